@@ -40,22 +40,16 @@ fn line(process: &Process, text: &str) -> String {
 /// Also if a gateway is killed, and another one starts beside boards that stream.
 #[test]
 fn an_ordinary_start_in_any_order_warns_of_nothing() {
-    for (k, order) in [
+    for order in [
         [0, 1, 2],
         [0, 2, 1],
         [1, 0, 2],
         [1, 2, 0],
         [2, 0, 1],
         [2, 1, 0],
-    ]
-    .iter()
-    .enumerate()
-    {
+    ] {
         let rig = Rig::new();
-        let names = [format!("start-{k}-a"), format!("start-{k}-b")];
-        let arm = Arm::slow()
-            .on_virtual([&names[0], &names[1]])
-            .write(&rig.path("robot"));
+        let arm = Arm::slow().on_virtual(["a", "b"]).write(&rig.path("robot"));
         let mut processes = order.map(|which| (which, start(&rig, &arm, which)));
         let domain = rig.open();
         let mut torques = open::<TorqueEstimate>(&domain, ROBOT);
@@ -104,9 +98,7 @@ fn an_ordinary_start_in_any_order_warns_of_nothing() {
 #[test]
 fn the_estimator_says_when_the_gateway_goes_and_comes() {
     let rig = Rig::new();
-    let arm = Arm::slow()
-        .on_virtual(["goes-a", "goes-b"])
-        .write(&rig.path("robot"));
+    let arm = Arm::slow().on_virtual(["a", "b"]).write(&rig.path("robot"));
     let mut estimator = start(&rig, &arm, 2);
     let waits = line(
         &estimator,
@@ -152,7 +144,7 @@ fn the_estimator_says_when_the_gateway_goes_and_comes() {
 #[test]
 fn a_board_that_never_answers_and_a_channel_that_is_missing_are_named() {
     let rig = Rig::new();
-    let arm = Arm::new().on_virtual(["missing-a", "missing-b"]);
+    let arm = Arm::new().on_virtual(["a", "b"]);
     let boards = arm.clone().write(&rig.path("boards"));
     let mut other = arm.each_device(|driver, device| {
         if driver == "icub_strain" {
@@ -200,9 +192,7 @@ fn a_board_that_never_answers_and_a_channel_that_is_missing_are_named() {
 #[test]
 fn a_gateway_that_is_terminated_stops_its_boards() {
     let rig = Rig::new();
-    let arm = Arm::slow()
-        .on_virtual(["term-a", "term-b"])
-        .write(&rig.path("robot"));
+    let arm = Arm::slow().on_virtual(["a", "b"]).write(&rig.path("robot"));
     let mut simulator = start(&rig, &arm, 0);
     let mut gateway = start(&rig, &arm, 1);
     let domain = rig.open();
@@ -214,7 +204,7 @@ fn a_gateway_that_is_terminated_stops_its_boards() {
                 .all(|d| d.state == DeviceState::Streaming)
     });
     // The other bus has motor boards only, which have no command that stops their stream.
-    let mut bus = VirtualBus::open(&rig.domain.name, "term-a", &[]).expect("a virtual bus");
+    let mut bus = VirtualBus::open(&rig.domain.name, "a", &[]).expect("a virtual bus");
     let mut quiet = |limit| {
         until(limit, || {
             // Ten periods of every board.
@@ -235,9 +225,7 @@ fn a_gateway_that_is_terminated_stops_its_boards() {
 #[test]
 fn a_limit_of_open_files_that_is_too_low_is_named_with_its_remedy() {
     let rig = Rig::new();
-    let arm = Arm::slow()
-        .on_virtual(["files-a", "files-b"])
-        .write(&rig.path("robot"));
+    let arm = Arm::slow().on_virtual(["a", "b"]).write(&rig.path("robot"));
     let limited = |limit: u32, verb: &str, config: &str| {
         let mut command = rig.command(&[]);
         let program = Rig::program();
@@ -297,9 +285,7 @@ fn a_limit_of_open_files_that_is_too_low_is_named_with_its_remedy() {
 #[test]
 fn a_run_opens_no_more_files_than_doctor_says() {
     let rig = Rig::new();
-    let arm = Arm::slow()
-        .on_virtual(["open-a", "open-b"])
-        .write(&rig.path("robot"));
+    let arm = Arm::slow().on_virtual(["a", "b"]).write(&rig.path("robot"));
     let mut processes = [0, 1, 2].map(|which| start(&rig, &arm, which));
     let domain = rig.open();
     let mut health = Newest::<EstimatorHealth>::open(&domain, ROBOT);
