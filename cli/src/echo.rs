@@ -42,6 +42,9 @@ pub(crate) struct Echo {
 
 type Out = BufWriter<StdoutLock<'static>>;
 
+/// Without a line for so long, it says that it waits.
+const PATIENCE: Nanos = Nanos::from_millis(2000);
+
 /// Prints what is asked for.
 pub(crate) fn run(args: &Echo, config: &DomainConfig) -> anyhow::Result<()> {
     let domain = open(config)?;
@@ -101,7 +104,9 @@ fn follow<T: Topic>(
     let mut out = BufWriter::new(io::stdout().lock());
     let is_enough = |printed| args.count.is_some_and(|count| printed >= count);
     let mut printed = 0_u64;
+    let (mut newest, mut is_told) = (monotonic(), false);
     while !stop.load(Relaxed) && !is_enough(printed) {
+        let before = printed;
         while !is_enough(printed)
             && let Some(payload) = next(&mut payloads)?
         {
@@ -110,6 +115,12 @@ fn follow<T: Topic>(
             }
         }
         out.flush()?;
+        if printed > before {
+            (newest, is_told) = (monotonic(), false);
+        } else if !is_told && monotonic() - newest > PATIENCE {
+            eprintln!("waiting: nothing is published; `proprio status` says what is missing");
+            is_told = true;
+        }
         if !is_enough(printed) {
             payloads.wait(monotonic() + Nanos::from_millis(100));
         }

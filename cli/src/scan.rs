@@ -251,9 +251,12 @@ fn as_text(name: &str, how: &str, heard: &Traffic, devices: &[Device]) -> String
         text.push_str(match frames {
             0 => {
                 "nothing was heard: are the boards on, is the bit rate right, do they wait to be \
-                  asked (--active)?\n"
+                 asked (--active; --ask DRIVER for a driver that its help names)?\n"
             }
-            _ => "no device was recognised\n",
+            _ => {
+                "no device was recognised; some answer only if they are asked (--active, --ask \
+                 DRIVER), and driver \"dbc\" reads what a .dbc file describes\n"
+            }
         });
     }
     if count == 0 {

@@ -99,7 +99,13 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
             devices: devices(&heard.traffic, &prefix),
             name,
         };
-        eprintln!("bus {}: {} devices", bus.name, bus.devices.len());
+        match bus.devices.len() {
+            0 => eprintln!(
+                "bus {}: no device was recognised; `proprio scan` says what was heard",
+                bus.name
+            ),
+            count => eprintln!("bus {}: {count} devices", bus.name),
+        }
         buses.push(bus);
     }
     if buses.is_empty() {

@@ -316,6 +316,19 @@ fn what_fell_silent_was_last_seen_and_withholds_torques() {
     let says_why =
         |line: &str| line.contains("l_wrist_yaw") && line.contains("withheld: stale (l_elbow)");
     assert!(text.lines().any(says_why), "{text}");
+    // Who waits for its samples is told.
+    let mut echo = rig.command(&["echo", "l_elbow"]);
+    let mut echo = echo.stderr(Stdio::piped()).spawn().expect("it runs");
+    let mut told = [0; 8];
+    let mut log = echo.stderr.take().expect("a pipe");
+    log.read_exact(&mut told).expect("a line");
+    assert_eq!(&told, b"waiting:");
+    kill(
+        Pid::from_raw(i32::try_from(echo.id()).expect("a process")),
+        Signal::SIGINT,
+    )
+    .expect("it runs");
+    assert_eq!(echo.wait().expect("it ends").code(), Some(0));
     let (_, text, _) = out(&["echo", "--torques", "l_wrist_yaw", "--count", "1"]);
     assert!(
         text.trim_end()

@@ -237,7 +237,7 @@ impl fmt::Display for Defect {
             ),
             Self::NeverSeen { channel } => write!(
                 f,
-                "{channel} is in the configuration but has no sample in the log: everything that \
+                "{channel} is in the configuration but has no sample: everything that \
                  needs it is excluded; record it, or remove it from the configuration"
             ),
             Self::RepeatedRows { rows, first } => write!(
