@@ -528,3 +528,53 @@ fn an_xsens_sensor_is_known_by_two_quantities() {
         assert_eq!(told, quantities, "{texts:?}");
     }
 }
+
+/// Frames `id`#`first`, then a position that sweeps, its velocity, no torque, and 30 degrees twice;
+/// each `period` ms.
+fn mit(id: &str, first: &str, period: u16, phase: f64) -> Vec<Frame> {
+    let turn = |turn: u16| {
+        let ms = f64::from(turn * period);
+        let angle = 0.005 * ms + phase;
+        let position = (32768.0 + 9000.0 * angle.sin()) as u16;
+        // 5 rad/s of 12.5 rad on 16 and of 30 rad/s on 12 bits.
+        let velocity = (2047.5 + 1170.0 * angle.cos()) as u16;
+        let text = format!("{id}#{first}{position:04X}{velocity:03X}8001E1E");
+        frame(&text, 1000.0 + ms)
+    };
+    (0..2000 / period).map(turn).collect()
+}
+
+/// Each has its own period, and is told from the other by the low half of its number.
+#[test]
+fn damiao_motors_share_an_identifier() {
+    let mut frames = [mit("000", "11", 5, 0.0), mit("000", "12", 20, 1.0)].concat();
+    frames.sort_by_key(|frame| frame.t);
+    let all = recognise(&traffic(&frames));
+    for (address, period) in [(1, "5"), (2, "20")] {
+        let one = all
+            .iter()
+            .find(|found| (found.driver, found.address) == ("damiao", address));
+        let one = one.unwrap_or_else(|| panic!("{address}: {all:?}"));
+        assert_eq!(key(one, "period_ms"), Some(period));
+    }
+}
+
+#[test]
+fn a_motor_in_motion_mode_sends_its_own_number() {
+    let own = found("myactuator", &mit("501", "01", 10, 0.0));
+    assert_eq!(own.map(|found| found.address), Some(1));
+    assert!(found("myactuator", &mit("501", "02", 10, 0.0)).is_none());
+}
+
+/// Two bits of the identifier are the mode, of which there are three.
+#[test]
+fn robstride_motors_have_three_modes() {
+    let motor = |id: &str| {
+        found(
+            "robstride",
+            &periodic(&[&format!("{id}#8000800080000104")], 10.0, 50),
+        )
+    };
+    assert!(motor("028001FD").is_some());
+    assert!(motor("02C001FD").is_none());
+}
