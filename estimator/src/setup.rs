@@ -12,7 +12,7 @@ use crate::plausible;
 use crate::skin::{PatchSetup, TRIANGLE, TRIANGLES, Taxel, TaxelMap, threshold};
 use proprio_dynamics::calibration::{self, Calibration, UNKNOWN_OFFSET};
 use proprio_dynamics::model::{
-    Frame, JointKind, MeasurementDirection, MeasurementFrame, Model, ModelError,
+    Frame, JointKind, MeasurementDirection, MeasurementFrame, Model, ModelError, SensorElement,
 };
 use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
 use proprio_dynamics::{
@@ -83,7 +83,12 @@ impl Setup {
     /// # Errors
     /// As [`Setup::new`].
     pub fn with_model(config: &Config, model: Model) -> Result<Self, String> {
-        let mut warnings: Vec<String> = model.warnings().to_vec();
+        let urdf = config.model.file_name().map(|name| name.to_string_lossy());
+        let urdf = urdf.unwrap_or_default();
+        let of_urdf = model.warnings().iter();
+        let mut warnings: Vec<String> = of_urdf
+            .map(|warning| format!("{urdf}: {warning}"))
+            .collect();
         warnings.extend(plausible::check(config, &model)?);
         let identification = &config.identification;
         if identification.enabled && identification.inputs.contains(&IdentificationInput::Torque) {
@@ -445,6 +450,33 @@ const fn direction_word(direction: MeasurementDirection) -> &'static str {
     }
 }
 
+/// The element of the URDF that describes a sensor: that of its name in its joint, else the only
+/// one of the joint.
+fn element_of<'m>(
+    model: &'m Model,
+    sensor: &str,
+    joint: &str,
+) -> Result<Option<&'m SensorElement>, String> {
+    let of_joint: Vec<_> = model
+        .sensors()
+        .iter()
+        .filter(|e| e.joint == joint)
+        .collect();
+    let named = of_joint.iter().find(|element| element.name == sensor);
+    match (named, &of_joint[..]) {
+        (Some(element), _) | (None, [element]) => Ok(Some(element)),
+        (None, []) => Ok(None),
+        (None, several) => {
+            let names: Vec<&str> = several.iter().map(|e| e.name.as_str()).collect();
+            Err(format!(
+                ": the URDF has several sensors in joint {joint}, none of this name: {}; use the \
+                 name of one of them",
+                names.join(", ")
+            ))
+        }
+    }
+}
+
 fn sensors(
     config: &Config,
     model: &Model,
@@ -453,7 +485,7 @@ fn sensors(
     let mut cuts = Vec::new();
     for ft in &config.force_torque {
         let at = format!("force_torque {:?}", ft.sensor);
-        let element = model.sensors().iter().find(|e| e.joint == ft.joint);
+        let element = element_of(model, &ft.sensor, &ft.joint).map_err(|why| at.clone() + &why)?;
         let frame = ft.frame.map(|f| match f {
             SensorFrame::Child => MeasurementFrame::Child,
             SensorFrame::Parent => MeasurementFrame::Parent,
@@ -486,6 +518,14 @@ fn sensors(
         let direction = direction
             .or(element.map(|e| e.direction))
             .unwrap_or(MeasurementDirection::ChildToParent);
+        if let (None, Some(why)) = (element, model.unread_sensor(&ft.joint))
+            && (ft.frame.is_none() || ft.direction.is_none())
+        {
+            return Err(format!(
+                "{at}: the URDF does not tell how it measures: {why}; correct it there, or give \
+                 frame and direction here"
+            ));
+        }
         let given = ft.xyz_m.is_some();
         if ft.xyz_m.is_some() != ft.rpy_rad.is_some() {
             return Err(format!(

@@ -516,3 +516,47 @@ fn a_sensor_in_a_moving_joint_is_on_the_side_of_its_child() {
         "{error}"
     );
 }
+
+/// Of several sensors in one joint the one of the given name is read; how one that cannot be
+/// understood measures is not guessed.
+#[test]
+fn a_sensor_is_the_one_of_its_name_in_its_joint() {
+    let element = |name: &str, direction: &str| {
+        format!(
+            "<gazebo reference=\"j2\"><sensor name=\"{name}\" type=\"force_torque\"><force_torque>\
+             <measure_direction>{direction}</measure_direction></force_torque></sensor></gazebo>"
+        )
+    };
+    let robot = |elements: &[String]| {
+        let elements = elements.concat() + "</robot>";
+        GRIPPER
+            .replace("<mimic", "<ignored")
+            .replace("</robot>", &elements)
+    };
+    let of = |urdf: &str, name: &str, keys: &str| {
+        let ft = format!("[[force_torque]]\nsensor = \"{name}\"\njoint = \"j2\"\n{keys}");
+        let (_folder, setup) = files(urdf.as_bytes(), &ft);
+        setup.map(|setup| checked(&setup).sensors[0].reading.force_first()[2])
+    };
+    let two = robot(&[
+        element("u", "child_to_parent"),
+        element("w", "parent_to_child"),
+    ]);
+    let (u, w) = (of(&two, "u", "").unwrap(), of(&two, "w", "").unwrap());
+    assert!(u < -4.0 && (u + w).abs() < 1e-9, "{u} {w}");
+    let error = of(&two, "v", "").unwrap_err();
+    assert!(
+        error.contains("\"v\": the URDF has several sensors in joint j2, none of this name: u, w"),
+        "{error}"
+    );
+    let one = robot(&[element("u", "parent_to_child")]);
+    assert_eq!(of(&one, "v", ""), Ok(w));
+    let misspelt = robot(&[element("u", "parenttochild")]);
+    let error = of(&misspelt, "u", "").unwrap_err();
+    assert!(
+        error.contains("its direction is parenttochild") && error.contains("line 1: F/T sensor"),
+        "{error}"
+    );
+    let given = "frame = \"child\"\ndirection = \"parent_to_child\"\n";
+    assert_eq!(of(&misspelt, "u", given), Ok(w));
+}

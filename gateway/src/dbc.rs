@@ -6,7 +6,8 @@
 //! it, does no harm. A message or signal that can not be used is kept with the reason, for whoever
 //! asks for it.
 //!
-//! A statement begins with its keyword at the beginning of a line, outside of quotes.
+//! A statement begins with its keyword at the beginning of a line or behind a semicolon, outside of
+//! quotes.
 
 use proprio_drivers::Id;
 use proprio_drivers::signal::{Bits, Message, Raw, Signal, Switch};
@@ -49,29 +50,33 @@ pub(crate) fn text(file: &Path) -> Result<String, String> {
     })
 }
 
-/// The statements of a file.
+/// The statements of a file. Each begins on a line of its own or behind the semicolon of another.
 fn statements(text: &str) -> impl Iterator<Item = &str> {
-    let mut begins = Vec::new();
-    let (mut at, mut is_quoted) = (0, false);
-    for line in text.split_inclusive('\n') {
-        let words = line.trim_start();
-        let keyword = words.split(|c: char| !c.is_ascii_uppercase() && c != '_');
-        if !is_quoted && keyword.take(1).any(|word| word.ends_with('_')) {
-            begins.push(at + line.len() - words.len());
+    let mut begins: Vec<usize> = Vec::new();
+    let (mut is_quoted, mut is_fresh, mut is_remark) = (false, true, false);
+    for (at, c) in text.char_indices() {
+        let rest = &text[at..];
+        if matches!(c, '\n' | '\r') {
+            (is_fresh, is_remark) = (!is_quoted, false);
+        } else if is_fresh && !c.is_whitespace() {
+            is_fresh = false;
+            is_remark = rest.starts_with("//");
+            let end = rest.find(|c: char| !c.is_ascii_uppercase() && c != '_');
+            if rest[..end.unwrap_or(rest.len())].ends_with('_') {
+                begins.push(at);
+            }
         }
-        // Comments hold quotes that nothing marks. The last one is before the semicolon.
-        let is_comment = begins
-            .last()
-            .is_some_and(|begin| text[*begin..].starts_with("CM_"));
-        let mut from = 0;
-        while let Some(found) = line[from..].find('"').map(|quote| from + quote) {
-            let rest = line[found + 1..].trim_start();
-            let ends = rest.starts_with(';');
-            let is_literal = is_quoted && !ends && (is_comment || line[..found].ends_with('\\'));
-            is_quoted ^= !is_literal;
-            from = found + 1;
+        if c == ';' && !is_quoted {
+            is_fresh = true;
         }
-        at += line.len();
+        if c == '"' && !is_remark {
+            // Comments hold quotes that nothing marks. The last one is before the semicolon.
+            let begin = begins.last().copied().unwrap_or_default();
+            let is_comment = text[begin..].starts_with("CM_");
+            let ends = rest[1..].trim_start().starts_with(';');
+            let is_marked = text[..at].ends_with('\\');
+            is_quoted ^= !(is_quoted && !ends && (is_comment || is_marked));
+        }
     }
     let ends = begins.clone().into_iter().skip(1).chain([text.len()]);
     begins
@@ -510,6 +515,27 @@ mod tests {
             (messages[0].signals.len(), signal.unit.as_str()),
             (1, "a:b")
         );
+    }
+
+    #[test]
+    fn statements_begin_and_end_anywhere() {
+        let float = |text: &str| {
+            let message = "BO_ 1 A: 8 N\n SG_ S : 0|32@1+ (1,0) [0|0] \"\" N\n";
+            let messages = messages(&text.replace("BO_", message));
+            format!("{:?}", messages[0].signals[0])
+        };
+        let own = float("BO_\nSIG_VALTYPE_ 1 S : 1;\n");
+        assert_ne!(own, float("BO_\n"));
+        for text in [
+            "BO_\nCM_ BO_ 1 \"text\"\n;\nSIG_VALTYPE_ 1 S : 1;\n",
+            "CM_ \"text\" \r\n ;\r\nBO_\nSIG_VALTYPE_ 1 S : 1;\n",
+            "BO_\nBA_DEF_ BO_ \"x\" INT 0 1; SIG_VALTYPE_ 1 S : 1;\n",
+            "// made \"by hand; BO_ 2\nBO_\nSIG_VALTYPE_ 1 S : 1;\n",
+        ] {
+            assert_eq!(float(text), own, "{text}");
+        }
+        let old = float(&"BO_\nSIG_VALTYPE_ 1 S : 1;\n".replace('\n', "\r"));
+        assert_eq!(old, own);
     }
 
     #[test]

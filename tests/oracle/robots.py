@@ -31,9 +31,16 @@ def unpack(wheels, out):
                 yield name
 
 
+def mimic_of(tree, name):
+    """The `<mimic>` of a joint, if it names a joint that is there."""
+    mimic = tree.find(f"joint[@name='{name}']/mimic")
+    if mimic is not None and tree.find(f"joint[@name='{mimic.get('joint')}']") is not None:
+        return mimic
+
+
 def followed(tree, name):
     """The joint that a joint follows in the end, with ratio and offset."""
-    mimic = tree.find(f"joint[@name='{name}']/mimic")
+    mimic = mimic_of(tree, name)
     if mimic is None:
         return name, 1.0, 0.0
     leader, ratio, offset = followed(tree, mimic.get("joint"))
@@ -56,7 +63,7 @@ def cases(path, random):
         for joint in range(1, model.njoints)
         if model.joints[joint].nv == 1
     }
-    own = [name for name in moving if tree.find(f"joint[@name='{name}']/mimic") is None]
+    own = [name for name in moving if mimic_of(tree, name) is None]
     matrix, shift = np.zeros((model.nv, len(own))), np.zeros(model.nv)
     for name, row in moving.items():
         leader, ratio, shift[row] = followed(tree, name)

@@ -202,6 +202,8 @@ struct JointFacts {
     child_link: String,
     limits: Option<Limits>,
     effort: Option<f64>,
+    /// The joint that it follows, multiplier and offset.
+    mimic: Option<(String, f64, f64)>,
 }
 
 /// The frame in which an F/T sensor measures: its axes, and the origin as the point of its torque.
@@ -257,7 +259,17 @@ pub struct Model {
     folded_joints: HashMap<String, ()>,
     frames: HashMap<String, Frame>,
     sensors: Vec<SensorElement>,
+    unread: Vec<Unread>,
     warnings: Vec<String>,
+}
+
+/// An F/T sensor element that cannot be understood.
+#[derive(Clone, Debug)]
+struct Unread {
+    /// Its joint; empty if it names none.
+    joint: String,
+    /// Its line, its name, and what is wrong.
+    why: String,
 }
 
 impl Model {
@@ -340,14 +352,29 @@ impl Model {
         (leader != joint).then_some(leader)
     }
 
-    /// Holds a joint that follows another one at a position [rad or m] of its own. False if there
-    /// is no such joint.
+    /// Holds a joint that follows another one at a position [rad or m] of its own, and so those that
+    /// follow it. False if there is no such joint.
     pub fn hold(&mut self, joint: &str, position: f64) -> bool {
         let follower = self.follows(joint).and_then(|_| self.joint(joint));
-        let Some(joint) = follower.and_then(|number| self.joints.get_mut(number)) else {
+        let Some(held) = follower else {
             return false;
         };
-        (joint.ratio, joint.offset) = (0.0, position);
+        (self.joints[held].ratio, self.joints[held].offset) = (0.0, position);
+        self.joint_facts[held].mimic = None;
+        let mut leaders = vec![held];
+        while let Some(leader) = leaders.pop() {
+            let name = self.joint_facts[leader].name.clone();
+            let (of_leader, at) = (self.joints[leader].ratio, self.joints[leader].offset);
+            for (number, joint) in self.joints.iter_mut().enumerate() {
+                match &self.joint_facts[number].mimic {
+                    Some((leads, ratio, offset)) if *leads == name && joint.dof.is_some() => {
+                        (joint.ratio, joint.offset) = (ratio * of_leader, ratio * at + offset);
+                        leaders.push(number);
+                    }
+                    _ => {}
+                }
+            }
+        }
         true
     }
 
@@ -404,6 +431,12 @@ impl Model {
     /// Names of all URDF links, in no particular order.
     pub fn frame_names(&self) -> impl Iterator<Item = &str> {
         self.frames.keys().map(String::as_str)
+    }
+
+    /// What is wrong with an F/T sensor element of this joint.
+    pub fn unread_sensor(&self, joint: &str) -> Option<&str> {
+        let mut unread = self.unread.iter();
+        Some(&unread.find(|unread| unread.joint == joint)?.why)
     }
 
     /// The F/T sensors that the URDF describes; one entry for a sensor described twice.
@@ -603,7 +636,7 @@ pub enum ModelError {
     #[error(
         "{}: the mass is unknown, because no <inertial> is there or in a link fixed to it; add one \
          (with mass 0 and inertia 0 if it is meant to be massless)",
-        .0.iter().map(|(place, joint)| format!("{place}, moved by joint {joint}"))
+        .0.iter().map(|(place, joint)| format!("{place}, beyond joint {joint}"))
             .collect::<Vec<_>>().join("; ")
     )]
     MissingInertial(Vec<(Place, String)>),

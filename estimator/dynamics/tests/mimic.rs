@@ -336,6 +336,21 @@ fn a_chain_of_followers_has_pinocchios_torque_and_inertia() {
         kinematics.joint_axis(&cable),
         Some(Motion::translation(&Vec3::zeros()))
     );
+    // Who follows a held joint is held, too, where that puts it: 0.05 x 0.7 - 0.01.
+    let mut held = model;
+    assert!(held.hold("close", 0.7));
+    let cable = held.joints()[held.joint("cable").unwrap()];
+    assert!(cable.ratio == 0.0 && (cable.offset - 0.025).abs() < 1e-15);
+    // In either order, each has the position that it was given.
+    for order in [["close", "cable"], ["cable", "close"]] {
+        let mut held = Model::from_urdf(HAND, &[]).unwrap();
+        assert!(order.iter().all(|joint| held.hold(joint, 0.2)));
+        let all = order.map(|joint| held.joints()[held.joint(joint).unwrap()]);
+        assert!(
+            all.iter()
+                .all(|joint| (joint.ratio, joint.offset) == (0.0, 0.2))
+        );
+    }
 }
 
 #[test]
@@ -346,10 +361,15 @@ fn a_joint_that_cannot_follow_says_where_and_why() {
             .expect_err("broken")
             .to_string()
     };
+    // Other programs read it: it is a joint of its own, and so is not held by a mistake.
+    let misspelt = HAND.replacen("<mimic joint=\"lead\"", "<mimic joint=\"led\"", 1);
+    let own = Model::from_urdf(&misspelt, &[]).unwrap();
+    assert!(own.dof("close").is_some());
+    assert_eq!(own.follows("cable"), Some("close"));
     assert_eq!(
-        error("<mimic joint=\"lead\"", "<mimic joint=\"led\""),
-        "line 19: joint close: its <mimic> joint=\"led\" is not a joint of the URDF; correct \
-         it, or remove the <mimic>"
+        own.warnings()[0],
+        "line 19: joint close: its <mimic> joint=\"led\" is not a joint of the URDF: it is taken \
+         as a joint of its own, which is measured or in [locked]"
     );
     assert_eq!(
         error("<mimic joint=\"lead\"", "<mimic joint=\"cable\""),

@@ -198,8 +198,45 @@ fn sensor_elements_of_both_forms_are_read() {
     );
     assert_eq!(
         model.warnings(),
-        ["F/T sensor s is described twice, and differently; the first description counts"]
+        [
+            "line 11: F/T sensor s in joint grip is described twice, and differently; the first \
+          description counts"
+        ]
     );
+    // A sensor's name is its own in its joint only: both arms may have an "s".
+    let other = plain.replace("parent_to_child", "child_to_parent");
+    let model = with(&(plain.to_owned() + &other.replace("\"grip\"", "\"end\"")));
+    let directions = model
+        .sensors()
+        .iter()
+        .map(|s| (s.joint.as_str(), s.direction));
+    assert_eq!(
+        directions.collect::<Vec<_>>(),
+        [
+            ("grip", MeasurementDirection::ParentToChild),
+            ("end", MeasurementDirection::ChildToParent)
+        ]
+    );
+    // SDF's poses may be in degrees.
+    let turned =
+        gazebo("1 2 3 0 0 90").replace("<pose>", "<pose degrees=\"true\" relative_to=\"\">");
+    assert_eq!(
+        with(&turned).sensors()[0].pose,
+        Pose::from_xyz_rpy([1.0, 2.0, 3.0], [0.0, 0.0, std::f64::consts::FRAC_PI_2])
+    );
+    for attribute in [
+        "relative_to=\"base\"",
+        "rotation_format=\"quat_xyzw\"",
+        "degrees=\"x\"",
+    ] {
+        let model = with(&gazebo("1 2 3 0 0 0").replace("<pose>", &format!("<pose {attribute}>")));
+        assert_eq!(model.sensors(), []);
+        assert!(
+            model
+                .unread_sensor("grip")
+                .is_some_and(|why| why.contains(attribute))
+        );
+    }
     // Defaults: child, child to parent. Invalid values: ignored, with a warning.
     let model =
         with("<gazebo reference=\"grip\"><sensor name=\"g\" type=\"force_torque\"/></gazebo>");
@@ -212,8 +249,8 @@ fn sensor_elements_of_both_forms_are_read() {
     assert_eq!(
         model.warnings(),
         [
-            "F/T sensor element s: its frame is elsewhere, not child, parent or sensor; it is \
-             ignored"
+            "line 11: F/T sensor element s: its frame is elsewhere, not child, parent or sensor; \
+             it is ignored"
         ]
     );
     // Other sensors and other Gazebo extensions are ignored.
@@ -324,7 +361,7 @@ fn malformed_files_have_one_clear_message_each() {
     is(
         &format!("<link name=\"finger\">{INERTIAL}</link>"),
         "<link name=\"finger\"/>",
-        "line 5: link finger, moved by joint slide: the mass is unknown, because no <inertial> is \
+        "line 5: link finger, beyond joint slide: the mass is unknown, because no <inertial> is \
          there or in a link fixed to it; add one (with mass 0 and inertia 0 if it is meant to be \
          massless)",
     );
@@ -714,7 +751,7 @@ fn what_is_missing_has_its_place_and_the_remedy() {
     );
     assert_eq!(
         read(&text).unwrap_err().to_string(),
-        "line 3: link arm, moved by joint turn; line 5: link finger, moved by joint slide: the \
+        "line 3: link arm, beyond joint turn; line 5: link finger, beyond joint slide: the \
          mass is unknown, because no <inertial> is there or in a link fixed to it; add one \
          (with mass 0 and inertia 0 if it is meant to be massless)"
     );

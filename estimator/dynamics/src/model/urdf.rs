@@ -17,7 +17,7 @@ use self::elements::{numbers, once, part, place, read_sensors, required};
 use super::xml::{self, Document, Node, XmlError};
 use super::{
     Axis, AxisKind, Frame, Joint, JointFacts, JointKind, Limits, MeasurementDirection,
-    MeasurementFrame, Model, ModelError, SensorElement,
+    MeasurementFrame, Model, ModelError, SensorElement, Unread,
 };
 use crate::spatial::{Mat3, Pose, RigidInertia, Vec3};
 
@@ -60,7 +60,7 @@ pub(super) fn read(text: &str, keep: &[&str]) -> Result<Model, ModelError> {
     let document = parse(text)?;
     let robot = robot(&document)?;
     let mut warnings = Vec::new();
-    let sensors = read_sensors(robot, &mut warnings);
+    let (sensors, unread) = read_sensors(robot, &mut warnings);
     let (links, numbers) = read_links(robot, &mut warnings)?;
     let mut joints = read_joints(robot, &numbers, &mut warnings)?;
     let tree = Tree::build(&links, &joints, &mut warnings)?;
@@ -75,7 +75,7 @@ pub(super) fn read(text: &str, keep: &[&str]) -> Result<Model, ModelError> {
     .fold(
         &tree,
         robot.attribute("name").unwrap_or_default().to_owned(),
-        sensors,
+        (sensors, unread),
         warnings,
     )
 }
@@ -158,7 +158,7 @@ fn read_links<'d>(
             has_inertial: false,
             negative: None,
         };
-        once(node, &["inertial"], warnings);
+        once(node, node, &["inertial"], warnings);
         if let Some(inertial) = node.child("inertial") {
             link.has_inertial = true;
             read_inertia(&mut link, inertial, warnings)?;
@@ -177,7 +177,7 @@ fn read_inertia(
     warnings: &mut Vec<String>,
 ) -> Result<(), ModelError> {
     let (owner, name) = (link.node, link.name);
-    once(inertial, &["origin", "mass", "inertia"], warnings);
+    once(inertial, owner, &["origin", "mass", "inertia"], warnings);
     let mass = part(inertial, owner, "<mass>", "add <mass value=\"...\"/> in kg")?;
     let remedy = "add <inertia ixx=\"...\" .../> about the centre of mass, in kg m^2";
     let tensor = part(inertial, owner, "<inertia>", remedy)?;
@@ -230,7 +230,7 @@ fn read_joints<'d>(
     for node in robot.children().filter(|node| node.name() == "joint") {
         let name = name(node, "joint", &mut seen, |first| joints[first].node)?;
         let used = ["origin", "parent", "child", "axis", "limit", "mimic"];
-        once(node, &used, warnings);
+        once(node, node, &used, warnings);
         let joint = read_joint(node, name, links)?;
         if let Some(Limits { lower, upper }) = joint.limits
             && lower > upper
@@ -311,6 +311,8 @@ fn read_joint<'d>(
         lower: lower.map_or(0.0, |[lower]| lower),
         upper: upper.map_or(0.0, |[upper]| upper),
     });
+    // An infinite limit means no limit.
+    let limits = limits.filter(|limits| (limits.upper - limits.lower).is_finite());
     let mimic = match node.child("mimic").filter(|_| moves) {
         None => None,
         Some(mimic) => {
@@ -490,6 +492,18 @@ impl Coordinates {
     /// one of the joint that it follows, if necessary through others. One that follows a fixed
     /// joint is made fixed where that holds it.
     fn of(joints: &mut [RawJoint<'_>], warnings: &mut Vec<String>) -> Result<Self, ModelError> {
+        let names: HashSet<&str> = joints.iter().map(|joint| joint.name).collect();
+        for joint in joints.iter_mut() {
+            if let Some((leader, ..)) = joint.mimic.filter(|(leader, ..)| !names.contains(leader)) {
+                let mimic = joint.node.child("mimic").unwrap_or(joint.node);
+                warnings.push(format!(
+                    "{}: its <mimic> joint=\"{leader}\" is not a joint of the URDF: it is taken as \
+                     a joint of its own, which is measured or in [locked]",
+                    place(mimic, joint.node)
+                ));
+                joint.mimic = None;
+            }
+        }
         let mut held = Vec::new();
         let coordinates = Self::resolve(joints, &mut held)?;
         for (number, position) in held {
@@ -530,12 +544,9 @@ impl Coordinates {
                     follows: follows.to_owned(),
                     reason,
                 };
-                let next = numbers
-                    .get(follows)
-                    .and_then(|&number| joints.get(number))
-                    .ok_or_else(|| {
-                        wrong("is not a joint of the URDF; correct it, or remove the <mimic>")
-                    })?;
+                let Some(next) = numbers.get(follows).and_then(|&number| joints.get(number)) else {
+                    break;
+                };
                 if next.kind.is_none() {
                     return Err(wrong(
                         "is the motion of the whole robot; name a joint of the robot, or remove \
@@ -576,7 +587,7 @@ impl Folder<'_, '_> {
         &self,
         tree: &Tree,
         name: String,
-        sensors: Vec<SensorElement>,
+        (sensors, unread): (Vec<SensorElement>, Vec<Unread>),
         warnings: Vec<String>,
     ) -> Result<Model, ModelError> {
         let mut model = Model {
@@ -590,6 +601,7 @@ impl Folder<'_, '_> {
             folded_joints: HashMap::new(),
             frames: HashMap::with_capacity(self.links.len()),
             sensors,
+            unread,
             warnings,
         };
         let robot = (0..self.links.len()).filter(|link| !tree.dropped.contains(link));
@@ -674,6 +686,7 @@ impl Folder<'_, '_> {
             child_link: self.links[joint.child].name.to_owned(),
             limits: joint.limits,
             effort: joint.effort,
+            mimic: (joint.mimic).map(|(leader, ratio, offset)| (leader.to_owned(), ratio, offset)),
         };
         let new = model.joints.len();
         model.joint_numbers.insert(joint.name.to_owned(), new);

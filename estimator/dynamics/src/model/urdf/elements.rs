@@ -1,7 +1,7 @@
 //! Reads the elements of a URDF: their numbers and names, with a message that has the place where
 //! one is missing or wrong, and the elements of F/T sensors.
 
-use super::{MeasurementDirection, MeasurementFrame, ModelError, Node, SensorElement};
+use super::{MeasurementDirection, MeasurementFrame, ModelError, Node, SensorElement, Unread};
 use crate::model::Place;
 use crate::spatial::Pose;
 use std::collections::HashSet;
@@ -92,9 +92,9 @@ pub(super) fn numbers<const N: usize>(
 }
 
 /// Warns of elements that occur twice: the first one counts, as in urdfdom.
-pub(super) fn once(owner: Node<'_>, names: &[&str], warnings: &mut Vec<String>) {
+pub(super) fn once(element: Node<'_>, owner: Node<'_>, names: &[&str], warnings: &mut Vec<String>) {
     let mut seen = HashSet::new();
-    for child in owner.children() {
+    for child in element.children() {
         let name = child.name();
         if names.contains(&name) && !seen.insert(name) {
             let Place { line, owner } = place(child, owner);
@@ -105,10 +105,13 @@ pub(super) fn once(owner: Node<'_>, names: &[&str], warnings: &mut Vec<String>) 
     }
 }
 
-/// Reads both forms of F/T `<sensor>` elements. An element that cannot be understood becomes a
-/// warning, because the configuration can replace it.
-pub(super) fn read_sensors(robot: Node<'_>, warnings: &mut Vec<String>) -> Vec<SensorElement> {
-    let mut sensors: Vec<SensorElement> = Vec::new();
+/// Reads both forms of F/T `<sensor>` elements. One that cannot be understood becomes a warning, and
+/// is kept with what is wrong: the configuration may replace it.
+pub(super) fn read_sensors(
+    robot: Node<'_>,
+    warnings: &mut Vec<String>,
+) -> (Vec<SensorElement>, Vec<Unread>) {
+    let (mut sensors, mut unread): (Vec<SensorElement>, Vec<Unread>) = (Vec::new(), Vec::new());
     let is_sensor =
         |node: &Node<'_>| node.name() == "sensor" && node.attribute("type") == Some("force_torque");
     let plain = robot.children().filter(is_sensor).map(|node| {
@@ -134,20 +137,34 @@ pub(super) fn read_sensors(robot: Node<'_>, warnings: &mut Vec<String>) -> Vec<S
             None => Err("it does not name its joint".to_owned()),
         };
         match read {
-            Err(why) => warnings.push(format!("F/T sensor element {name}: {why}; it is ignored")),
-            Ok(sensor) => match sensors.iter().find(|other| other.name == sensor.name) {
+            Err(why) => {
+                let why = format!("line {}: F/T sensor element {name}: {why}", node.line());
+                warnings.push(format!("{why}; it is ignored"));
+                unread.push(Unread {
+                    joint: joint.unwrap_or_default().to_owned(),
+                    why,
+                });
+            }
+            Ok(sensor) => match sensors.iter().find(|other| is_same(other, &sensor)) {
                 None => sensors.push(sensor),
                 Some(other) if same_sensor(other, &sensor) => {}
                 Some(_) => {
                     warnings.push(format!(
-                        "F/T sensor {name} is described twice, and differently; the first \
-                         description counts"
+                        "line {}: F/T sensor {name} in joint {} is described twice, and \
+                         differently; the first description counts",
+                        node.line(),
+                        sensor.joint
                     ));
                 }
             },
         }
     }
-    sensors
+    (sensors, unread)
+}
+
+/// Whether two elements are of one sensor. A name is its own among the sensors of a joint only.
+fn is_same(a: &SensorElement, b: &SensorElement) -> bool {
+    (&a.joint, &a.name) == (&b.joint, &b.name)
 }
 
 pub(super) fn read_sensor(
@@ -183,12 +200,23 @@ pub(super) fn read_sensor(
             triple(origin.attribute("rpy"))?,
         )
     } else if let Some(pose) = node.child("pose") {
+        let said = |key| pose.attribute(key).map(str::trim).unwrap_or_default();
+        for key in ["relative_to", "frame", "rotation_format"] {
+            if !["", "euler_rpy", joint].contains(&said(key)) {
+                return Err(format!("its <pose> has {key}=\"{}\"", said(key)));
+            }
+        }
+        let unit = match said("degrees") {
+            "" | "false" | "0" => 1.0,
+            "true" | "1" => std::f64::consts::PI / 180.0,
+            other => return Err(format!("its <pose> has degrees=\"{other}\"")),
+        };
         let [x, y, z, roll, pitch, yaw] = floats(if pose.text().is_empty() {
             "0 0 0 0 0 0"
         } else {
             pose.text()
         })?;
-        Pose::from_xyz_rpy([x, y, z], [roll, pitch, yaw])
+        Pose::from_xyz_rpy([x, y, z], [roll, pitch, yaw].map(|angle| unit * angle))
     } else {
         Pose::identity()
     };
