@@ -185,11 +185,14 @@ fn a_configuration_is_written_that_the_gateway_runs() {
     }
     // Placeholders are refused, each by its key, until somebody has looked at them.
     let check = ["gateway", "--config", &config, "--check"];
-    let refused = rig.command(&check).output().expect("proprio runs");
-    let said = text(&refused.stderr);
-    assert_eq!(refused.status.code(), Some(2), "{said}");
-    for part in ["name = \"joint_7\"", "ratio = 1.0", "fill in"] {
-        assert!(said.contains(part), "{part}:\n{said}");
+    let install = ["install", "--config", &folder, "--dry-run"];
+    for arguments in [&check[..], &check[..3], &install] {
+        let refused = rig.command(arguments).output().expect("proprio runs");
+        let said = text(&refused.stderr);
+        assert_eq!(refused.status.code(), Some(2), "{arguments:?}: {said}");
+        for part in ["name = \"joint_7\"", "ratio = 1.0", "fill in"] {
+            assert!(said.contains(part), "{part}:\n{said}");
+        }
     }
     let filled: Vec<&str> = (written.lines())
         .map(|line| line.split("  # fill in").next().unwrap_or_default())
@@ -215,6 +218,7 @@ fn a_configuration_is_written_that_the_gateway_runs() {
     fs::write(&config, "mine").expect("the file");
     rig.run(&[&setup[..], &["--force"]].concat());
     assert_eq!(fs::read_to_string(&config).expect("the file"), written);
+    fs::write(&config, filled.join("\n")).expect("the file");
     let mut gateway = rig.start(&["gateway", "--config", &config]);
     let streams = until(PATIENCE, || {
         let output = rig

@@ -17,8 +17,10 @@ const TENTHS: u16 = 1600;
 /// What a motor's answer about its number counts: 8 arbitrary bytes on an identifier of its own.
 const TELLS: f64 = 4.0;
 
+/// A motor is not at the lower ends of all three ranges.
 fn is_state(frame: &Frame) -> bool {
-    frame.len() == LENGTH && u16_be(frame.data(), 6) <= TENTHS
+    let data = frame.data();
+    data.len() == LENGTH && u16_be(data, 6) <= TENTHS && !data.starts_with(&[0; 6])
 }
 
 fn is_parameter(frame: &Frame) -> bool {
@@ -72,17 +74,22 @@ fn private(seen: &Traffic, address: u8, host: u8) -> Option<Finding> {
         is_extended && (to, from) == (host, address) && upper >> 6 < 3 && kinds.contains(&kind)
     };
     let mut period = None;
-    // The identifier tells the mode, and faults.
-    for stream in seen
+    // The identifier tells the mode, and faults: what has many of these is another device with as
+    // many messages of one form. So the stream with most frames speaks for the motor.
+    let states = seen
         .streams()
-        .filter(|stream| own(stream, &[kind::STATE, kind::REPORT]))
-    {
-        if let Some(stream) = evidence.sends(stream.id, is_state) {
+        .filter(|stream| own(stream, &[kind::STATE, kind::REPORT]));
+    let mut states: Vec<&Stream> = states.collect();
+    states.sort_by_key(|stream| core::cmp::Reverse(stream.frames));
+    for (stream, place) in states.into_iter().zip(0..) {
+        if place > 0 {
+            evidence.belongs(stream.id);
+        } else if let Some(stream) = evidence.sends(stream.id, is_state) {
             evidence.moves(stream, |frame| {
                 let [position, velocity] = [0, 2].map(|at| f64::from(u16_be(frame.data(), at)));
                 Some((position, velocity - 32767.5))
             });
-            period = period.or_else(|| stream.period());
+            period = stream.period();
         }
     }
     for stream in seen
