@@ -352,8 +352,8 @@ impl Model {
         (leader != joint).then_some(leader)
     }
 
-    /// Holds a joint that follows another one at a position [rad or m] of its own, and so those that
-    /// follow it. False if there is no such joint.
+    /// Holds a joint that follows another one at a position [rad or m] of its own, and so those
+    /// that follow it. False if there is no such joint.
     pub fn hold(&mut self, joint: &str, position: f64) -> bool {
         let follower = self.follows(joint).and_then(|_| self.joint(joint));
         let Some(held) = follower else {

@@ -35,7 +35,7 @@ pub enum Presence {
 impl fmt::Display for Presence {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::NotStarted => f.write_str("was not started"),
+            Self::NotStarted => f.write_str("is not running"),
             Self::Running => f.write_str("is running"),
             // In another container its number is not known.
             Self::Stuck { process: 0 } => f.write_str("is stopped or stuck"),

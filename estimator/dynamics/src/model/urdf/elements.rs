@@ -105,8 +105,8 @@ pub(super) fn once(element: Node<'_>, owner: Node<'_>, names: &[&str], warnings:
     }
 }
 
-/// Reads both forms of F/T `<sensor>` elements. One that cannot be understood becomes a warning, and
-/// is kept with what is wrong: the configuration may replace it.
+/// Reads both forms of F/T `<sensor>` elements. One that cannot be understood becomes a warning,
+/// and is kept with what is wrong: the configuration may replace it.
 pub(super) fn read_sensors(
     robot: Node<'_>,
     warnings: &mut Vec<String>,
