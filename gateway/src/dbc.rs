@@ -60,15 +60,13 @@ fn statements(text: &str) -> impl Iterator<Item = &str> {
             (is_fresh, is_remark) = (!is_quoted, false);
         } else if is_fresh && !c.is_whitespace() {
             is_fresh = false;
-            is_remark = rest.starts_with("//");
             let end = rest.find(|c: char| !c.is_ascii_uppercase() && c != '_');
             if rest[..end.unwrap_or(rest.len())].ends_with('_') {
                 begins.push(at);
             }
         }
-        if c == ';' && !is_quoted {
-            is_fresh = true;
-        }
+        is_remark |= !is_quoted && rest.starts_with("//");
+        is_fresh |= c == ';' && !is_quoted && !is_remark;
         if c == '"' && !is_remark {
             // Comments hold quotes that nothing marks. The last one is before the semicolon.
             let begin = begins.last().copied().unwrap_or_default();
@@ -530,7 +528,7 @@ mod tests {
             "BO_\nCM_ BO_ 1 \"text\"\n;\nSIG_VALTYPE_ 1 S : 1;\n",
             "CM_ \"text\" \r\n ;\r\nBO_\nSIG_VALTYPE_ 1 S : 1;\n",
             "BO_\nBA_DEF_ BO_ \"x\" INT 0 1; SIG_VALTYPE_ 1 S : 1;\n",
-            "// made \"by hand; BO_ 2\nBO_\nSIG_VALTYPE_ 1 S : 1;\n",
+            "// made \"by hand; SIG_VALTYPE_ 2\nBO_ // \"\nSIG_VALTYPE_ 1 S : 1; // \"\n",
         ] {
             assert_eq!(float(text), own, "{text}");
         }
