@@ -185,7 +185,7 @@ fn a_configuration_is_written_that_the_gateway_runs() {
     }
     // Placeholders are refused, each by its key, until somebody has looked at them.
     let check = ["gateway", "--config", &config, "--check"];
-    let install = ["install", "--config", &folder, "--dry-run"];
+    let install = ["install", "--config", folder, "--dry-run"];
     for arguments in [&check[..], &check[..3], &install] {
         let refused = rig.command(arguments).output().expect("proprio runs");
         let said = text(&refused.stderr);
