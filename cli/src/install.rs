@@ -4,6 +4,7 @@
 use crate::folder::{each_file, read};
 use anyhow::{Context as _, bail};
 use proprio_estimator::files;
+use proprio_gateway::plan::Plan;
 use std::collections::BTreeSet;
 use std::fmt;
 use std::fs;
@@ -171,7 +172,7 @@ fn write(to: PathBuf, bytes: Vec<u8>, mode: u32) -> Step {
 fn check(folder: &Path) -> anyhow::Result<()> {
     let [gateway, estimator] = SERVICES.map(|service| folder.join(service.config));
     if gateway.is_file() {
-        proprio_gateway::daemon::load(&gateway)?;
+        Plan::load_live(&gateway)?;
     }
     if estimator.is_file() {
         proprio_estimator::daemon::load(&estimator, |_| {})?;

@@ -18,14 +18,12 @@
 //! its longest chain of joint origins, but 2 m at least: few links are longer.
 
 use crate::config::{Base, Config};
-use proprio_dynamics::model::{JointKind, Model};
+use proprio_dynamics::model::{JointKind, Model, POINT};
 use proprio_dynamics::spatial::{RigidInertia, Vec3};
 use std::f64::consts::{PI, TAU};
 
 /// The density of osmium \[kg/m^3\].
 const DENSEST: f64 = 22590.0;
-/// A body with a smaller square of its radius of gyration is meant to be a point \[m^2\].
-const POINT: f64 = 1e-9;
 /// The least length that a robot is credited with \[m\].
 const SHORTEST: f64 = 2.0;
 /// Most links that one note names.
@@ -224,6 +222,7 @@ fn bodies(model: &Model, longest: f64) -> impl Iterator<Item = String> {
         };
         Some(what(first, value) + &more)
     };
+    // The inertia of what is meant to be a point says nothing of its size.
     let solid = links().filter(|(body, _)| gyration(body) > POINT);
     let dense = solid.map(|(body, link)| (link, density(body)));
     let dense: Vec<(usize, f64)> = dense.filter(|(_, density)| *density > DENSEST).collect();

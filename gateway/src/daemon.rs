@@ -16,7 +16,6 @@ use crate::link::adapter::{self, Adapter};
 use crate::link::interface::{Netlink, Observer};
 use crate::operator::Operator;
 use crate::plan::{ConfigError, Plan};
-use crate::scan::{FILL_IN, placeholders};
 use crate::thread::{BusThread, join, statuses};
 use crate::watch;
 use anyhow::{Context, anyhow, bail};
@@ -43,7 +42,7 @@ const LOOK: Duration = Duration::from_millis(5);
 /// An error chain with cause, place and remedy; its root is a [`ConfigError`] if the configuration
 /// is wrong.
 pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<()> {
-    let plan = load(config)?;
+    let plan = Plan::load_live(config)?;
     if check {
         // The reader of standard output may close it early.
         let _ = write!(
@@ -61,27 +60,6 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
     served.map_err(|error| match open_files_remedy(&format!("{error:#}")) {
         Some(remedy) => error.context(remedy),
         None => error,
-    })
-}
-
-/// The plan of a gateway.toml in which nothing is left to fill in.
-///
-/// # Errors
-/// As [`Plan::load_live`]; a list of the placeholders, if there are any.
-pub fn load(config: &Path) -> Result<Plan, ConfigError> {
-    let plan = Plan::load_live(config)?;
-    let text = std::fs::read_to_string(config).unwrap_or_default();
-    let left = placeholders(&text);
-    if left.is_empty() {
-        return Ok(plan);
-    }
-    Err(ConfigError {
-        file: config.to_owned(),
-        problem: format!(
-            "placeholders are not filled in; put in what is right, and remove the comment \
-             `{FILL_IN}`:\n{}",
-            left.join("\n")
-        ),
     })
 }
 

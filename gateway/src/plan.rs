@@ -16,6 +16,7 @@ use crate::link::adapter::Adapter;
 use crate::link::replay::Matching;
 use crate::load::{self, BitRates, Load, Member};
 use crate::log::Stamps;
+use crate::scan::{FILL_IN, placeholders};
 use crate::{dbc, eds};
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, OutputInfo, Outputs, Spec};
 use proprio_topics::{
@@ -132,22 +133,29 @@ impl Plan {
     /// # Errors
     /// [`ConfigError`] with file, place, value and the legal values.
     pub fn load(file: &Path) -> Result<Self, ConfigError> {
+        Self::read(file).map(|(plan, _)| plan)
+    }
+
+    /// The plan, and the text that it is made of.
+    fn read(file: &Path) -> Result<(Self, String), ConfigError> {
         let error = |problem| ConfigError {
             file: file.to_owned(),
             problem,
         };
         let text =
             std::fs::read_to_string(file).map_err(|e| error(format!("cannot be read: {e}")))?;
-        Self::parse(&text, file.parent().unwrap_or(Path::new("."))).map_err(error)
+        let plan = Self::parse(&text, file.parent().unwrap_or(Path::new(".")));
+        Ok((plan.map_err(error)?, text))
     }
 
-    /// As [`Plan::load`], for a daemon, which replays logs only as they were recorded, and needs
-    /// buses that carry what its devices send.
+    /// As [`Plan::load`], for a daemon, which replays logs only as they were recorded, needs buses
+    /// that carry what its devices send, and a file in which nothing is left to fill in.
     ///
     /// # Errors
     /// As [`Plan::load`].
     pub fn load_live(file: &Path) -> Result<Self, ConfigError> {
-        let plan = Self::load(file)?;
+        let (plan, text) = Self::read(file)?;
+        let left = placeholders(&text);
         let fast = |bus: &&BusPlan| {
             matches!(
                 bus.source,
@@ -170,6 +178,12 @@ impl Plan {
                 bus.name,
                 bus.load.share * 100.0,
                 bit_rate(bus.rates.nominal)
+            )
+        } else if !left.is_empty() {
+            format!(
+                "placeholders are not filled in; put in what is right, and remove the comment \
+                 `{FILL_IN}`:\n{}",
+                left.join("\n")
             )
         } else {
             return Ok(plan);

@@ -81,16 +81,15 @@ fn private(seen: &Traffic, address: u8, host: u8) -> Option<Finding> {
         .filter(|stream| own(stream, &[kind::STATE, kind::REPORT]));
     let mut states: Vec<&Stream> = states.collect();
     states.sort_by_key(|stream| core::cmp::Reverse(stream.frames));
-    for (stream, place) in states.into_iter().zip(0..) {
-        if place > 0 {
-            evidence.belongs(stream.id);
-        } else if let Some(stream) = evidence.sends(stream.id, is_state) {
+    if let Some((most, others)) = states.split_first() {
+        if let Some(stream) = evidence.sends(most.id, is_state) {
             evidence.moves(stream, |frame| {
                 let [position, velocity] = [0, 2].map(|at| f64::from(u16_be(frame.data(), at)));
                 Some((position, velocity - 32767.5))
             });
             period = stream.period();
         }
+        (others.iter()).for_each(|stream| evidence.belongs(stream.id));
     }
     for stream in seen
         .streams()

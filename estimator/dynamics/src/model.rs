@@ -194,6 +194,10 @@ pub struct Frame {
     pub pose: Pose,
 }
 
+/// A principal moment below the mass times this [m^2] is zero: it is that of the mass 0.03 mm away,
+/// and lengths of a URDF are given to 0.1 mm at best.
+pub const POINT: f64 = 1e-9;
+
 /// Data of a joint that the loops do not need.
 #[derive(Clone, Debug, PartialEq)]
 struct JointFacts {

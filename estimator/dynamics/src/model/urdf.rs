@@ -17,17 +17,13 @@ use self::elements::{numbers, once, part, place, read_sensors, required};
 use super::xml::{self, Document, Node, XmlError};
 use super::{
     Axis, AxisKind, Frame, Joint, JointFacts, JointKind, Limits, MeasurementDirection,
-    MeasurementFrame, Model, ModelError, SensorElement, Unread,
+    MeasurementFrame, Model, ModelError, POINT, SensorElement, Unread,
 };
 use crate::spatial::{Mat3, Pose, RigidInertia, Vec3};
 
 /// Tolerance on the signs of principal moments, relative to the greatest: a URDF is written by hand
 /// or with six digits.
 const INERTIA_TOLERANCE: f64 = 1e-5;
-
-/// A principal moment below the mass times this \[m^2\] is zero: it is that of the mass 0.03 mm
-/// away, and lengths of a URDF are given to 0.1 mm at best.
-const POINT: f64 = 1e-9;
 
 /// A link of the URDF, before folding.
 struct RawLink<'d> {

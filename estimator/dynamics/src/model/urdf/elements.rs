@@ -145,9 +145,9 @@ pub(super) fn read_sensors(
                     why,
                 });
             }
-            Ok(sensor) => match sensors.iter().find(|other| is_same(other, &sensor)) {
+            Ok(sensor) => match sensors.iter().find(|other| is_same_sensor(other, &sensor)) {
                 None => sensors.push(sensor),
-                Some(other) if same_sensor(other, &sensor) => {}
+                Some(other) if is_same_description(other, &sensor) => {}
                 Some(_) => {
                     warnings.push(format!(
                         "line {}: F/T sensor {name} in joint {} is described twice, and \
@@ -163,7 +163,7 @@ pub(super) fn read_sensors(
 }
 
 /// Whether two elements are of one sensor. A name is its own among the sensors of a joint only.
-fn is_same(a: &SensorElement, b: &SensorElement) -> bool {
+fn is_same_sensor(a: &SensorElement, b: &SensorElement) -> bool {
     (&a.joint, &a.name) == (&b.joint, &b.name)
 }
 
@@ -239,7 +239,7 @@ pub(super) fn floats<const N: usize>(text: &str) -> Result<[f64; N], String> {
         .ok_or_else(|| format!("its pose \"{text}\" is not {N} finite numbers"))
 }
 
-pub(super) fn same_sensor(a: &SensorElement, b: &SensorElement) -> bool {
+pub(super) fn is_same_description(a: &SensorElement, b: &SensorElement) -> bool {
     a.joint == b.joint
         && a.frame == b.frame
         && a.direction == b.direction
