@@ -174,8 +174,8 @@ pub(super) fn identifier(id: Id, others: usize, alike: &[u32], near: usize, is_n
         _ => f64::INFINITY,
     };
     let block = match near {
-        4.. => log2(2 * NEAR as usize) - log2(near),
-        _ => f64::INFINITY,
+        0 => f64::INFINITY,
+        _ => log2(2 * NEAR as usize) - log2(near) + [3.0, 2.0, 1.0].get(near - 1).unwrap_or(&0.0),
     };
     chance.min(density).min(block).max(0.0)
 }

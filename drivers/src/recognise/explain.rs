@@ -20,18 +20,18 @@ const FAMILY: f64 = PRIOR - 1.0;
 
 /// Whether both cannot be true: each has frames of one identifier for itself.
 fn contests(a: &Finding, b: &Finding, of: &Explained) -> bool {
-    of.part != Part::Takes
-        && b.explains.iter().any(|other| {
-            let shared = match (of.part, other.part) {
-                (_, Part::Takes) => true,
-                (Part::Tells, Part::Tells) => a.address == b.address,
-                (Part::Sends(Some(one)), Part::Sends(Some(another))) => {
-                    a.driver == b.driver && one != another
-                }
-                (Part::Takes | Part::Tells | Part::Sends(_), _) => false,
-            };
-            other.id == of.id && !shared
-        })
+    b.explains.iter().any(|other| {
+        let shared = match (of.part, other.part) {
+            (_, Part::Takes) | (Part::Takes, Part::Tells) => true,
+            (Part::Takes, Part::Sends(_)) => false,
+            (Part::Tells, Part::Tells) => a.address == b.address,
+            (Part::Sends(Some(one)), Part::Sends(Some(another))) => {
+                a.driver == b.driver && one != another
+            }
+            (Part::Tells | Part::Sends(_), _) => false,
+        };
+        other.id == of.id && !shared
+    })
 }
 
 /// The count of the identifiers of 11 or 29 bits, as `id` has them.
@@ -95,8 +95,7 @@ impl Open {
             let near = self.near(seen, explained.id);
             let mut others = self.others;
             let others = *of_format(&mut others, explained.id);
-            let is_next = |id: &Id| id.raw().abs_diff(explained.id.raw()) == 1;
-            let is_next = before.iter().any(is_next);
+            let is_next = before.iter().any(|id| seen.are_in_a_row(*id, explained.id));
             bits += common(explained.bits, others, alike.len());
             bits += identifier(explained.id, others, &alike, near, is_next);
             before.push(explained.id);

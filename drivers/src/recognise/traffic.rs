@@ -178,6 +178,13 @@ impl Traffic {
         self.0.range(range).map(|(id, _)| *id)
     }
 
+    /// Whether `a` and `b` are of one format, and each identifier between them was heard, too.
+    pub(super) fn are_in_a_row(&self, a: Id, b: Id) -> bool {
+        let gap = a.raw().abs_diff(b.raw()) as usize;
+        core::mem::discriminant(&a) == core::mem::discriminant(&b)
+            && self.between(a.min(b)..=a.max(b)).count() == gap + 1
+    }
+
     /// What was heard, by identifier.
     pub fn streams(&self) -> impl Iterator<Item = &Stream> {
         self.0.values()

@@ -5,7 +5,8 @@ use crate::rig::{FD, frame};
 use proprio_drivers::{Certainty, Finding, Frame, Id, Traffic, questions, recognise};
 use proprio_topics::{Nanos, StampKind};
 
-fn traffic(frames: &[Frame]) -> Traffic {
+/// What was heard, if these frames were.
+pub(crate) fn traffic(frames: &[Frame]) -> Traffic {
     let mut traffic = Traffic::new();
     frames.iter().for_each(|frame| traffic.on_frame(frame));
     traffic
@@ -399,7 +400,11 @@ fn an_odrive_is_known_by_its_heartbeat_or_its_estimates() {
             "ODrive 3.6, firmware 0.5.6",
             "\"0.5\"",
         ),
-        (&[BEAT, "0A0#0203060000070600"], "ODrive", "\"0.6\""),
+        (
+            &[BEAT, ESTIMATES, "0A0#0203060000070600"],
+            "ODrive",
+            "\"0.6\"",
+        ),
     ] {
         let found = found("odrive", &unstamped(texts)).unwrap();
         assert_eq!((found.address, found.what.as_str()), (5, what));
