@@ -61,6 +61,60 @@ fn mit(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
     let Id::Standard(host) = stream.id else {
         return Vec::new();
     };
+    match u8::try_from(host) {
+        Ok(0) => on_zero(seen, stream),
+        Ok(number) => on_its_own(seen, stream, number).into_iter().collect(),
+        Err(_) => Vec::new(),
+    }
+}
+
+fn is_reply(frame: &Frame, number: u8) -> bool {
+    let data = frame.data();
+    let has_length = data.len() == 6 || data.len() == 8 && has_error(data.get(7));
+    has_length && data.first() == Some(&number)
+}
+
+/// Motor `number`, if it replies on the identifier on which it is commanded.
+fn on_its_own(seen: &Traffic, stream: &Stream, number: u8) -> Option<Finding> {
+    let is_its = |frame: &Frame| is_reply(frame, number);
+    let (all, replies) = (
+        stream.recent().count(),
+        stream.recent().filter(|frame| is_its(frame)).count(),
+    );
+    // Like other devices, half of the motors have such a number.
+    let addresses = if number < 0x20 { 0x40 } else { 0xFF };
+    let mut evidence = Evidence::new(seen, addresses);
+    if replies == all {
+        evidence.sends(stream.id, is_its)?;
+    } else if replies * 3 >= all {
+        // Commands and replies in turn, half of which begin with the identifier by chance once in
+        // 256 times.
+        evidence.sends(stream.id, |frame| is_its(frame) || frame.len() == 8)?;
+        evidence.add(8.0);
+    }
+    with_motion(&mut evidence, stream, number);
+    let what = "CubeMars motor in MIT mode";
+    let finding = finding(evidence, number, what, "\"mit\"")?;
+    let keys = Key::period_ms(stream.period_of(is_its), 1, 60_000);
+    let host = Key::new("host_id", number);
+    let finding = finding.with_keys([host]).with_keys(keys);
+    Some(finding.with_commands([stream.id..=stream.id]))
+}
+
+/// Whether the positions of motor `number` go on as its velocities say.
+fn with_motion(evidence: &mut Evidence<'_>, stream: &Stream, number: u8) {
+    evidence.moves(stream, |frame| match *frame.data() {
+        [first, a, b, c, d, ..] if first == number && is_reply(frame, number) => {
+            let velocity = u16::from_be_bytes([c, d]) >> 4;
+            let position = u16::from_be_bytes([a, b]);
+            Some((position.into(), f64::from(velocity) - 2047.5))
+        }
+        _ => None,
+    });
+}
+
+/// The motors that reply on identifier 0.
+fn on_zero(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
     let mut numbers: Vec<u8> = Vec::new();
     for frame in stream.kept() {
         if let Some(&number) = frame.data().first()
@@ -69,58 +123,31 @@ fn mit(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
             numbers.push(number);
         }
     }
-    let own = numbers
-        .first()
-        .is_some_and(|number| u16::from(*number) == host);
-    if host != 0 && !(own && numbers.len() == 1) {
-        return Vec::new();
-    }
-    let is_reply = |frame: &Frame| {
-        let data = frame.data();
-        data.len() == 6 || data.len() == 8 && has_error(data.get(7))
-    };
+    // Numbers are those that were heard: few of them tell something, and less than a rule.
+    let few = stream.frames >= 8 * numbers.len() as u64;
     let find = |number: &u8| {
-        let addresses = match (host, number) {
-            (0, _) => 1,
-            // Like other devices, half of the motors have such a number.
-            (_, ..0x20) => 0x40,
-            _ => 0xFF,
-        };
-        let mut evidence = Evidence::new(seen, addresses);
-        // Numbers are those that were heard: few of them tell something, and less than a rule.
-        let few = stream.frames >= 8 * numbers.len() as u64;
+        let mut evidence = Evidence::new(seen, 1);
         if few && numbers.len() > 1 {
             evidence.add(-3.0);
         }
-        let part = Part::Sends((host == 0).then_some(*number));
-        evidence.sends_as(part, stream.id, |frame| {
-            let is_own = frame.data().first().is_some_and(|first| match host {
-                0 => !few || numbers.contains(first),
-                _ => u16::from(*first) == host,
-            });
-            is_own && is_reply(frame)
+        evidence.sends_as(Part::Sends(Some(*number)), stream.id, |frame| {
+            let first = frame.data().first();
+            first.is_some_and(|first| (!few || numbers.contains(first)) && is_reply(frame, *first))
         })?;
         let command = Id::standard((*number).into());
         let is_its = |frame: &Frame| frame.data().first() == Some(number);
-        if host == 0 {
-            evidence.is_commanded(command, stream, is_its);
-        }
-        evidence.moves(stream, |frame| match *frame.data() {
-            [first, a, b, c, d, ..] if first == *number => {
-                let velocity = u16::from_be_bytes([c, d]) >> 4;
-                let position = u16::from_be_bytes([a, b]);
-                Some((position.into(), f64::from(velocity) - 2047.5))
-            }
-            _ => None,
-        });
+        evidence.is_commanded(command, stream, is_its);
+        with_motion(&mut evidence, stream, *number);
         let what = "CubeMars motor in MIT mode";
         let finding = finding(evidence, *number, what, "\"mit\"")?;
-        let host = (host != 0).then(|| Key::new("host_id", host));
         let period = Key::period_ms(stream.period_of(is_its), 1, 60_000);
-        let finding = finding.with_keys(host).with_keys(period);
-        Some(finding.with_commands([command..=command]))
+        Some(finding.with_keys(period).with_commands([command..=command]))
     };
     // A bus has not many motors: more numbers are no numbers.
-    let few = numbers.len() <= 16;
-    numbers.iter().filter(|_| few).filter_map(find).collect()
+    let are_few = numbers.len() <= 16;
+    numbers
+        .iter()
+        .filter(|_| are_few)
+        .filter_map(find)
+        .collect()
 }

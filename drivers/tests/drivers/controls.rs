@@ -548,6 +548,26 @@ fn the_commands_of_motors_are_no_sensor() {
     }
 }
 
+/// A motor of CubeMars that replies on its own number, on which it is commanded, too.
+#[test]
+fn a_motor_is_found_among_its_commands() {
+    let mut bus = Bus::default();
+    let position = |turn: u32| (33_000.0 + 3000.0 * (f64::from(turn) * 0.03).sin()) as u16;
+    bus.every(5.0, 0.3, Id::standard(7), |turn| {
+        let [a, b] = position(turn).to_be_bytes();
+        vec![a, b, 0x7F, 0xF0, 0xA3, 0x33, 0x37, 0xFF]
+    });
+    bus.every(5.0, 0.4, Id::standard(7), |turn| {
+        let [a, b] = position(turn).to_be_bytes();
+        let velocity = 2047.0 + 300.0 * (f64::from(turn) * 0.03).cos();
+        let [c, d] = ((velocity as u16) << 4 | 7).to_be_bytes();
+        vec![7, a, b, c, d, 0xFF, 0x46, 0]
+    });
+    let found = likely(&bus.heard());
+    let told: Vec<(&str, u32)> = found.iter().map(|f| (f.driver, f.address)).collect();
+    assert_eq!(told, [("cubemars", 7)], "{found:?}");
+}
+
 /// A node of a profile that no driver reads is named as such, and taken for nothing else.
 #[test]
 fn an_unknown_node_is_a_node() {
