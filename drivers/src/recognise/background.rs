@@ -11,13 +11,15 @@
 //!   states and small numbers. One that changes, and that the rule still fits, counts one bit more.
 //! - **Identifier**: half of the devices have a number below 20 (hexadecimal) as their identifier,
 //!   the others any of 11 bits, or of about 20 bits that are in use of 29. Any of the identifiers
-//!   that are heard might have been this one. An identifier next to one that is already explained
-//!   counts one bit: most devices number their frames.
+//!   that are heard might have been this one. An identifier that follows one that is already
+//!   explained counts one bit, and so does one of the same row of identifiers, all of which are
+//!   heard: most devices number their frames.
 //! - **This bus**: the streams of it that no device of the family explains tell, too, how often
 //!   other devices fulfil the rule. Where the rule fits other streams too, which are none
 //!   of this family, the identifier is one of theirs: it counts no more than the density with which
-//!   they fill the range from the first to the last of them. So it is where four streams or more
-//!   are within 32 identifiers of it, whatever their form: devices have blocks of identifiers.
+//!   they fill the range from the first to the last of them. So it is where other streams are
+//!   within 32 identifiers of it, whatever their form: devices have blocks of identifiers. Four
+//!   are a block; with each that is missing it is one half as often.
 
 use super::traffic::{Stream, Traffic};
 use crate::{Format, Frame, Id};
@@ -38,6 +40,8 @@ const SMALL: f64 = 2.0;
 const CHANGING: f64 = 1.0;
 /// How far the identifiers of a block are from each other.
 pub(super) const NEAR: u32 = 32;
+/// How many streams near each other are a block of identifiers.
+const BLOCK: usize = 4;
 /// The bits of an identifier next to one that is explained.
 const NEXT: f64 = 1.0;
 
@@ -175,7 +179,7 @@ pub(super) fn identifier(id: Id, others: usize, alike: &[u32], near: usize, is_n
     };
     let block = match near {
         0 => f64::INFINITY,
-        _ => log2(2 * NEAR as usize) - log2(near) + [3.0, 2.0, 1.0].get(near - 1).unwrap_or(&0.0),
+        _ => log2(2 * NEAR as usize) - log2(near) + log2(1 << BLOCK.saturating_sub(near)),
     };
     chance.min(density).min(block).max(0.0)
 }
