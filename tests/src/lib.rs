@@ -8,6 +8,7 @@
 //! - [`watch`]: waits for a health condition or the first valid estimate; records everything
 //!   published; reads the truth.
 //! - [`browse`]: checks a report in a headless browser.
+//! - [`truth`]: is a valid torque true, whatever goes wrong?
 //! - [`can`]: candump, canplayer, cangen, cansend, ip.
 //!
 //! Every process started here is ended by its process id when its handle is dropped, whether the
@@ -17,6 +18,7 @@ mod arm;
 mod browser;
 pub mod can;
 mod process;
+pub mod truth;
 pub mod watch;
 
 pub use arm::{Arm, Written};

@@ -1,0 +1,103 @@
+//! The long set of [`proprio_tests::truth`]: a line for each trouble, and the runs that break the
+//! promise.
+//!
+//! ```text
+//! truth [FIRST LAST [TROUBLE..]]     seeds, and parts of troubles' names; default: 1 12, all
+//! truth --keep FOLDER SEED TROUBLE   writes one run's log and configuration
+//! ```
+
+use proprio_tests::truth::{Outcome, Run, TROUBLES, Trouble};
+use std::process::ExitCode;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+fn main() -> ExitCode {
+    let words: Vec<String> = std::env::args().skip(1).collect();
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    if let ["--keep", folder, seed, name] = words[..] {
+        let seed = seed.parse().expect("a seed");
+        let [(_, trouble)] = named(&[name])[..] else {
+            panic!("{name:?} names no trouble, or several");
+        };
+        let run = Run::new(seed, trouble).expect("the robot has no such channel");
+        let [log, config] = run.files();
+        std::fs::write(format!("{folder}/log.csv"), log).expect("a file");
+        std::fs::write(format!("{folder}/estimator.toml"), config).expect("a file");
+        println!("{:#?}", run.judged());
+        return ExitCode::SUCCESS;
+    }
+    let (first, last, names) = match words[..] {
+        [first, last, ref names @ ..] => (first, last, names),
+        _ => ("1", "12", &[][..]),
+    };
+    let seeds = first.parse().expect("a seed")..=last.parse().expect("a seed");
+    let (mut runs, mut broken) = (0, 0);
+    println!(
+        "| trouble | broken | valid late | deviation / range | worst |\n|---|---|---|---|---|"
+    );
+    for (name, trouble) in named(names) {
+        let outcomes = all(seeds.clone().collect(), trouble);
+        let (line, few) = line(&outcomes);
+        println!("| {name} | {few} of {} | {line} |", outcomes.len());
+        for (seed, outcome) in outcomes.iter().filter(|(_, outcome)| outcome.is_broken()) {
+            eprintln!("  {seed}: {outcome:?}");
+        }
+        runs += outcomes.len();
+        broken += few;
+    }
+    println!("\nThe promise is broken in {broken} of {runs} runs.");
+    ExitCode::from(u8::from(broken > 0))
+}
+
+fn named(names: &[&str]) -> Vec<(&'static str, Trouble)> {
+    let all = TROUBLES.iter().copied();
+    let exactly = |name: &&str| TROUBLES.iter().any(|(known, _)| known == name);
+    let is_meant = |known: &str| {
+        let meant = |name: &&str| known == *name || !exactly(name) && known.contains(*name);
+        names.is_empty() || names.iter().any(meant)
+    };
+    all.filter(|(known, _)| is_meant(known)).collect()
+}
+
+/// The runs of all seeds, on all processors.
+fn all(seeds: Vec<u64>, trouble: Trouble) -> Vec<(u64, Outcome)> {
+    let (next, outcomes) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
+    std::thread::scope(|scope| {
+        for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
+            scope.spawn(|| {
+                while let Some(seed) = seeds.get(next.fetch_add(1, Ordering::Relaxed)) {
+                    if let Some(run) = Run::new(*seed, trouble) {
+                        let outcome = run.judged();
+                        outcomes.lock().expect("no panic").push((*seed, outcome));
+                    }
+                }
+            });
+        }
+    });
+    let mut outcomes = outcomes.into_inner().expect("no panic");
+    outcomes.sort_by_key(|(seed, _)| *seed);
+    outcomes
+}
+
+/// The line of the table, and how many runs break the promise.
+fn line(outcomes: &[(u64, Outcome)]) -> (String, usize) {
+    let of = || outcomes.iter().map(|(_, outcome)| outcome);
+    let broken = of().filter(|outcome| outcome.is_broken()).count();
+    let [all, valid] = [0, 1].map(|k| of().map(|outcome| outcome.late[k]).sum::<usize>());
+    let mut deviations: Vec<f64> = of().map(|outcome| outcome.deviation).collect();
+    deviations.retain(|deviation| deviation.is_finite());
+    deviations.sort_by(f64::total_cmp);
+    let deviation = deviations.get(deviations.len() / 2).copied();
+    let worst = of().filter_map(|outcome| outcome.worst.as_ref());
+    let worst = worst.max_by(|a, b| a.share.total_cmp(&b.share));
+    let worst = worst.map_or_else(String::new, |worst| {
+        let (error, deviations) = (worst.error, worst.deviations);
+        format!(
+            "{error:.2} Nm, {deviations:.0} deviations, {:.0} %",
+            100.0 * worst.share
+        )
+    });
+    let share = valid as f64 / all.max(1) as f64;
+    let deviation = deviation.map_or_else(String::new, |d| format!("{d:.3}"));
+    (format!("{share:.2} | {deviation} | {worst}"), broken)
+}
