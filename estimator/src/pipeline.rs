@@ -76,7 +76,7 @@ use crate::differentiate::{Grid, Window};
 use crate::history::{ChannelValue, History};
 use crate::propagation::Propagation;
 use crate::setup::Setup;
-use buffers::{ChannelBuffer, OrReason, stale, temperature_at};
+use buffers::{ChannelBuffer, OrReason, Sanity, stale, temperature_at};
 use channels::{imu_at, joint_at, wrench_at};
 use contacts::Contacts;
 use identification::OnlineIdentification;
@@ -99,6 +99,8 @@ use validity::Dependences;
 pub struct Pipeline {
     setup: Setup,
     buffers: Vec<ChannelBuffer>,
+    /// The same channels: whether their readings can be true.
+    sanity: Vec<Sanity>,
     /// The stamp-dependent part of differentiation, shared by channels with equal stamps.
     grid: Box<Grid>,
     /// Per channel, why its value at the present instant is not valid.
@@ -207,6 +209,7 @@ impl Pipeline {
         }
         Self {
             buffers: buffers.collect(),
+            sanity: vec![Sanity::default(); setup.robot.channels.len()],
             grid: Box::default(),
             faults: vec![Reason::NeverSeen; setup.robot.channels.len()],
             base_fault: Reason::None,

@@ -5,16 +5,20 @@ use crate::dispatch::Dispatch;
 use crate::inbox::{Replacement, Reply, Request};
 use crate::joints::Joints;
 use crate::plan::{BusPlan, DevicePlan, Route};
-use crate::sanity::Sanity;
 use crate::status::BusStatus;
 use proprio_drivers::{
     Claim, CommandFailed, Decoded, Device, Frame, Mode, NotSent, SpecError, State, Transmit,
 };
+use proprio_topics::sanity::Repeats;
 use proprio_topics::{
     Counter, Header, MAX_CHANNELS, Nanos, Quality, Reading, Sample, StampKind, Wrench,
 };
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
+
+/// The shortest run of equal wrenches that counts as frozen, however improbable: some boards send
+/// one measurement several times, if they send faster than they measure.
+const LEAST_RUN: u32 = 16;
 
 /// The devices of one bus, their routes and counters.
 pub struct Decoder {
@@ -38,7 +42,7 @@ struct Running {
     routes: Vec<Route>,
     request: Open,
     /// The past of its wrenches, per route.
-    sanity: Vec<Sanity>,
+    repeats: Vec<Repeats<6>>,
 }
 
 /// The request of a device that has not been replied to.
@@ -91,7 +95,7 @@ impl Decoder {
                     device: build(device, mode)?,
                     routes: device.routes.clone(),
                     request: Open::None,
-                    sanity: vec![Sanity::new(); device.routes.len()],
+                    repeats: vec![Repeats::default(); device.routes.len()],
                 })
             })
             .collect::<Result<Vec<_>, SpecError>>()?;
@@ -200,8 +204,10 @@ impl Decoder {
                     }
                 }
                 if let Reading::Wrench(wrench) = &output.reading {
-                    let sanity = running.sanity.get_mut(at);
-                    let frozen = sanity.map_or(0, |sanity| sanity.look(wrench, quality));
+                    let repeats = running.repeats.get_mut(at);
+                    let ([fx, fy, fz], [tx, ty, tz]) = (wrench.force, wrench.torque);
+                    let values = [fx, fy, fz, tx, ty, tz];
+                    let frozen = repeats.map_or(0, |r| r.look(&values, quality, LEAST_RUN));
                     let beyond = beyond(wrench, running.device.full_scale());
                     if frozen != 0 {
                         quality |= Quality::FROZEN;
@@ -369,7 +375,7 @@ impl Decoder {
             }
             if let Some(device) = &mut new.device {
                 std::mem::swap(device, &mut running.device);
-                running.sanity.fill(Sanity::new());
+                running.repeats.fill(Repeats::default());
             }
             std::mem::swap(&mut new.routes, &mut running.routes);
             self.status.set_state(number, running.device.state());
@@ -494,7 +500,7 @@ mod tests {
             }),
             routes: Vec::new(),
             request: Open::None,
-            sanity: Vec::new(),
+            repeats: Vec::new(),
         };
         let mut decoder = Decoder::of(0, vec![running], Joints::default(), Arc::clone(&status));
         assert_eq!(decoder.claims(), [Claim::exclusive(answer)]);

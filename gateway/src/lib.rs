@@ -17,7 +17,6 @@
 //! - [`load`]: the share of a bus's time that its devices need.
 //! - [`decoder`]: all devices of one bus, without input or output; [`bus`]: the loop that moves
 //!   frames through it; [`inbox`]: what the control plane asks of it while it runs.
-//! - `sanity`: whether the values of force/torque sensors can be true.
 //! - [`publish`]: the destinations of samples; [`status`]: the counters of a bus thread.
 //! - [`scan`]: which devices are on a bus, and a configuration for them.
 //! - [`offline`]: converts a log to a table of samples and back, without a daemon.
@@ -46,7 +45,6 @@ mod operator;
 pub mod plan;
 pub mod publish;
 mod reload;
-mod sanity;
 pub mod scan;
 pub mod status;
 mod thread;

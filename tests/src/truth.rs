@@ -28,6 +28,7 @@ use proprio_topics::{Imu, JointState, Kind, NO_CAUSE, Nanos, Quality, Reading, W
 use random::Random;
 use robot::Robot;
 use std::collections::BTreeMap;
+use std::f64::consts::TAU;
 use std::fmt::Write as _;
 use toml::Table;
 use world::{DURATION, Series, World};
@@ -335,6 +336,17 @@ fn readings(
     let period = [0.005, 0.01, 0.01, 0.02][random.below(4)];
     let together = random.happens(0.5);
     let phase = random.uniform(0.0, period);
+    // Resolutions: none, or that of usual encoders and of 16 bits of usual ranges.
+    let turn = [0.0, TAU / 65536.0, TAU / 16384.0][random.below(3)];
+    let bits = if random.happens(0.5) {
+        1.0 / 32768.0
+    } else {
+        0.0
+    };
+    let rounded = |value: f64, step: f64| match step > 0.0 {
+        true => (value / step).round() * step,
+        false => value,
+    };
     let mut all = Vec::new();
     let mut of =
         |kind: Kind, name: &str, period: f64, phase: f64, read: &mut dyn FnMut(f64) -> Vec<f64>| {
@@ -359,7 +371,13 @@ fn readings(
             Kind::Joint => {
                 let dof = setup.robot.joint_names().position(|joint| joint == name);
                 let dof = dof.expect("its joint");
-                let mut read = |t| vec![world.at(t).position[dof] + 1e-4 * noise.normal()];
+                let deviation = if turn > 0.0 { 2e-5 } else { 1e-4 };
+                let mut read = |t| {
+                    vec![rounded(
+                        world.at(t).position[dof] + deviation * noise.normal(),
+                        turn,
+                    )]
+                };
                 of(kind, name, period, own, &mut read);
             }
             Kind::Wrench => {
@@ -371,8 +389,12 @@ fn readings(
                     let wrench = world.at(t).wrenches[sensor];
                     let axes = wrench.iter().zip(offsets[sensor]).enumerate();
                     let noisy = axes.map(|(axis, (value, offset))| {
-                        let deviation = if axis < 3 { 0.1 } else { 0.005 };
-                        value + offset + deviation * noise.normal()
+                        let (deviation, range) = if axis < 3 {
+                            (0.1, 1000.0)
+                        } else {
+                            (0.005, 40.0)
+                        };
+                        rounded(value + offset + deviation * noise.normal(), range * bits)
                     });
                     noisy.collect()
                 };

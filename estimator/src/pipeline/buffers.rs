@@ -3,7 +3,8 @@
 use super::prediction::Predictor;
 use crate::differentiate::Window;
 use crate::history::{ChannelValue, History};
-use proprio_topics::{Nanos, Reason};
+use proprio_topics::sanity::{Jumps, Repeats};
+use proprio_topics::{Nanos, Quality, Reason};
 
 /// The last samples of one channel, and a window for the values that are differentiated.
 pub(super) enum ChannelBuffer {
@@ -26,6 +27,44 @@ impl ChannelBuffer {
         }
     }
 }
+
+/// Judges the readings of one channel by those before it.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Sanity {
+    newest: Nanos,
+    repeats: Repeats<6>,
+    jumps: Jumps<6>,
+}
+
+impl Sanity {
+    /// The flags of a reading at `t`, NaN where it has fewer than six values, with `quality` as its
+    /// device has it. A reading that repeats itself is no news: after `max_silence` it is frozen,
+    /// if its noise makes that impossible.
+    pub(super) fn look(
+        &mut self,
+        t: Nanos,
+        values: &[f64; 6],
+        quality: Quality,
+        max_silence: Nanos,
+    ) -> Quality {
+        let period = (t - self.newest).0.max(1);
+        self.newest = t;
+        let least = u32::try_from(max_silence.0 / period).unwrap_or(LONGEST);
+        let frozen = (self.repeats).look(values, quality, least.clamp(2, LONGEST));
+        let jumps = self.jumps.look(t, values, quality);
+        let mut flags = quality;
+        if frozen != 0 {
+            flags |= Quality::FROZEN;
+        }
+        if jumps {
+            flags |= Quality::IMPLAUSIBLE;
+        }
+        flags
+    }
+}
+
+/// The longest run of equal readings that may be one measurement, sent several times.
+const LONGEST: u32 = 16;
 
 pub(super) trait OrReason {
     /// This reason, or `other` if there is none.

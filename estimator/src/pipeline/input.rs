@@ -21,6 +21,12 @@ impl Pipeline {
         let all_finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
         let finite_or_absent = |values: &[f64]| values.iter().all(|v| !v.is_infinite());
         let is_continued = !quality.intersects(Quality::ZERO_CHANGED);
+        let max_silence = self.setup.robot.max_silence;
+        let mut sanity = self.sanity.get_mut(channel);
+        let mut judged = |values: [f64; 6]| match &mut sanity {
+            Some(sanity) => sanity.look(t, &values, quality, max_silence),
+            None => quality,
+        };
         // Decide first whether the sample may be taken; then push it to window and history.
         let (mut late, mut backward) = (false, false);
         let mut admit = |is_valid: bool| {
@@ -40,12 +46,15 @@ impl Pipeline {
                     if !is_continued {
                         window.interrupt();
                     }
-                    // A position that the encoder itself marks as untrusted is kept, but not
-                    // differentiated.
-                    if Reason::of_quality(quality, Quality::UNTRUSTED_ENCODER) == Reason::None {
-                        let _ = window.push(t, [j.position]);
-                    } else {
-                        window.interrupt();
+                    const NONE: f64 = f64::NAN;
+                    let quality = judged([j.position, NONE, NONE, NONE, NONE, NONE]);
+                    // A position that is not to be trusted is kept, but not differentiated.
+                    match Reason::of_quality(quality, Quality::UNTRUSTED_ENCODER) {
+                        Reason::None => {
+                            let _ = window.push(t, [j.position]);
+                        }
+                        Reason::Implausible => {}
+                        _ => window.interrupt(),
                     }
                     history.push(t, [j.position, j.velocity, j.acceleration], quality);
                 }
@@ -80,8 +89,11 @@ impl Pipeline {
                 let value = [fx, fy, fz, tx, ty, tz];
                 let is_valid = all_finite(&value);
                 if admit(is_valid) {
-                    if let Some(predictor) = predictor {
-                        let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
+                    let quality = judged(value);
+                    let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
+                    if let Some(predictor) = predictor
+                        && fault != Reason::Implausible
+                    {
                         predictor.push(t, &value, fault == Reason::None, is_continued);
                     }
                     history.push(t, value, quality);
@@ -93,25 +105,23 @@ impl Pipeline {
                     && all_finite(&i.angular_velocity)
                     && finite_or_absent(&i.angular_acceleration);
                 if admit(is_valid) {
+                    let ([ax, ay, az], [gx, gy, gz]) = (i.proper_acceleration, i.angular_velocity);
+                    let quality = judged([ax, ay, az, gx, gy, gz]);
                     let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
-                    if let Some(predictor) = predictor {
-                        predictor.push(
-                            t,
-                            &i.proper_acceleration,
-                            fault == Reason::None,
-                            is_continued,
-                        );
+                    if let Some(predictor) = predictor
+                        && fault != Reason::Implausible
+                    {
+                        let is_good = fault == Reason::None;
+                        predictor.push(t, &i.proper_acceleration, is_good, is_continued);
                     }
-                    if fault == Reason::None {
-                        let _ = window.push(t, i.angular_velocity);
-                    } else {
-                        window.interrupt();
+                    match fault {
+                        Reason::None => {
+                            let _ = window.push(t, i.angular_velocity);
+                        }
+                        Reason::Implausible => {}
+                        _ => window.interrupt(),
                     }
-                    let ([ax, ay, az], [gx, gy, gz], [bx, by, bz]) = (
-                        i.proper_acceleration,
-                        i.angular_velocity,
-                        i.angular_acceleration,
-                    );
+                    let [bx, by, bz] = i.angular_acceleration;
                     history.push(t, [ax, ay, az, gx, gy, gz, bx, by, bz], quality);
                 }
                 is_valid

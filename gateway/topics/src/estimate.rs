@@ -41,6 +41,9 @@ pub enum Reason {
     /// A sensor it depends on repeats its readings instead of measuring ([`Quality::FROZEN`]), and
     /// is not saturated.
     Frozen = 12,
+    /// A reading it depends on contradicts the ones before it, and no later one has confirmed it
+    /// ([`Quality::IMPLAUSIBLE`]).
+    Implausible = 13,
 }
 
 coded!(Reason {
@@ -57,6 +60,7 @@ coded!(Reason {
     NoStance = "no_stance",
     Unexplained = "unexplained",
     Frozen = "frozen",
+    Implausible = "implausible",
 });
 
 impl Reason {
@@ -69,6 +73,8 @@ impl Reason {
             Self::Saturated
         } else if quality.intersects(Quality::FROZEN) {
             Self::Frozen
+        } else if quality.intersects(Quality::IMPLAUSIBLE) {
+            Self::Implausible
         } else if quality.intersects(faults) {
             Self::DeviceFault
         } else {

@@ -44,6 +44,7 @@ pub mod reading;
 #[cfg(feature = "ipc")]
 pub mod realtime;
 pub mod sample;
+pub mod sanity;
 pub mod time;
 
 pub use code::{Code, Coded};

@@ -74,10 +74,14 @@ impl Quality {
     /// joint's new offset): no motion or load lies between them.
     pub const ZERO_CHANGED: Self = Self(1 << 7);
 
+    /// The value is far from where those before it lead, and no later one has confirmed it yet
+    /// ([`crate::sanity`]). The estimator finds it.
+    pub const IMPLAUSIBLE: Self = Self(1 << 8);
+
     /// The flags that make an encoder's position unusable.
     pub const UNTRUSTED_ENCODER: Self = Self(Self::DEVICE_FAULT.0 | Self::NOT_CALIBRATED.0);
 
-    const NAMED: [(Self, &'static str); 8] = [
+    const NAMED: [(Self, &'static str); 9] = [
         (Self::GAP_BEFORE, "gap_before"),
         (Self::SATURATED, "saturated"),
         (Self::FROZEN, "frozen"),
@@ -86,6 +90,7 @@ impl Quality {
         (Self::DEVICE_COUNTER, "device_counter"),
         (Self::DRIVE_FAULT, "drive_fault"),
         (Self::ZERO_CHANGED, "zero_changed"),
+        (Self::IMPLAUSIBLE, "implausible"),
     ];
     const SATURATION_SHIFT: u32 = 16;
 

@@ -348,7 +348,9 @@ impl Component {
             *match reason {
                 Reason::Stale => &mut counts.stale,
                 Reason::Saturated => &mut counts.saturated,
-                Reason::DeviceFault | Reason::Frozen => &mut counts.device_fault,
+                Reason::DeviceFault | Reason::Frozen | Reason::Implausible => {
+                    &mut counts.device_fault
+                }
                 _ => &mut counts.unseen,
             } += 1;
             return;

@@ -1,0 +1,315 @@
+//! Whether the readings of a channel can be true: each is judged by those before it.
+//!
+//! # Repeats
+//! A value that stops to change, although its noise made that impossible, is frozen. Boards freeze
+//! without saying so: after a temperature error, or while a gauge of which they do not tell is
+//! saturated.
+//!
+//! Each axis is judged by its own past alone, in steps of its own resolution (the smallest change
+//! seen). Its noise is the mean absolute second difference of successive readings: motion leaves it
+//! small, because smooth values bend little between two readings. What counts is the noise of the
+//! quietest recent stretch: after a motion with vibration the noise at rest may be far smaller.
+//!
+//! Of white noise with a mean second difference of n steps, at most the share 0.55 / n of the
+//! readings equals the one before (Gaussian: the deviation is n / 1.95 steps, and the density of a
+//! first difference at zero is 0.28 / deviation). So a run of r equal readings has the probability
+//! (0.55 / n)^r, and that of all axes together is the product. Three times that share is allowed,
+//! because stretches differ; then the limit of 1e-12 is one false alarm in 30 years at 1 kHz. A
+//! coarse sensor at rest, whose noise is below its resolution, is expected to repeat itself and
+//! raises no alarm; nor does one that has never changed. Boards that send faster than they measure
+//! send one measurement several times: the caller says from how many on a run counts.
+//!
+//! What this does not see: a value that was constant from the start, and one that is wrong but
+//! goes on changing.
+//!
+//! # Jumps
+//! A value that is far from where those before it lead is doubtful until the next one confirms it:
+//! one wrong reading is no motion and no load. See [`Jumps`].
+
+use crate::{Nanos, Quality};
+
+/// Minus the logarithm of the probability of a false alarm per reading: 1e-12.
+const CERTAINTY: f64 = 27.6;
+
+/// The share of equal readings at a noise of one step: three times that of white noise.
+const SHARE: f64 = 3.0 * 0.55;
+
+/// Readings over which noise is averaged: few, so that it follows a vibration that fades away.
+const AVERAGE: f64 = 16.0;
+
+/// Readings over which the noise of a quiet stretch is forgotten.
+const FORGET: f64 = 256.0;
+
+/// A second difference counts as at most so many times the noise so far, so that a single wrong
+/// reading, or a stop at once, is no noise.
+const OUTLIER: f64 = 4.0;
+
+/// The past of one axis. NaN: not known.
+#[derive(Debug, Clone, Copy)]
+struct Axis {
+    last: f64,
+    /// The last change.
+    change: f64,
+    /// The smallest change seen.
+    step: f64,
+    /// The mean absolute second difference at present, and of the quietest recent stretch.
+    noise: f64,
+    quiet: f64,
+    /// Number of readings in a row that equal the one before.
+    run: u32,
+    frozen: bool,
+}
+
+impl Axis {
+    const NEW: Self = Self {
+        last: f64::NAN,
+        change: f64::NAN,
+        step: f64::INFINITY,
+        noise: 0.0,
+        quiet: 0.0,
+        run: 0,
+        frozen: false,
+    };
+
+    fn take(&mut self, value: f64) {
+        let change = value - self.last;
+        let bend = (change - self.change).abs();
+        (self.last, self.change) = (value, change);
+        if change == 0.0 {
+            self.run = self.run.saturating_add(1);
+        } else {
+            self.run = 0;
+            if change.is_finite() {
+                self.step = self.step.min(change.abs());
+            }
+        }
+        if self.step.is_finite() && bend.is_finite() {
+            let most = OUTLIER * self.noise.max(self.step);
+            self.noise += (bend.min(most) - self.noise) / AVERAGE;
+        }
+        if self.run > 0 {
+            return;
+        }
+        if core::mem::take(&mut self.frozen) && change.abs() > 2.0 * self.step {
+            // What was no measurement tells nothing of the noise. But a value that goes on by a
+            // step was measured all the time: its noise at rest is below the resolution.
+            self.noise = self.quiet;
+        }
+        let risen = self.quiet + (self.noise - self.quiet) / FORGET;
+        self.quiet = risen.min(self.noise);
+    }
+
+    /// It was frozen with the others, which are no longer: its value is the same by chance.
+    const fn release(&mut self) {
+        self.run = 0;
+        self.frozen = false;
+        self.noise = self.quiet;
+    }
+
+    /// What follows has no connection with what came before; its noise has.
+    const fn interrupt(&mut self) {
+        self.last = f64::NAN;
+        self.change = f64::NAN;
+        self.run = 0;
+        self.frozen = false;
+    }
+
+    /// Minus the logarithm of the probability that a reading equals the one before.
+    fn surprise(&self) -> f64 {
+        libm::log(self.quiet / (SHARE * self.step)).max(0.0)
+    }
+}
+
+/// The repeats of a channel of `N` axes.
+#[derive(Debug, Clone, Copy)]
+pub struct Repeats<const N: usize> {
+    axes: [Axis; N],
+    /// All axes together are frozen.
+    all: bool,
+}
+
+impl<const N: usize> Default for Repeats<N> {
+    fn default() -> Self {
+        Self {
+            axes: [Axis::NEW; N],
+            all: false,
+        }
+    }
+}
+
+impl<const N: usize> Repeats<N> {
+    /// Takes a reading, NaN where it has none; returns the axes that are frozen, bit k for axis k.
+    /// A run of fewer than `least` readings that equal the one before does not count, however
+    /// improbable it is.
+    ///
+    /// A reading of which the device itself says that it is not a measurement is not judged.
+    pub fn look(&mut self, values: &[f64; N], quality: Quality, least: u32) -> u16 {
+        let axes = &mut self.axes;
+        if quality.intersects(Quality::FROZEN | Quality::SATURATED) {
+            axes.iter_mut().for_each(Axis::interrupt);
+            self.all = false;
+            return 0;
+        }
+        axes.iter_mut()
+            .zip(values)
+            .for_each(|(axis, value)| axis.take(*value));
+        // Axes that the sensor does not measure are not part of it.
+        let measured = || axes.iter().filter(|axis| !axis.last.is_nan());
+        let longest = measured().map(|axis| axis.run).max().unwrap_or(0);
+        let together = measured().map(|axis| axis.run).min().unwrap_or(0);
+        if self.all && together == 0 {
+            self.all = false;
+            let same = axes.iter_mut().filter(|axis| axis.run > 0);
+            same.for_each(Axis::release);
+            return 0;
+        }
+        if longest < least {
+            return 0;
+        }
+        let certain =
+            |run: u32, surprise: f64| run >= least && f64::from(run) * surprise >= CERTAINTY;
+        self.all |= certain(together, measured().map(Axis::surprise).sum());
+        let mut mask = 0;
+        let numbered = (0..).zip(axes.iter_mut());
+        for (number, axis) in numbered.filter(|(_, axis)| !axis.last.is_nan()) {
+            axis.frozen |= self.all || certain(axis.run, axis.surprise());
+            mask |= u16::from(axis.frozen) << number;
+        }
+        mask
+    }
+}
+
+/// How far a reading may be from where those before it lead: so many times the largest such
+/// distance of about the last [`MEMORY`] readings. That of white noise exceeds it never: the
+/// largest of 32 is two deviations, and ten are left.
+const FAR: f64 = 5.0;
+/// A gap, in periods.
+const GAP: f64 = 5.0;
+/// Readings over which a large distance is forgotten.
+const MEMORY: f64 = 32.0;
+/// So many readings are taken as they come, to see how they are.
+const FIRST: u32 = 16;
+/// How much larger the expected distance becomes by one reading, at most: two wrong readings that
+/// confirm each other by chance shall not make the third a usual one.
+const GROWTH: f64 = 2.0;
+
+/// The path of one axis.
+#[derive(Debug, Clone, Copy)]
+struct Path {
+    /// The last reading that is not doubtful.
+    t: Nanos,
+    value: f64,
+    /// Its change \[1/s\].
+    rate: f64,
+    /// The usual time between two readings \[s\].
+    period: f64,
+    /// The largest recent distance from where the path led.
+    most: f64,
+    /// The smallest change seen: the resolution.
+    step: f64,
+    /// Readings so far.
+    count: u32,
+    /// The last reading follows a gap: where it leads is not known.
+    resumes: bool,
+    /// A doubtful reading, and its distance.
+    doubtful: Option<(Nanos, f64, f64)>,
+}
+
+impl Path {
+    const NEW: Self = Self {
+        t: Nanos::ZERO,
+        value: f64::NAN,
+        rate: 0.0,
+        period: 0.0,
+        most: 0.0,
+        step: f64::INFINITY,
+        count: 0,
+        resumes: false,
+        doubtful: None,
+    };
+
+    /// Takes a reading; returns whether it is doubtful.
+    fn take(&mut self, t: Nanos, value: f64) -> bool {
+        let after = (t - self.t).seconds();
+        if !value.is_finite() || after <= 0.0 && self.count > 0 {
+            return false;
+        }
+        if self.value.is_finite() && value != self.value {
+            self.step = self.step.min((value - self.value).abs());
+        }
+        let distance = (value - self.value - self.rate * after).abs();
+        if self.count < FIRST || self.value.is_nan() {
+            self.count += 1;
+            self.period = if self.period > 0.0 {
+                self.period.min(after)
+            } else {
+                after
+            };
+            return self.accept(t, value, if self.count > 2 { distance } else { 0.0 });
+        }
+        if self.resumes {
+            return self.accept(t, value, 0.0);
+        }
+        let usual = FAR * self.most.max(self.step);
+        // Smooth values bend with the square of the time.
+        let longer = (after / self.period).max(1.0);
+        if distance <= usual * longer * longer {
+            return self.accept(t, value, distance / (longer * longer));
+        }
+        if let Some((then, before, off)) = self.doubtful {
+            let (since, between) = ((then - self.t).seconds(), (t - then).seconds());
+            let rate = (before - self.value) / since;
+            let is_near = (value - before).abs() <= usual;
+            if is_near || (value - before - rate * between).abs() <= off {
+                // A step; or a motion, whose readings bend so much.
+                let most = match is_near {
+                    true => 0.0,
+                    false => off.min(GROWTH * self.most.max(self.step)),
+                };
+                (self.t, self.value) = (then, before);
+                return self.accept(t, value, most);
+            }
+        }
+        self.doubtful = Some((t, value, distance));
+        true
+    }
+
+    /// Goes on from this reading, which is not doubtful.
+    fn accept(&mut self, t: Nanos, value: f64, distance: f64) -> bool {
+        let after = (t - self.t).seconds();
+        self.resumes = after > GAP * self.period;
+        self.rate = match self.value.is_finite() && after > 0.0 {
+            true => (value - self.value) / after,
+            false => 0.0,
+        };
+        self.period += (after.min(2.0 * self.period) - self.period) / MEMORY;
+        self.most = (self.most * (1.0 - 1.0 / MEMORY)).max(distance);
+        (self.t, self.value, self.doubtful) = (t, value, None);
+        false
+    }
+}
+
+/// The jumps of a channel of `N` axes. A reading is doubtful that is further from the line through
+/// the two before it than five times the largest such distance of late (of white noise: ten
+/// deviations), on any axis. The next reading decides: if it is where the doubtful one leads, or
+/// near it, the value has really changed; if it is where those before lead, one reading was wrong.
+/// A load or motion that sets in at once costs a reading, or a few while it grows.
+#[derive(Debug, Clone, Copy)]
+pub struct Jumps<const N: usize>([Path; N]);
+
+impl<const N: usize> Default for Jumps<N> {
+    fn default() -> Self {
+        Self([Path::NEW; N])
+    }
+}
+
+impl<const N: usize> Jumps<N> {
+    /// Takes a reading at `t`, NaN where it has none; returns whether it is doubtful.
+    pub fn look(&mut self, t: Nanos, values: &[f64; N], quality: Quality) -> bool {
+        if quality.intersects(Quality::ZERO_CHANGED) {
+            self.0.iter_mut().for_each(|path| path.count = 0);
+        }
+        let all = self.0.iter_mut().zip(values);
+        all.fold(false, |any, (path, value)| path.take(t, *value) || any)
+    }
+}

@@ -1,0 +1,347 @@
+//! Readings that repeat or jump: [`proprio_topics::sanity`].
+#![allow(missing_docs)]
+
+use proprio_topics::sanity::{Jumps, Repeats};
+use proprio_topics::{Nanos, Quality};
+use std::f64::consts::TAU;
+
+/// As the gateway has it.
+const LEAST_RUN: u32 = 16;
+
+/// Normal numbers, the same in every run (xorshift, sum of twelve).
+struct Noise(u64);
+
+impl Noise {
+    fn next(&mut self) -> f64 {
+        let mut uniform = || {
+            self.0 ^= self.0 << 13;
+            self.0 ^= self.0 >> 7;
+            self.0 ^= self.0 << 17;
+            (self.0 >> 11) as f64 / (1_u64 << 53) as f64
+        };
+        (0..12).map(|_| uniform()).sum::<f64>() - 6.0
+    }
+}
+
+/// A sensor with one step for all axes, in whose readings an axis can be frozen.
+struct Sensor {
+    sanity: Repeats<6>,
+    noise: Noise,
+    /// \[steps\]
+    deviation: f64,
+    step: f64,
+    held: [Option<f64>; 6],
+}
+
+impl Sensor {
+    fn new(deviation: f64) -> Self {
+        Self {
+            sanity: Repeats::default(),
+            noise: Noise(0x9E37_79B9_7F4A_7C15),
+            deviation,
+            step: 1804.0 / 32768.0,
+            held: [None; 6],
+        }
+    }
+
+    /// The mask after a reading of `load` \[steps\] on every axis; `frozen` axes keep theirs.
+    fn read(&mut self, load: f64, frozen: u16) -> u16 {
+        let mut values = [0.0; 6];
+        for (axis, (value, held)) in values.iter_mut().zip(&mut self.held).enumerate() {
+            let fresh = (load + self.deviation * self.noise.next()).round() * self.step;
+            *value = match frozen >> axis & 1 {
+                1 => *held.get_or_insert(fresh),
+                _ => *held.insert(fresh),
+            };
+        }
+        self.sanity.look(&values, Quality::GOOD, LEAST_RUN)
+    }
+
+    /// Number of equal readings until the mask is `wanted`. (By chance an axis has been equal
+    /// once or twice before.)
+    fn until(&mut self, wanted: u16, frozen: u16) -> Option<u32> {
+        (1..200).find(|_| self.read(0.0, frozen) == wanted)
+    }
+}
+
+/// Rest and motion by turns of 40 s at 100 Hz: joints move a hundred steps at 0.5 Hz, or a
+/// thousand.
+fn work(k: u32) -> f64 {
+    let swing = [0.0, 100.0, 0.0, 1000.0][k as usize / 4000 % 4];
+    let t = f64::from(k % 4000) / 4000.0;
+    // It begins and ends smoothly.
+    swing * (0.5 - 0.5 * (t * TAU).cos()) * (t * 20.0 * TAU).sin()
+}
+
+#[test]
+fn no_noise_and_no_resolution_raises_an_alarm() {
+    for deviation in [0.0, 0.02, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0, 5.0, 50.0] {
+        let mut sensor = Sensor::new(deviation);
+        for k in 0..100_000 {
+            assert_eq!(sensor.read(work(k), 0), 0, "{deviation} steps, reading {k}");
+        }
+    }
+}
+
+/// A coarse sensor at an edge between two codes, which drifts to the middle of one; and with
+/// single wrong readings.
+#[test]
+fn a_coarse_sensor_at_rest_raises_no_alarm() {
+    for deviation in [0.05, 0.1, 0.2] {
+        let mut sensor = Sensor::new(deviation);
+        for k in 0..200_000 {
+            let spike = if k % 5000 == 4999 { 4000.0 } else { 0.0 };
+            let load = 0.5 + f64::from(k) / 40_000.0 + spike;
+            assert_eq!(sensor.read(load, 0), 0, "{deviation} steps, reading {k}");
+        }
+    }
+}
+
+#[test]
+fn a_sensor_that_freezes_is_found_within_a_few_readings() {
+    for (deviation, most) in [(2.0, 32), (4.0, 20), (50.0, 16)] {
+        let mut sensor = Sensor::new(deviation);
+        for k in 0..3000 {
+            sensor.read(work(k), 0);
+        }
+        for _ in 0..3 {
+            let found = sensor.until(0x3F, 0x3F);
+            assert!(
+                found.is_some_and(|n| (14..=most).contains(&n)),
+                "{deviation}: {found:?}"
+            );
+            // For as long as it lasts, and no longer.
+            assert!((0..10_000).all(|_| sensor.read(0.0, 0x3F) == 0x3F));
+            assert!((0..500).all(|_| sensor.read(0.0, 0) == 0));
+        }
+    }
+    // What cannot be told from a coarse sensor at rest.
+    let mut coarse = Sensor::new(0.3);
+    assert!((0..3000).all(|_| coarse.read(0.0, 0) == 0));
+    assert_eq!(coarse.until(0x3F, 0x3F), None);
+}
+
+#[test]
+fn one_axis_that_freezes_is_named() {
+    for axis in 0..6 {
+        let mut sensor = Sensor::new(20.0);
+        for _ in 0..3000 {
+            assert_eq!(sensor.read(0.0, 0), 0);
+        }
+        let found = sensor.until(1 << axis, 1 << axis);
+        assert!(
+            found.is_some_and(|n| (14..=24).contains(&n)),
+            "{axis}: {found:?}"
+        );
+    }
+    // It is over at its first change, and found again.
+    let mut sensor = Sensor::new(20.0);
+    assert!((0..3000).all(|_| sensor.read(0.0, 0) == 0));
+    for axis in [2, 4, 1] {
+        assert!(sensor.until(1 << axis, 1 << axis).is_some(), "{axis}");
+        // (By chance the first reading is the same.)
+        sensor.read(0.0, 0);
+        assert!((0..40).all(|_| sensor.read(0.0, 0) == 0));
+    }
+    // With little noise alone it may be chance: all axes together are needed.
+    let mut sensor = Sensor::new(1.5);
+    for _ in 0..3000 {
+        sensor.read(0.0, 0);
+    }
+    assert!(sensor.until(1, 1).is_none_or(|n| n > 50));
+}
+
+/// A run of fifteen is not judged: a board may send a measurement several times.
+#[test]
+fn a_measurement_that_is_sent_several_times_is_not_frozen() {
+    let mut sensor = Sensor::new(30.0);
+    for k in 0..50_000 {
+        let frozen = if k % 16 == 0 { 0 } else { 0x3F };
+        assert_eq!(sensor.read(work(k), frozen), 0, "{k}");
+    }
+    for (twice, k) in (0..3000).flat_map(|k| [(false, k), (true, k)]) {
+        assert_eq!(sensor.read(work(k), if twice { 0x3F } else { 0 }), 0, "{k}");
+    }
+    assert!(sensor.until(0x3F, 0x3F).is_some());
+}
+
+#[test]
+fn what_the_device_says_itself_is_not_judged() {
+    let mut sanity = Repeats::default();
+    let mut noise = Noise(7);
+    let wrench = |x: f64| [x, x, x, f64::NAN, f64::NAN, f64::NAN];
+    for _ in 0..3000 {
+        assert_eq!(
+            sanity.look(
+                &wrench((30.0 * noise.next()).round()),
+                Quality::GOOD,
+                LEAST_RUN
+            ),
+            0
+        );
+    }
+    for flag in [Quality::FROZEN, Quality::SATURATED] {
+        assert!((0..100).all(|_| sanity.look(&wrench(5.0), flag, LEAST_RUN) == 0));
+    }
+    // Without a word it is; the axes that it does not measure are not named.
+    let found = (0..20)
+        .map(|_| sanity.look(&wrench(5.0), Quality::GOOD, LEAST_RUN))
+        .last();
+    assert_eq!(found, Some(0b111));
+    assert_eq!(sanity.look(&wrench(f64::NAN), Quality::GOOD, LEAST_RUN), 0);
+}
+
+/// Three axes, of which none alone is noisy enough; then also one that never changes.
+#[test]
+fn axes_are_judged_together() {
+    for constant in [f64::NAN, 1.0] {
+        let (mut sanity, mut noise) = (Repeats::default(), Noise(11));
+        let mut fresh = || {
+            let [x, y, z] = [(); 3].map(|()| (3.0 * noise.next()).round());
+            [x, y, z, constant, constant, constant]
+        };
+        for _ in 0..3000 {
+            assert_eq!(sanity.look(&fresh(), Quality::GOOD, LEAST_RUN), 0);
+        }
+        let last = fresh();
+        let masks: Vec<u16> = (0..60)
+            .map(|_| sanity.look(&last, Quality::GOOD, LEAST_RUN))
+            .collect();
+        let all = if constant.is_nan() { 0b111 } else { 0x3F };
+        let first = masks.iter().position(|mask| *mask != 0).expect("found");
+        assert!((15..40).contains(&first), "{first}");
+        assert!(masks[first..].iter().all(|mask| *mask == all), "{masks:?}");
+        // What the device says itself parts two runs.
+        for _ in 0..3000 {
+            sanity.look(&fresh(), Quality::GOOD, LEAST_RUN);
+        }
+        let last = fresh();
+        for k in 0..200 {
+            let quality = match k % 12 {
+                0 => Quality::SATURATED,
+                _ => Quality::GOOD,
+            };
+            assert_eq!(sanity.look(&last, quality, LEAST_RUN), 0, "{k}");
+        }
+    }
+}
+
+#[test]
+fn what_was_never_different_is_not_frozen() {
+    let mut sanity = Repeats::default();
+    let wrench = [1.0, 1.0, 1.0, 0.0, 0.0, 0.0];
+    assert!((0..100_000).all(|_| sanity.look(&wrench, Quality::GOOD, LEAST_RUN) == 0));
+}
+
+/// A channel of one axis, read every 10 ms.
+#[derive(Default)]
+struct Channel {
+    jumps: Jumps<1>,
+    t: i64,
+}
+
+impl Channel {
+    fn read(&mut self, value: f64) -> bool {
+        self.t += 10;
+        (self.jumps).look(Nanos::from_millis(self.t), &[value], Quality::GOOD)
+    }
+
+    fn doubtful(&mut self, values: &[f64]) -> Vec<bool> {
+        values.iter().map(|value| self.read(*value)).collect()
+    }
+}
+
+/// A channel that has read noise of this deviation, rounded to whole numbers.
+fn noisy(deviation: f64) -> Channel {
+    let (mut channel, mut noise) = (Channel::default(), Noise(5));
+    for _ in 0..500 {
+        channel.read((deviation * noise.next()).round());
+    }
+    channel
+}
+
+#[test]
+fn noise_and_motion_are_not_doubtful() {
+    for deviation in [0.0, 0.1, 0.3, 1.0, 3.0, 50.0] {
+        let (mut channel, mut noise) = (Channel::default(), Noise(3));
+        let doubtful =
+            (0..200_000).filter(|k| channel.read((work(*k) + deviation * noise.next()).round()));
+        let doubtful = doubtful.count();
+        assert!(doubtful <= 2, "{deviation}: {doubtful}");
+    }
+}
+
+#[test]
+fn one_wrong_reading_is_doubtful_alone() {
+    for deviation in [0.3, 1.0, 20.0_f64] {
+        let far = 40.0 * deviation.max(1.0);
+        for wrong in [far, -far, 1e9] {
+            let mut channel = noisy(deviation);
+            assert_eq!(channel.doubtful(&[0.0, wrong, 0.0]), [false, true, false]);
+            // A hundred readings later it is as far off as before.
+            assert!((0..100).all(|_| !channel.read(0.0)));
+            assert!(channel.read(wrong) && !channel.read(0.0));
+        }
+    }
+}
+
+#[test]
+fn wrong_readings_in_turn_are_doubtful() {
+    let (mut channel, mut noise) = (noisy(1.0), Noise(9));
+    let mut wrong = 0;
+    for k in 0..3000 {
+        let is_wrong = k % 10 < 2;
+        let value = if is_wrong {
+            5000.0 * noise.next()
+        } else {
+            noise.next()
+        };
+        let doubtful = channel.read(value);
+        wrong += usize::from(is_wrong && !doubtful && value.abs() > 100.0);
+    }
+    // The second of two confirms the first by chance, once in three times.
+    assert!(wrong < 150, "{wrong}");
+}
+
+#[test]
+fn what_has_changed_is_confirmed_by_the_next_reading() {
+    let mut channel = noisy(1.0);
+    assert_eq!(
+        channel.doubtful(&[400.0, 401.0, 400.0]),
+        [true, false, false]
+    );
+    let mut channel = noisy(1.0);
+    // A motion sets in: 20, 60, 120, ..
+    let motion: Vec<f64> = (1..20).map(|k| 10.0 * f64::from(k * (k + 1))).collect();
+    let doubtful = channel.doubtful(&motion);
+    assert!(
+        doubtful.iter().filter(|doubtful| **doubtful).count() <= 2,
+        "{doubtful:?}"
+    );
+    assert!(!doubtful[1]);
+    // A tare is no jump.
+    let mut channel = noisy(1.0);
+    let t = Nanos::from_millis(channel.t + 10);
+    assert!(!channel.jumps.look(t, &[700.0], Quality::ZERO_CHANGED));
+    channel.t += 10;
+    assert!(!channel.read(700.0));
+}
+
+#[test]
+fn after_a_gap_it_may_be_anywhere_near() {
+    let swing = |t: i64| 1000.0 * (t as f64 * 1e-3 * 3.0).sin();
+    for gap in [20, 100, 700] {
+        let mut channel = Channel::default();
+        for _ in 0..1000 {
+            assert!(!channel.read(swing(channel.t + 10)));
+        }
+        channel.t += gap;
+        assert!(!channel.read(swing(channel.t + 10)), "{gap}");
+        assert!(!channel.read(swing(channel.t + 10)), "{gap}");
+    }
+    // Without a value, or in the past, nothing is judged.
+    let mut channel = noisy(1.0);
+    assert!(!channel.read(f64::NAN) && channel.read(1e6));
+    channel.t -= 100;
+    assert!(!channel.read(-1e6));
+}
