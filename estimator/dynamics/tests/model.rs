@@ -644,10 +644,19 @@ fn what_other_readers_take_is_taken() {
         "<!DOCTYPE robot SYSTEM \"r.dtd\" [ <!ELEMENT robot ANY> <!ENTITY a \"b\"> ]>",
         "<!-- a -- comment --->",
         "<?stylesheet a?>\n<note/>",
+        "\u{feff}\u{feff}<?xml version=\"1.0\"?>",
+        "<!x><?xml version=\"1.0\"?>\n<!ELEMENT robot ANY>",
     ] {
         same(&(before.to_owned() + &robot()));
     }
-    for after in ["\n<robot/>", "\0\0", "\n<!-- the end -->"] {
+    for after in [
+        "\n<robot/>",
+        "\0\0",
+        "\0<robot",
+        "\n<!-- the end -->",
+        "</robot>\n",
+        "</robot> <x",
+    ] {
         same(&format!("{declaration}{}{after}", robot()));
     }
     for inside in [
@@ -655,6 +664,7 @@ fn what_other_readers_take_is_taken() {
         "<gazebo p:q=\"1\">a & b &foo; &lt;<![CDATA[ < ]]></gazebo>",
         "<material name=\"a & b < c > d &foo;\"/>",
         "<material name='a'rgba=\"1\"/>",
+        "<!x 'y'>",
         "<transmission/><group><link name=\"base\"/></group>",
     ] {
         same(&robot().replacen(

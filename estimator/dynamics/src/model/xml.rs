@@ -2,14 +2,16 @@
 //! Pinocchio and MuJoCo use), so that a file which they load is not refused here for its syntax.
 //!
 //! These accept what a strict parser does not: prefixes that no `xmlns` declares, `--` in comments,
-//! an empty line before `<?xml`, `&` that begins no entity, anything after the root element, and
-//! bytes of any encoding. quick-xml, a parser of tokens, accepts the same; the tree is built here
-//! with the place of every element, which the messages and the rewriting of a URDF need.
+//! an empty line before `<?xml`, `&` that begins no entity, `<!x>`, anything after the root element
+//! (a second `</robot>`, too) or after a NUL, and bytes of any encoding. quick-xml, a parser of
+//! tokens, accepts most of it; the tree is built here with the place of every element, which the
+//! messages and the rewriting of a URDF need.
 
 use std::borrow::Cow;
 use std::ops::Range;
 
 use encoding_rs::{Encoding, UTF_8, UTF_16BE, UTF_16LE, WINDOWS_1252};
+use quick_xml::errors::SyntaxError;
 use quick_xml::escape::unescape;
 use quick_xml::events::Event;
 use quick_xml::events::attributes::Attributes;
@@ -96,28 +98,50 @@ impl<'t> Document<'t> {
     /// # Errors
     /// It has no element, or tags that do not fit together.
     pub(super) fn parse(text: &'t str) -> Result<Self, XmlError> {
+        // To the other readers a NUL is the end.
+        let text = text.split('\0').next().unwrap_or_default();
         let wrong = |at: usize, reason: String| XmlError {
             line: line_at(text, at),
             reason,
         };
-        let mut reader = quick_xml::Reader::from_str(text);
-        let config = reader.config_mut();
-        config.allow_dangling_amp = true;
-        // The check here can name both lines.
-        config.check_end_names = false;
-        config.allow_unmatched_ends = true;
+        let reader_from = |at: usize| {
+            let mut reader = quick_xml::Reader::from_str(text.get(at..).unwrap_or_default());
+            let config = reader.config_mut();
+            config.allow_dangling_amp = true;
+            // The check here can name both lines.
+            config.check_end_names = false;
+            config.allow_unmatched_ends = true;
+            reader
+        };
+        // Where the reader began. It would not count a byte order mark.
+        let mut base = text.len() - text.trim_start_matches('\u{feff}').len();
+        let mut reader = reader_from(base);
         let mut document = Self {
             text,
             elements: Vec::new(),
         };
         let mut open: Vec<usize> = Vec::new();
         loop {
-            let start = usize::try_from(reader.buffer_position()).unwrap_or(text.len());
-            let event = reader.read_event().map_err(|error| {
-                let at = usize::try_from(reader.error_position()).unwrap_or(text.len());
-                wrong(at, error.to_string())
-            })?;
-            let end = usize::try_from(reader.buffer_position()).unwrap_or(text.len());
+            let place = |at: u64| usize::try_from(at).map_or(text.len(), |at| base + at);
+            let start = place(reader.buffer_position());
+            let event = match reader.read_event() {
+                Ok(event) => event,
+                Err(error) => {
+                    // `<!x>`, which no reader knows, is skipped.
+                    let unknown = matches!(
+                        error,
+                        quick_xml::Error::Syntax(SyntaxError::InvalidBangMarkup)
+                    );
+                    let length = text.get(start..).and_then(|rest| rest.find('>'));
+                    let Some(length) = length.filter(|_| unknown) else {
+                        return Err(wrong(place(reader.error_position()), error.to_string()));
+                    };
+                    base = start + length + 1;
+                    reader = reader_from(base);
+                    continue;
+                }
+            };
+            let end = place(reader.buffer_position());
             let add_text = |document: &mut Self, more: &str| {
                 let element = open
                     .last()
@@ -165,6 +189,10 @@ impl<'t> Document<'t> {
                     let name = tag.name();
                     let name = str::from_utf8(name.into_inner()).unwrap_or_default().trim();
                     let Some(number) = open.pop() else {
+                        // After the root it ends the text for the other readers, too.
+                        if !document.elements.is_empty() {
+                            break;
+                        }
                         return Err(wrong(start, format!("</{name}> closes nothing")));
                     };
                     let element = &mut document.elements[number];
@@ -298,14 +326,18 @@ impl<'d> Node<'d> {
         self.children().find(|child| child.name() == name)
     }
 
-    /// The first element of this name anywhere in it.
-    pub(super) fn descendant(self, name: &str) -> Option<Self> {
+    /// The elements anywhere in it.
+    pub(super) fn descendants(self) -> impl Iterator<Item = Self> {
         let (document, end) = (self.document, self.element().range.end);
         let after = self.number + 1..document.elements.len();
         after
-            .map(|number| Self { document, number })
-            .take_while(|node| node.element().range.start < end)
-            .find(|node| node.name() == name)
+            .map(move |number| Self { document, number })
+            .take_while(move |node| node.element().range.start < end)
+    }
+
+    /// The first element of this name anywhere in it.
+    pub(super) fn descendant(self, name: &str) -> Option<Self> {
+        self.descendants().find(|node| node.name() == name)
     }
 
     /// The line of its start tag, from 1. Counted only when asked for.
@@ -402,6 +434,16 @@ mod tests {
     }
 
     #[test]
+    fn places_are_right_behind_what_is_skipped() {
+        let text = "\u{feff}<a>\n<!x\n>&lt;<b c='d'/>\n</a>";
+        let document = Document::parse(text).unwrap();
+        let b = document.root("a").child("b").unwrap();
+        assert_eq!((b.line(), b.attribute("c")), (3, Some("d")));
+        assert_eq!(&text[b.range()], "<b c='d'/>");
+        assert_eq!(document.root("a").range(), 3..text.len());
+    }
+
+    #[test]
     fn tags_that_do_not_fit_have_their_lines() {
         let wrong = |text: &str| {
             let XmlError { line, reason } = Document::parse(text).unwrap_err();
@@ -412,7 +454,7 @@ mod tests {
             "3: </a> where <b> of line 2 is open"
         );
         assert_eq!(wrong("<a>\n<b>\n</b>\n"), "1: <a> is not closed");
-        assert_eq!(wrong("<a/>\n</b>"), "2: </b> closes nothing");
+        assert_eq!(wrong("\n</b><a/>"), "2: </b> closes nothing");
         assert_eq!(wrong(" \n"), "1: it has no element");
         assert!(wrong("<a/>\n<b c=d/>").starts_with("2: <b>: "));
         assert!(wrong("<a/>\n<b c='d' c='e'/>").starts_with("2: <b>: "));
