@@ -522,6 +522,29 @@ pub enum ModelError {
         /// What to do.
         remedy: &'static str,
     },
+    /// An attribute that is needed and is empty.
+    #[error("{place}: {what} has an empty {attribute}; {remedy}")]
+    Empty {
+        /// The link or joint.
+        place: Place,
+        /// Its element, such as `its <axis>`.
+        what: String,
+        /// The attribute.
+        attribute: &'static str,
+        /// What to do.
+        remedy: &'static str,
+    },
+    /// An element or a value that xacro would replace.
+    #[error(
+        "{place}: {what} is not expanded: the file is a xacro; expand it first (xacro FILE > \
+         model.urdf)"
+    )]
+    Unexpanded {
+        /// The link, the joint or the robot, at the element's line.
+        place: Place,
+        /// The element, with the attribute if it is one.
+        what: String,
+    },
     /// A joint refers to a link that does not exist.
     #[error("{place}: its {role} link {link} is not in the URDF; correct the name or add the link")]
     UnknownLink {
@@ -558,9 +581,7 @@ pub enum ModelError {
     #[error("{0}: the joints above it form a loop; only trees can be described: remove a joint")]
     Loop(Place),
     /// A number that cannot be parsed.
-    #[error(
-        "{place}: {element} {attribute}=\"{value}\" is not {expected}{}", macros(.value)
-    )]
+    #[error("{place}: {element} {attribute}=\"{value}\" is not {expected}")]
     Number {
         /// The owner of the element, at the element's line.
         place: Place,
@@ -708,15 +729,6 @@ fn together(with: &[String]) -> String {
             ", together with the links fixed to it ({})",
             with.join(", ")
         )
-    }
-}
-
-/// What to do about a value that is not expanded.
-fn macros(value: &str) -> &'static str {
-    if value.contains("${") || value.contains("$(") {
-        "; the file is a xacro: expand it first (xacro FILE > model.urdf)"
-    } else {
-        ""
     }
 }
 

@@ -707,9 +707,21 @@ fn what_is_missing_has_its_place_and_the_remedy() {
     );
     is(
         "ixy=\"0.001\"",
-        "ixy=\"\"",
-        "line 2: link base: its <inertia> has no ixy (it has ixx, ixy, ixz, iyy, iyz, izz); write \
-         all six of ixx, ixy, ixz, iyy, iyz, izz; a product of inertia of a symmetric body is 0",
+        "",
+        "line 2: link base: its <inertia> has no ixy (it has ixx, ixz, iyy, iyz, izz); write all \
+         six of ixx, ixy, ixz, iyy, iyz, izz; a product of inertia of a symmetric body is 0",
+    );
+    is(
+        "ixy=\"0.001\"",
+        "ixy=\" \"",
+        "line 2: link base: its <inertia> has an empty ixy; write all six of ixx, ixy, ixz, iyy, \
+         iyz, izz; a product of inertia of a symmetric body is 0",
+    );
+    is(
+        "<parent link=\"tool\"/>",
+        "<parent link=\"\"/>",
+        "line 7: joint slide: its <parent> has an empty link; write link=\"...\", the name of a \
+         link",
     );
     is(
         "<mass value=\"2\"/>",
@@ -743,9 +755,29 @@ fn what_is_missing_has_its_place_and_the_remedy() {
     is(
         "xyz=\"0 0 0.5\"",
         "xyz=\"0 0 ${height}\"",
-        "line 8: joint turn: <origin> xyz=\"0 0 ${height}\" is not three numbers with spaces \
-         between them; the file is a xacro: expand it first (xacro FILE > model.urdf)",
+        "line 8: joint turn: <origin> xyz=\"0 0 ${height}\" is not expanded: the file is a xacro; \
+         expand it first (xacro FILE > model.urdf)",
     );
+    is(
+        "<link name=\"tip\"/>",
+        "<link name=\"${side}_tip\"/>",
+        "line 6: link ${side}_tip: <link> name=\"${side}_tip\" is not expanded: the file is a \
+         xacro; expand it first (xacro FILE > model.urdf)",
+    );
+    // What xacro leaves out would be missing without a word, links and joints too.
+    is(
+        "<link name=\"tip\"/>",
+        "<link name=\"tip\">\n<xacro:shell/></link>",
+        "line 7: robot r: <xacro:shell> is not expanded: the file is a xacro; expand it first \
+         (xacro FILE > model.urdf)",
+    );
+    let empty = "<robot name=\"r\" xmlns:xacro=\"http://www.ros.org/wiki/xacro\">";
+    let macros = format!("{empty}\n<xacro:arm/></robot>");
+    assert!(
+        (read(&macros).unwrap_err().to_string()).starts_with("line 2: robot r: <xacro:arm> is not")
+    );
+    // Its name space alone is what an expanded file has.
+    read(&robot().replacen("<robot name=\"r\">", empty, 1)).unwrap();
     // All bodies without a mass in one message.
     let text = robot().replace(
         &format!("<link name=\"finger\">{INERTIAL}</link>"),

@@ -13,7 +13,7 @@ mod elements;
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
-use self::elements::{numbers, once, part, place, read_sensors, required};
+use self::elements::{check_expanded, numbers, once, part, place, read_sensors, required};
 use super::xml::{self, Document, Node, XmlError};
 use super::{
     Axis, AxisKind, Frame, Joint, JointFacts, JointKind, Limits, MeasurementDirection,
@@ -85,6 +85,7 @@ pub(super) fn parse(text: &str) -> Result<Document<'_>, ModelError> {
 pub(super) fn robot<'d>(document: &'d Document<'_>) -> Result<Node<'d>, ModelError> {
     let root = document.root("robot");
     if root.name() == "robot" {
+        check_expanded(root)?;
         Ok(root)
     } else {
         Err(ModelError::NotUrdf {

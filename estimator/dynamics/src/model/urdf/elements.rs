@@ -37,22 +37,59 @@ pub(super) fn part<'d>(
     })
 }
 
-/// The value of an attribute.
+/// The value of an attribute, which is there, not empty, and expanded.
 pub(super) fn required<'d>(
     element: Node<'d>,
     owner: Node<'d>,
     attribute: &'static str,
     remedy: &'static str,
 ) -> Result<&'d str, ModelError> {
-    element
-        .attribute(attribute)
-        .ok_or_else(|| ModelError::Missing {
-            place: place(element, owner),
-            what: format!("its {}", tag(element)),
+    let place = || place(element, owner);
+    let what = || format!("its {}", tag(element));
+    match element.attribute(attribute) {
+        Some(value) => expanded(element, owner, attribute, value),
+        None if element.attributes().any(|there| there == attribute) => Err(ModelError::Empty {
+            place: place(),
+            what: what(),
+            attribute,
+            remedy,
+        }),
+        None => Err(ModelError::Missing {
+            place: place(),
+            what: what(),
             missing: attribute,
             there: element.attributes().map(str::to_owned).collect(),
             remedy,
-        })
+        }),
+    }
+}
+
+/// The value of an attribute, unless xacro would put something else in its place.
+fn expanded<'d>(
+    element: Node<'d>,
+    owner: Node<'d>,
+    attribute: &str,
+    value: &'d str,
+) -> Result<&'d str, ModelError> {
+    if !value.contains("${") && !value.contains("$(") {
+        return Ok(value);
+    }
+    Err(ModelError::Unexpanded {
+        place: place(element, owner),
+        what: format!("{} {attribute}=\"{value}\"", tag(element)),
+    })
+}
+
+/// Refuses elements that xacro would replace: links and joints may be missing.
+pub(super) fn check_expanded(robot: Node<'_>) -> Result<(), ModelError> {
+    let mut inside = robot.descendants();
+    match inside.find(|node| node.name().starts_with("xacro:")) {
+        None => Ok(()),
+        Some(left) => Err(ModelError::Unexpanded {
+            place: place(left, robot),
+            what: tag(left),
+        }),
+    }
 }
 
 /// The `N` numbers of an attribute; none if it is missing or empty.
@@ -64,6 +101,7 @@ pub(super) fn numbers<const N: usize>(
     let Some(value) = element.attribute(attribute) else {
         return Ok(None);
     };
+    expanded(element, owner, attribute, value)?;
     let parsed: Result<Vec<f64>, _> = value.split_whitespace().map(str::parse).collect();
     let numbers = parsed.ok().and_then(|n| <[f64; N]>::try_from(n).ok());
     // An infinite limit means no limit.
