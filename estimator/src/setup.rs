@@ -71,6 +71,15 @@ impl Setup {
             .collect();
         let mut model = Model::from_file(&config.model, &keep).map_err(|e| match e {
             ModelError::Read { .. } => e.to_string(),
+            ModelError::UnknownSensorJoint { ref joint, .. } => {
+                let mut sensors = config.force_torque.iter();
+                let sensor = sensors.find(|ft| ft.joint == *joint).map(|ft| &ft.sensor);
+                format!(
+                    "force_torque {:?}: joint = {joint:?}: {}: {e}",
+                    sensor.map_or("", String::as_str),
+                    config.model.display()
+                )
+            }
             e => format!("{}: {e}", config.model.display()),
         })?;
         hold(config, &mut model);
@@ -217,6 +226,15 @@ impl Setup {
                         contacts.get(index).map_or("", |c| c.name.as_str())
                     )
                 }
+                StructureError::TooMany {
+                    what: "links",
+                    count,
+                    most,
+                } => format!(
+                    "{}: its joints, those in [locked] too, join {count} bodies; {most} at most: \
+                     make joints that never move fixed in the URDF (type=\"fixed\")",
+                    config.model.display()
+                ),
                 e => e.to_string(),
             },
         )?;
@@ -765,6 +783,9 @@ fn stances(
 /// name.
 fn frame(model: &Model, name: &str) -> Result<Frame, String> {
     model.frame(name).ok_or_else(|| {
+        if model.is_dropped(name) {
+            return dropped(model, name);
+        }
         format!(
             "{name:?} is not a link of the URDF{}",
             nearest(name, model.frame_names())
@@ -772,8 +793,26 @@ fn frame(model: &Model, name: &str) -> Result<Frame, String> {
     })
 }
 
+/// Why the name of a link or joint above the robot is none of the model's.
+fn dropped(model: &Model, name: &str) -> String {
+    format!(
+        "{name:?} is above the robot, which floats in the URDF, and is dropped; the root is the \
+         link {:?}",
+        model.link_name(0)
+    )
+}
+
 /// Why a name is not a moving joint, with a suggestion.
 fn no_joint(model: &Model, name: &str) -> String {
+    if model.is_dropped(name) {
+        return dropped(model, name);
+    }
+    if let Some(leader) = model.held_by(name) {
+        return format!(
+            "{name:?} follows {leader:?} (<mimic>), a fixed joint, which already holds it; remove \
+             it here, or its <mimic> in the URDF"
+        );
+    }
     if let Some(joint) = model.joint(name)
         && model.joints().get(joint).is_some_and(|j| j.dof.is_none())
     {

@@ -341,6 +341,12 @@ fn only_measured_joints_are_limited() {
         "r.urdf: 129 joints are to be measured; 128 at most: name joints that nobody measures in \
          [locked], with their positions, or make them fixed in the URDF"
     );
+    // A locked joint still moves a body of its own.
+    assert_eq!(
+        chain(512, 500).expect_err("513 bodies"),
+        "r.urdf: its joints, those in [locked] too, join 513 bodies; 512 at most: make joints that \
+         never move fixed in the URDF (type=\"fixed\")"
+    );
 }
 
 const GRIPPER: &str = "<robot name=\"r\"><link name=\"base\"/>\
@@ -411,6 +417,48 @@ fn a_joint_that_follows_another_is_not_measured() {
     // With the leader locked, the follower is where that puts it.
     let (_folder, setup) = files(GRIPPER.as_bytes(), "[locked]\nj1 = 0.5\n");
     assert!(setup.unwrap_err().starts_with("no channel is read"));
+    // A fixed leader holds it already.
+    let fixed = "<joint name=\"j1\" type=\"fixed\">";
+    let urdf = GRIPPER.replace("<joint name=\"j1\" type=\"continuous\">", fixed);
+    let (_folder, setup) = files(urdf.as_bytes(), "[locked]\nj2 = 0.5\n");
+    assert_eq!(
+        setup.unwrap_err(),
+        "locked.j2: \"j2\" follows \"j1\" (<mimic>), a fixed joint, which already holds it; remove \
+         it here, or its <mimic> in the URDF"
+    );
+}
+
+/// The names above a floating joint are in the file, but not in the model.
+#[test]
+fn a_name_above_the_robot_is_told_as_such() {
+    let free = "<link name=\"world\"/><joint name=\"free\" type=\"floating\">\
+                <parent link=\"world\"/><child link=\"base\"/></joint></robot>";
+    let urdf = GRIPPER.replace("</robot>", free);
+    let told = |name: &str| {
+        format!(
+            "\"{name}\" is above the robot, which floats in the URDF, and is dropped; the root is \
+             the link \"base\""
+        )
+    };
+    let contact = "[[contact]]\nlink = \"world\"\nkind = \"wrench\"\npresence = \"always\"\n";
+    let sensor = "[[force_torque]]\nsensor = \"s\"\njoint = \"free\"\n";
+    for (more, place, name) in [
+        (contact, "contact \"world\": link: ", "world"),
+        (sensor, "force_torque \"s\": joint = \"free\": ", "free"),
+        ("[locked]\nfree = 0.0\n", "locked.free: ", "free"),
+    ] {
+        let (_folder, setup) = files(urdf.as_bytes(), more);
+        assert_eq!(setup.unwrap_err(), place.to_owned() + &told(name));
+    }
+    assert!(files(urdf.as_bytes(), "").1.is_ok());
+    // Of a joint that is not there at all, the configuration's key is told.
+    let (folder, setup) = files(urdf.as_bytes(), &sensor.replace("free", "fre"));
+    let place = format!(
+        "force_torque \"s\": joint = \"fre\": {}: joint fre, named as",
+        folder.path().join("r.urdf").display()
+    );
+    let problem = setup.unwrap_err();
+    assert!(problem.starts_with(&place), "{problem}");
 }
 
 #[test]

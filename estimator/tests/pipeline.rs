@@ -1014,8 +1014,9 @@ fn each_mistake_between_configuration_and_model_has_one_clear_message() {
         ),
         (
             &|c: &mut Config| c.force_torque[0].joint = "l_arm_ft".into(),
-            "joint l_arm_ft, named as the joint of an F/T sensor, is not in the URDF; fixed joints \
-             that could carry one: l_arm_ft_sensor",
+            "joint l_arm_ft, named as the joint of an F/T sensor, is not in the URDF; any of its \
+             joints could carry one, fixed or moving (it is then on the child's side): \
+             l_arm_ft_sensor",
         ),
         (
             &|c: &mut Config| {

@@ -27,7 +27,7 @@ mod rewrite;
 mod urdf;
 mod xml;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fmt;
 use std::path::PathBuf;
 
@@ -261,7 +261,11 @@ pub struct Model {
     joint_facts: Vec<JointFacts>,
     joint_numbers: HashMap<String, usize>,
     folded_joints: HashMap<String, ()>,
+    /// Per joint that follows a fixed one, that one.
+    held: HashMap<String, String>,
     frames: HashMap<String, Frame>,
+    /// Links and joints above a joint that lets the whole robot float, and that joint.
+    dropped: HashSet<String>,
     sensors: Vec<SensorElement>,
     unread: Vec<Unread>,
     warnings: Vec<String>,
@@ -339,6 +343,18 @@ impl Model {
     /// Whether the URDF has a fixed joint of this name that was folded.
     pub fn is_folded(&self, joint: &str) -> bool {
         self.folded_joints.contains_key(joint)
+    }
+
+    /// Whether a link or joint of this name was dropped, because it is the joint that lets the
+    /// whole robot float or is above that. The root link, body 0, is below.
+    pub fn is_dropped(&self, name: &str) -> bool {
+        self.dropped.contains(name)
+    }
+
+    /// The fixed joint that holds a joint, which follows it (its `<mimic>`, if necessary through
+    /// others).
+    pub fn held_by(&self, joint: &str) -> Option<&str> {
+        self.held.get(joint).map(String::as_str)
     }
 
     /// Index of the degree of freedom of the moving joint of this name; none if the joint follows
@@ -667,15 +683,16 @@ pub enum ModelError {
     MissingInertial(Vec<(Place, String)>),
     /// A joint to be kept that the URDF does not have.
     #[error(
-        "joint {joint}, named as the joint of an F/T sensor, is not in the URDF; \
-         fixed joints that could carry one: {}",
-        or_none(.fixed)
+        "joint {joint}, named as the joint of an F/T sensor, is not in the URDF; any of its \
+         joints could carry one, fixed or moving (it is then on the child's side): {}",
+        or_none(.some)
     )]
     UnknownSensorJoint {
         /// The joint.
         joint: String,
-        /// Fixed joints of the URDF with an F/T `<sensor>` element, or else all of them, up to ten.
-        fixed: Vec<String>,
+        /// Joints of the URDF with an F/T `<sensor>` element; if there are none, the first ten,
+        /// fixed ones before others.
+        some: Vec<String>,
     },
     /// There is no body with this index.
     #[error("there is no link {0}")]

@@ -407,7 +407,10 @@ fn a_follower_of_a_fixed_joint_is_fixed() -> Result<(), ModelError> {
     let expected = free.joints()[moving].pose(0.2);
     assert_eq!(model.joints()[held].placement, expected);
     assert!(model.warnings().iter().any(|warning| {
-        warning == "joint close: it follows a fixed joint (<mimic>), so it is fixed, at 0.2"
+        warning == "joint close: it follows the fixed joint lead (<mimic>), so it is held at 0.2"
     }));
+    // Also through another one.
+    let holders = ["close", "cable", "lead"].map(|joint| model.held_by(joint));
+    assert_eq!(holders, [Some("lead"), Some("lead"), None]);
     Ok(())
 }

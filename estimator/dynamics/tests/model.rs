@@ -439,8 +439,14 @@ fn sensor_joints_must_be_there() {
     assert_eq!(
         error("grab"),
         "joint grab, named as the joint of an F/T sensor, is not in the URDF; \
-         fixed joints that could carry one: grip, end"
+         any of its joints could carry one, fixed or moving (it is then on the child's side): \
+         grip, end, slide, turn"
     );
+    let described =
+        "<gazebo reference=\"turn\"><sensor name=\"s\" type=\"force_torque\"/></gazebo>";
+    let text = robot().replace("</robot>", &format!("{described}</robot>"));
+    let error = Model::from_urdf(&text, &["grab"]).unwrap_err().to_string();
+    assert!(error.ends_with(" side): turn"), "{error}");
 }
 
 /// The cut of a sensor in a moving joint is on the side of the child.
@@ -882,6 +888,8 @@ fn a_floating_root_joint_is_dropped() {
         assert_eq!((model.link_count(), model.dof_count()), (3, 2));
         assert_eq!((model.link_name(0), model.joint("free")), ("base", None));
         assert!(model.frame("world").is_none() && model.frame("map").is_none());
+        let dropped = ["world", "map", "fix", "free", "base", "turn"].map(|n| model.is_dropped(n));
+        assert_eq!(dropped, [true, true, true, true, false, false]);
         assert_eq!(
             model.warnings(),
             [

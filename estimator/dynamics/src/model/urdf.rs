@@ -455,21 +455,18 @@ fn check_kept(
         if joints.iter().any(|joint| joint.name == name) {
             continue;
         }
-        let all = || {
-            joints
-                .iter()
-                .filter(|joint| joint.kind == Some(JointKind::Fixed))
-                .map(|joint| joint.name.to_owned())
-        };
-        let mut fixed: Vec<String> = all()
-            .filter(|joint| sensors.iter().any(|sensor| sensor.joint == *joint))
-            .collect();
-        if fixed.is_empty() {
-            fixed = all().take(10).collect();
+        let (mut some, others): (Vec<_>, Vec<_>) =
+            (joints.iter()).partition(|joint| joint.kind == Some(JointKind::Fixed));
+        some.extend(others.into_iter().filter(|joint| joint.kind.is_some()));
+        let described = |joint: &&RawJoint<'_>| sensors.iter().any(|s| s.joint == joint.name);
+        if some.iter().any(described) {
+            some.retain(described);
+        } else {
+            some.truncate(10);
         }
         return Err(ModelError::UnknownSensorJoint {
             joint: name.to_owned(),
-            fixed,
+            some: some.iter().map(|joint| joint.name.to_owned()).collect(),
         });
     }
     Ok(())
@@ -482,6 +479,8 @@ struct Coordinates {
     of: Vec<Option<(usize, f64, f64)>>,
     /// Per degree of freedom, the joint that it is named after.
     leaders: Vec<usize>,
+    /// Joints that follow a fixed one; that one, and where it holds them.
+    held: Vec<(usize, usize, f64)>,
 }
 
 impl Coordinates {
@@ -501,12 +500,13 @@ impl Coordinates {
                 joint.mimic = None;
             }
         }
-        let mut held = Vec::new();
-        let coordinates = Self::resolve(joints, &mut held)?;
-        for (number, position) in held {
+        let coordinates = Self::resolve(joints)?;
+        for &(number, leader, position) in &coordinates.held {
+            let leader = joints[leader].name;
             let joint = &mut joints[number];
             warnings.push(format!(
-                "joint {}: it follows a fixed joint (<mimic>), so it is fixed, at {position}",
+                "joint {}: it follows the fixed joint {leader} (<mimic>), so it is held at \
+                 {position}",
                 joint.name
             ));
             joint.origin = moved(&joint.origin, joint.kind, position);
@@ -515,14 +515,14 @@ impl Coordinates {
         Ok(coordinates)
     }
 
-    /// The same without changing the joints: those to be fixed, and where, are added to `held`.
-    fn resolve(joints: &[RawJoint<'_>], held: &mut Vec<(usize, f64)>) -> Result<Self, ModelError> {
+    /// The same without changing the joints.
+    fn resolve(joints: &[RawJoint<'_>]) -> Result<Self, ModelError> {
         let moves = |joint: &RawJoint<'_>| is_moving(joint.kind.as_ref());
         let leads = |joint: &RawJoint<'_>| moves(joint) && joint.mimic.is_none();
         let leaders: Vec<usize> = (0..joints.len()).filter(|&j| leads(&joints[j])).collect();
         let numbers: HashMap<&str, usize> =
             joints.iter().map(|j| j.name).zip(0..joints.len()).collect();
-        let mut of = Vec::with_capacity(joints.len());
+        let (mut of, mut held) = (Vec::with_capacity(joints.len()), Vec::new());
         for (number, joint) in joints.iter().enumerate() {
             if !moves(joint) {
                 of.push(None);
@@ -560,12 +560,16 @@ impl Coordinates {
                 leader = next;
             }
             if !moves(leader) {
-                held.push((number, offset));
+                held.extend(
+                    numbers
+                        .get(leader.name)
+                        .map(|&leader| (number, leader, offset)),
+                );
             }
             let dof = leaders.iter().position(|&l| joints[l].name == leader.name);
             of.push(dof.map(|dof| (dof, ratio, offset)));
         }
-        Ok(Self { of, leaders })
+        Ok(Self { of, leaders, held })
     }
 }
 
@@ -596,7 +600,18 @@ impl Folder<'_, '_> {
             joint_facts: Vec::new(),
             joint_numbers: HashMap::new(),
             folded_joints: HashMap::new(),
+            held: (self.coordinates.held.iter())
+                .map(|&(joint, leader, _)| [joint, leader].map(|j| self.joints[j].name.to_owned()))
+                .map(|[joint, leader]| (joint, leader))
+                .collect(),
             frames: HashMap::with_capacity(self.links.len()),
+            dropped: (tree.dropped.iter())
+                .flat_map(|&link| {
+                    let below = tree.children[link].iter().map(|&j| self.joints[j].name);
+                    below.chain([self.links[link].name])
+                })
+                .map(str::to_owned)
+                .collect(),
             sensors,
             unread,
             warnings,
