@@ -177,32 +177,32 @@ impl<W: Write> Table<W> {
     pub fn new(mut out: W, setup: &Setup) -> io::Result<Self> {
         let joints: Vec<&str> = setup.robot.joint_names().collect();
         let contacts: Vec<&str> = setup.robot.contact_names().collect();
-        let mut header = String::from("t");
+        let mut header = Vec::from(*b"t");
+        let mut add = |part: &str, name: &str, field: &str| {
+            header.push(b',');
+            let start = header.len();
+            header.extend_from_slice(format!("{part}/{name}{field}").as_bytes());
+            quote(&mut header, start);
+        };
         for part in ["torque", "torque_std"] {
-            joints
-                .iter()
-                .for_each(|j| header.push_str(&format!(",{part}/{j}")));
+            joints.iter().for_each(|joint| add(part, joint, ""));
         }
         for contact in &contacts {
-            let columns = "fx fy fz tx ty tz fx_std fy_std fz_std tx_std ty_std tz_std valid \
-                           reason detected px py pz located";
-            columns
-                .split(' ')
-                .for_each(|c| header.push_str(&format!(",contact/{contact}/{c}")));
+            let columns = "/fx /fy /fz /tx /ty /tz /fx_std /fy_std /fz_std /tx_std /ty_std /tz_std \
+                           /valid /reason /detected /px /py /pz /located";
+            let columns = columns.split(' ');
+            columns.for_each(|field| add("contact", contact, field));
         }
         for part in ["valid", "reason"] {
-            joints
-                .iter()
-                .for_each(|j| header.push_str(&format!(",{part}/{j}")));
+            joints.iter().for_each(|joint| add(part, joint, ""));
         }
         let subtrees: Vec<&str> = setup.robot.subtree_names().collect();
         for top in &subtrees {
-            "fx fy fz tx ty tz significance reason"
-                .split(' ')
-                .for_each(|c| header.push_str(&format!(",residual/{top}/{c}")));
+            let columns = "/fx /fy /fz /tx /ty /tz /significance /reason".split(' ');
+            columns.for_each(|field| add("residual", top, field));
         }
-        header.push('\n');
-        out.write_all(header.as_bytes())?;
+        header.push(b'\n');
+        out.write_all(&header)?;
         let channels = setup.channels().map(|(_, name)| name.to_owned()).collect();
         Ok(Self {
             out,
@@ -319,13 +319,32 @@ fn reason(text: &mut Vec<u8>, channels: &[String], reason: Reason, cause: u32) {
     if reason == Reason::None {
         return;
     }
+    let start = text.len();
     text.extend_from_slice(reason.word().as_bytes());
     if cause != NO_CAUSE
         && let Some(channel) = channels.get(cause as usize)
     {
         text.push(b':');
         text.extend_from_slice(channel.as_bytes());
+        quote(text, start);
     }
+}
+
+/// Puts the last cell, which begins at `start`, in quotes if the names in it need them (RFC 4180).
+fn quote(text: &mut Vec<u8>, start: usize) {
+    let cell = text.get(start..).unwrap_or_default();
+    if !cell.iter().any(|byte| b",\"\r\n".contains(byte)) {
+        return;
+    }
+    let cell = text.split_off(start);
+    text.push(b'"');
+    for byte in cell {
+        if byte == b'"' {
+            text.push(byte);
+        }
+        text.push(byte);
+    }
+    text.push(b'"');
 }
 
 /// A cell: the shortest text that reads back as the same number; empty for NaN.

@@ -428,6 +428,34 @@ fn a_joint_that_follows_another_is_not_measured() {
     );
 }
 
+/// Names of a URDF may have what divides the cells of a table.
+#[test]
+fn any_name_has_its_column_in_the_table() {
+    let name = "a, \"b\"\nc";
+    let urdf = GRIPPER.replace("\"j1\"", "\"a, &quot;b&quot;\nc\"");
+    let (_folder, setup) = files(urdf.as_bytes(), "");
+    // Two positions are too few for an acceleration, for which the channel is named.
+    let log = format!(
+        "t,\"joint/{}/position\"\n0.01,0.1\n0.02,0.1\n",
+        name.replace('"', "\"\"")
+    );
+    let mut out = Vec::new();
+    proprio_estimator::offline::estimate(setup.unwrap(), log.as_bytes(), &mut out, None).unwrap();
+    let mut table = csv::Reader::from_reader(out.as_slice());
+    let header = table.headers().unwrap().clone();
+    let column = |part: &str| {
+        let wanted = format!("{part}/{name}");
+        header.iter().position(|column| column == wanted).unwrap()
+    };
+    let (torque, reason) = (column("torque"), column("reason"));
+    let rows: Vec<_> = table.records().map(Result::unwrap).collect();
+    assert_eq!(rows.len(), 2);
+    for row in rows {
+        assert_eq!((row.len(), &row[torque]), (header.len(), ""));
+        assert!(row[reason].ends_with(&format!(":{name}")), "{row:?}");
+    }
+}
+
 /// The names above a floating joint are in the file, but not in the model.
 #[test]
 fn a_name_above_the_robot_is_told_as_such() {
