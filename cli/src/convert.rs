@@ -262,8 +262,9 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
     for bad in &report.bad {
         eprintln!("{}: skipped: {bad}", args.log.display());
     }
-    if let Some(doubt) = &report.doubt {
-        eprintln!("{}: {doubt}", args.log.display());
+    let told = [&report.doubt, &report.several, &report.step_back];
+    for told in told.into_iter().flatten() {
+        eprintln!("{}: {told}", args.log.display());
     }
     if report.dropped > 0 {
         eprintln!(
@@ -458,6 +459,15 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
              {not_finite} not finite",
             args.samples.display(),
             report.first_dropped.unwrap_or_default()
+        );
+    }
+    if let Some((line, from, to)) = report.step_back {
+        eprintln!(
+            "{}: at line {line} the time steps back by {} s, from {from} s to {to} s: what is not \
+             later than its channel's last sample is dropped. Cut the table there, and estimate \
+             from the parts one by one",
+            args.samples.display(),
+            from.saturating_sub(to)
         );
     }
     let withheld: u64 = report.withheld.values().sum();

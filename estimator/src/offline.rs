@@ -50,6 +50,9 @@ pub enum OfflineError {
     MissingChannels(#[from] MissingChannels),
 }
 
+/// Rows that are earlier than another by more are not only a little out of order.
+const STEP: Nanos = Nanos::from_millis(100);
+
 /// Counts and remarks of the estimates of a log.
 #[derive(Debug, Clone, Default)]
 pub struct EstimateReport {
@@ -63,6 +66,8 @@ pub struct EstimateReport {
     pub dropped: [u64; 3],
     /// The line of the first row with a dropped sample.
     pub first_dropped: Option<u64>,
+    /// The line of the first row whose clock was set back, the newest instant before, and its own.
+    pub step_back: Option<(u64, Nanos, Nanos)>,
     /// Channels of the log that the configuration does not name.
     pub unused_channels: Vec<String>,
 }
@@ -111,7 +116,7 @@ pub fn estimate(
     let spacing =
         pipeline.setup().robot.max_silence + pipeline.setup().robot.max_silence + Nanos(1);
     let (mut row, mut pseudo) = (Row::default(), Nanos::ZERO);
-    let mut stamped = true;
+    let (mut stamped, mut newest) = (true, Nanos::MIN);
     let mut write = |pipeline: &mut Pipeline, stamped: bool| -> Result<(), OfflineError> {
         while let Some(estimate) = pipeline.poll() {
             table.write(estimate, stamped)?;
@@ -145,6 +150,10 @@ pub fn estimate(
         if report.first_dropped.is_none() && counts.late + counts.backward + counts.not_finite > 0 {
             report.first_dropped = Some(row.line);
         }
+        if newest.saturating_sub(t) > STEP {
+            report.step_back.get_or_insert((row.line, newest, t));
+        }
+        newest = newest.max(t);
         write(&mut pipeline, stamped)?;
     }
     pipeline.finish();

@@ -1060,6 +1060,20 @@ fn each_mistake_between_configuration_and_model_has_one_clear_message() {
     );
 }
 
+#[test]
+fn a_table_whose_clock_was_set_back_is_told_with_its_place() {
+    let log = golden("icub_left_arm_mujoco.csv");
+    let lines: Vec<&str> = log.lines().collect();
+    let t = |line: usize| {
+        let cell = lines[line].split(',').next().unwrap();
+        Nanos::parse_seconds(cell).unwrap()
+    };
+    let set_back = [&lines[..100], &lines[20..40]].concat().join("\n");
+    let report = offline::estimate(setup(|_| {}), set_back.as_bytes(), Vec::new(), None).unwrap();
+    assert_eq!(report.step_back, Some((101, t(99), t(20))));
+    assert_eq!(report.first_dropped, Some(101));
+}
+
 /// A robot that stands on its chest, then on its hand, then on nothing: the base follows the
 /// declarations, and the torques equal the true ones.
 #[test]

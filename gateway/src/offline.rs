@@ -5,7 +5,7 @@ use crate::config::Source;
 use crate::decoder::Decoder;
 use crate::joints::Inverse;
 use crate::link::adapter::Adapter;
-use crate::link::replay::Matching;
+use crate::link::replay::{self, Matching};
 use crate::log::{self, LogFormat, Stamps, candump};
 use crate::plan::{BusPlan, ChannelPlan, Plan};
 use crate::status::BusStatus;
@@ -50,6 +50,10 @@ pub enum OfflineError {
 pub struct DecodeReport {
     /// Frames in the log.
     pub frames: u64,
+    /// What a person should be told if the one bus takes the frames of several interfaces.
+    pub several: Option<String>,
+    /// What a person should be told if the clock of the log was set back.
+    pub step_back: Option<String>,
     /// Of these, frames of an interface that is no bus of the configuration.
     pub other_interfaces: u64,
     /// The names of those interfaces, at most eight.
@@ -165,8 +169,8 @@ impl<T> InOrder<T> {
 
 /// Decodes a log to a table of samples.
 ///
-/// If the plan has one bus, it takes the frames of all interfaces; with several, each takes the
-/// frames of its own interface.
+/// Each bus takes the frames of its own interface; if the plan has one bus, whose interface is not
+/// in the log, it takes those of all.
 ///
 /// # Errors
 /// [`OfflineError`]: a file that cannot be read or written, or a log without a frame.
@@ -199,6 +203,7 @@ pub fn decode_with(
         })
         .collect();
     let mut writer = csv::Writer::new(table, &series, columns)?;
+    let mut reader = log::Reader::with_stamps(log, stamps);
     let mut buses = Vec::new();
     for (bus, number) in plan.buses.iter().zip(0..) {
         let status = Arc::new(BusStatus::new(number, bus));
@@ -208,12 +213,13 @@ pub fn decode_with(
                 cause,
             },
         )?;
-        buses.push((plan.matching(number as usize), decoder, status));
+        let matching = plan.matching(number as usize);
+        let matching = matching.map_or(Ok(None), |matching| matching.in_log(&mut reader))?;
+        buses.push((matching, decoder, status));
     }
     let mut report = DecodeReport::default();
     let mut order = InOrder::new(REORDER);
     let mut failure = None;
-    let mut reader = log::Reader::with_stamps(log, stamps);
     let mut last_bus = 0;
     let takes = |matching: &Option<Matching>, interface: &str| {
         matching.as_ref().is_none_or(|m| m.takes(interface))
@@ -274,6 +280,10 @@ pub fn decode_with(
     report.out_of_order = order.out_of_order();
     (report.bad_lines, report.dropped) = (reader.report().bad, reader.report().dropped);
     report.format = reader.format();
+    report.step_back = reader.step_back();
+    if buses.iter().any(|(matching, ..)| matching.is_none()) {
+        report.several = replay::several(reader.interfaces());
+    }
     report.bad = reader.bad().collect();
     (report.stamps, report.doubt) = (reader.stamps(), reader.doubt(log::STAMPS_OPTION));
     if report.frames == 0 {

@@ -211,7 +211,7 @@ impl Plan {
     }
 
     /// The frames that bus number `bus` takes from the log that its source replays, or from a log
-    /// given for all buses. If only this bus replays the log, it takes all frames.
+    /// given for all buses. `None` if there is no such bus.
     #[must_use]
     pub fn matching(&self, bus: usize) -> Option<Matching> {
         let own = self.buses.get(bus).map(|b| &b.source);

@@ -731,15 +731,16 @@ fn a_log_of_several_buses_is_taken_apart_by_interface_then_by_name() {
         (Some("can1"), "can0"),
         (None, "right"),
     ];
-    let ids = |this, buses: &[_]| {
+    let told = |this, buses: &[_]| {
         let mut link = Replay::open(&path, Pace::Fast, Matching::of(buses, this), &[]).unwrap();
         let mut ids = Vec::new();
         while let Received::Frame(frame) = link.recv(now()) {
             ids.push(frame.id.raw());
         }
         assert_eq!(link.unmatched() + ids.len() as u64, 5);
-        ids
+        (ids, link.note())
     };
+    let ids = |this, buses: &[_]| told(this, buses).0;
     assert_eq!(ids(0, &buses), [1, 3, 5]);
     assert_eq!(
         ids(1, &buses),
@@ -747,7 +748,18 @@ fn a_log_of_several_buses_is_taken_apart_by_interface_then_by_name() {
         "can0 is the other bus's interface, although it is this bus's name"
     );
     assert!(ids(2, &buses).is_empty());
-    assert_eq!(ids(0, &buses[..1]), [1, 2, 3, 4, 5], "one bus takes all");
+    assert_eq!(told(0, &buses[..1]), (vec![1, 3, 5], None));
+    // A single bus takes all if the log was recorded under another name; that is told if they may
+    // be several buses.
+    let (all, note) = told(0, &[(Some("can7"), "arm")]);
+    assert_eq!(all, [1, 2, 3, 4, 5]);
+    let note = note.unwrap();
+    assert!(
+        note.starts_with(
+            "the log has the interfaces can0, can1, left, other, and the frames of all"
+        ),
+        "{note}"
+    );
 }
 
 // --- The virtual bus alone

@@ -213,3 +213,50 @@ fn interfaces_of_a_log_that_no_bus_takes_are_named() {
     );
     assert_eq!(report.other_names, ["can7", "can3"]);
 }
+
+/// Of a log of several buses, one bus takes its own frames; of a log that was recorded under other
+/// names, all, which is told if there are several. Its interface may come late.
+#[test]
+fn one_bus_takes_the_frames_of_its_interface_if_the_log_has_it() {
+    let line = |name: &str, t: u32| format!("({t}.000000) {name} 140#0000000000000000\n");
+    let decoded = |log: &str| {
+        let plan = Plan::parse(ARM, Path::new(".")).unwrap();
+        decode(&plan, log.as_bytes(), &mut Vec::new(), Columns::Main).unwrap()
+    };
+    let late: String = (0..9_000).map(|t| line("leg", t)).collect();
+    let report = decoded(&(late + &line("arm", 9_000)));
+    assert_eq!((report.samples, report.other_interfaces), (1, 9_000));
+    assert_eq!(
+        (report.other_names, report.several),
+        (vec!["leg".to_owned()], None)
+    );
+    let report = decoded(&(line("can0", 1) + &line("can0", 2)));
+    assert_eq!((report.samples, report.several), (2, None));
+    let report = decoded(&(line("can0", 1) + &line("can1", 2)));
+    assert_eq!((report.samples, report.other_interfaces), (2, 0));
+    let told = report.several.unwrap();
+    assert!(
+        told.starts_with("the log has the interfaces can0, can1, and the frames of all count")
+            && told.contains("interface or name of the bus in gateway.toml"),
+        "{told}"
+    );
+}
+
+/// Where the clock was set back, by how much, and what to do: until it has caught up, nothing is
+/// taken.
+#[test]
+fn a_clock_that_was_set_back_is_told_with_its_place() {
+    let before = log((1_000..1_050).step_by(10));
+    let (_, report) = decoded(&format!("{before}{}", log((400..430).step_by(10))));
+    assert_eq!(
+        report.step_back.as_deref(),
+        Some(
+            "at line 16 the time steps back by 0.6402 s, from 1.0402 s to 0.4 s: what has an \
+             earlier stamp than its last one is dropped. Cut the log there, and read the parts one \
+             by one"
+        )
+    );
+    // Frames of two interfaces that are read in turn are a little out of order.
+    let (_, report) = decoded(&format!("{before}{}", log([980, 1_100])));
+    assert_eq!(report.step_back, None);
+}

@@ -1313,11 +1313,14 @@ fn stamps_that_go_backwards_are_counted_and_take_nothing_else_with_them() {
         18,
         "two rows of nine channels: {json}"
     );
-    assert_eq!(dirty.err.lines().count(), 1, "{}", dirty.err);
+    assert_eq!(dirty.err.lines().count(), 2, "{}", dirty.err);
     assert!(
         dirty
             .err
-            .starts_with("bad.csv: samples dropped, the first in line 121: "),
+            .starts_with("bad.csv: samples dropped, the first in line 121: ")
+            && dirty
+                .err
+                .contains("\nbad.csv: at line 121 the time steps back by "),
         "{}",
         dirty.err
     );
@@ -1357,6 +1360,8 @@ fn stamps_that_go_backwards_are_counted_and_take_nothing_else_with_them() {
         "{}",
         dirty.err
     );
+    let told = format!("bad.log: at line {} the time steps back by ", motor + 2);
+    assert!(dirty.err.contains(&told), "{}", dirty.err);
 }
 
 #[test]

@@ -180,7 +180,7 @@ fn every_format_gives_the_same_table() {
             "{name}: not the same table"
         );
     }
-    // One bus takes all channels; the table without channels is that of one bus, too.
+    // One bus takes a channel of any name; the table without channels is that of one bus, too.
     let gateway = std::fs::read_to_string(&arm.gateway).expect("a file");
     let mut gateway: toml::Table = gateway.parse().expect("a configuration");
     let buses = gateway["bus"].as_array_mut().expect("the buses");

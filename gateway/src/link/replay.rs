@@ -18,7 +18,7 @@ use crate::log::{LogFormat, Reader, Report, Stamps};
 use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos, StampKind};
 use std::fs::File;
-use std::io::{self, BufReader};
+use std::io::{self, BufRead, BufReader};
 use std::path::Path;
 
 /// Size of the read buffer \[bytes\].
@@ -29,16 +29,16 @@ const BUFFER: usize = 1 << 16;
 pub struct Matching {
     interface: Option<String>,
     name: Option<String>,
+    is_alone: bool,
 }
 
 impl Matching {
     /// The selection of bus number `this` of `buses`, each given by its interface (if its source is
-    /// one) and name. A single bus takes everything (`None`). With several, a bus takes the frames
-    /// of its interface, and those of an interface with the bus's name that belongs to no other
-    /// bus.
+    /// one) and name: the frames of its interface, and those of an interface with the bus's name
+    /// that belongs to no other bus. `None` if there is no such bus.
     #[must_use]
     pub fn of(buses: &[(Option<&str>, &str)], this: usize) -> Option<Self> {
-        let (interface, name) = buses.get(this).filter(|_| buses.len() > 1)?;
+        let (interface, name) = buses.get(this)?;
         let taken = buses
             .iter()
             .enumerate()
@@ -46,7 +46,19 @@ impl Matching {
         Some(Self {
             interface: interface.map(str::to_owned),
             name: (!taken).then(|| (*name).to_owned()),
+            is_alone: buses.len() == 1,
         })
+    }
+
+    /// The selection in this log, of which nothing is read yet. `None`: all frames, those of a
+    /// single bus whose interface and name are not in the log, which was recorded under another
+    /// one.
+    ///
+    /// # Errors
+    /// The log cannot be read.
+    pub fn in_log(self, log: &mut Reader<impl BufRead>) -> io::Result<Option<Self>> {
+        let takes_all = self.is_alone && !log.has_interface(|name| self.takes(name))?;
+        Ok((!takes_all).then_some(self))
     }
 
     /// Whether frames of `interface` in the log belong to it.
@@ -54,6 +66,18 @@ impl Matching {
     pub fn takes(&self, interface: &str) -> bool {
         self.interface.as_deref() == Some(interface) || self.name.as_deref() == Some(interface)
     }
+}
+
+/// What a person should be told if a bus takes the frames of several interfaces of a log.
+pub(crate) fn several(interfaces: &[String]) -> Option<String> {
+    (interfaces.len() > 1).then(|| {
+        format!(
+            "the log has the interfaces {}, and the frames of all count, because none in its first \
+             16 MiB is the interface or name of the one bus; if only one of them is that bus, give \
+             its name as interface or name of the bus in gateway.toml",
+            interfaces.join(", ")
+        )
+    })
 }
 
 /// A log that is being replayed.
@@ -113,7 +137,7 @@ impl Replay {
         let mut replay = Self {
             log: Reader::with_stamps(BufReader::with_capacity(BUFFER, file), stamps),
             pace,
-            matching: interface,
+            matching: None,
             claims: claims.to_vec(),
             clock: Monotonic,
             pending: None,
@@ -125,6 +149,9 @@ impl Replay {
             unmatched: 0,
             counters: LinkCounters::default(),
         };
+        if let Some(interface) = interface {
+            replay.matching = interface.in_log(&mut replay.log).map_err(fail)?;
+        }
         // The first frame of the whole log is the origin, so that the buses of one log stay in
         // step.
         let matches = |interface: &str| replay.matching.as_ref().is_none_or(|m| m.takes(interface));
@@ -235,6 +262,10 @@ impl Link for Replay {
         }
         let key = "stamps = \"since_start\" or \"since_previous\" of the source";
         notes.extend(self.log.doubt(key));
+        notes.extend(self.log.step_back());
+        if self.matching.is_none() {
+            notes.extend(several(self.log.interfaces()));
+        }
         if self.counters.received == 0 {
             notes.push(format!(
                 "none of the log's {} frames is for this bus",

@@ -45,6 +45,6 @@ mod stamps;
 mod text;
 mod trc;
 
-pub use reader::{REORDER, Reader, Report};
+pub use reader::{REORDER, Reader, Report, StepBack};
 pub use record::{Direction, LineError, LogFormat, Record};
 pub use stamps::{STAMPS_OPTION, Stamps};

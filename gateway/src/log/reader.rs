@@ -32,12 +32,25 @@ pub struct Report {
     pub unstamped: u64,
     /// Frames with an earlier stamp than the previous frame.
     pub backwards: u64,
+    /// The first of them that is earlier by more than [`REORDER`].
+    pub first_step: Option<StepBack>,
     /// Frames that candump reports as lost.
     pub dropped: u64,
     /// Lines or objects that could not be read; they are skipped.
     pub bad: u64,
     /// Number and error of the first eight of them.
     pub first_bad: ArrayVec<(u64, LineError), NAMED>,
+}
+
+/// A place where the clock of a log was set back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StepBack {
+    /// The number of the line or object.
+    pub number: u64,
+    /// The stamp of the frame before \[ns\].
+    pub from: Nanos,
+    /// Its own stamp \[ns\].
+    pub to: Nanos,
 }
 
 /// The beginnings of files that people take for logs; what they are, and what to do.
@@ -93,6 +106,8 @@ const UTF_16: &str = "text in UTF-16: save it as UTF-8 first (iconv -f UTF-16 -t
 const UTF_8_MARK: &[u8] = b"\xEF\xBB\xBF";
 /// Bytes that are read first: the longest of these beginnings.
 const HEAD: usize = 8;
+/// The most bytes that are read ahead to look for an interface, and how many at first.
+const LOOK_FOR_INTERFACE: (usize, usize) = (16 << 20, 64 << 10);
 /// Bytes that are read ahead to tell relative stamps apart: a million lines.
 const LOOK_AHEAD: usize = 64 << 20;
 
@@ -193,6 +208,7 @@ pub struct Reader<R> {
     doubtful: bool,
     sum: Nanos,
     last: Option<Nanos>,
+    interfaces: ArrayVec<String, NAMED>,
     report: Report,
 }
 
@@ -221,6 +237,7 @@ impl<R: BufRead> Reader<R> {
             doubtful: false,
             sum: Nanos::ZERO,
             last: None,
+            interfaces: ArrayVec::new(),
             report: Report::default(),
         }
     }
@@ -287,6 +304,45 @@ impl<R: BufRead> Reader<R> {
         })
     }
 
+    /// The interfaces of the frames so far, at most eight.
+    pub fn interfaces(&self) -> &[String] {
+        &self.interfaces
+    }
+
+    /// What a person should be told if the clock of the log was set back.
+    pub fn step_back(&self) -> Option<String> {
+        let StepBack { number, from, to } = self.report.first_step?;
+        Some(format!(
+            "at {} {number} the time steps back by {} s, from {from} s to {to} s: what has an \
+             earlier stamp than its last one is dropped. Cut the log there, and read the parts one \
+             by one",
+            self.part(),
+            from.saturating_sub(to)
+        ))
+    }
+
+    /// Whether a frame of an interface that is `wanted` is in the log's first 16 MiB. To be called
+    /// before the first record is read; takes none.
+    ///
+    /// # Errors
+    /// A read error of `inner`.
+    pub fn has_interface(&mut self, wanted: impl Fn(&str) -> bool) -> io::Result<bool> {
+        let (most, mut size) = LOOK_FOR_INTERFACE;
+        loop {
+            let held = self.inner.hold(size)?;
+            let mut ahead = Reader::with_stamps(held, Stamps::SinceStart);
+            while let Some(record) = ahead.next_record()? {
+                if wanted(record.interface) {
+                    return Ok(true);
+                }
+            }
+            if held.len() < size || size >= most {
+                return Ok(false);
+            }
+            size *= 16;
+        }
+    }
+
     /// The next record; `None` at the end of the log.
     ///
     /// # Errors
@@ -314,13 +370,31 @@ impl<R: BufRead> Reader<R> {
                 if adds_up {
                     self.sum = t;
                 }
-                self.report.backwards += u64::from(self.last.is_some_and(|last| t < last));
-                self.last = Some(t);
+                if let Some(from) = self.last.replace(t)
+                    && t < from
+                {
+                    self.report.backwards += 1;
+                    let step = StepBack {
+                        number,
+                        from,
+                        to: t,
+                    };
+                    if from.saturating_sub(t) > REORDER {
+                        self.report.first_step.get_or_insert(step);
+                    }
+                }
                 break (parsed, Some(t));
             }
         };
         self.report.records += 1;
-        Ok(parsed.record(&self.line, stamp))
+        let record = parsed.record(&self.line, stamp);
+        if let Some(record) = &record
+            && !self.interfaces.is_full()
+            && self.interfaces.iter().all(|i| i != record.interface)
+        {
+            self.interfaces.push(record.interface.to_owned());
+        }
+        Ok(record)
     }
 
     /// The next frame and the number of its line; its text is in `line`. Lines without a frame are
