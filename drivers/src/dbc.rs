@@ -6,20 +6,23 @@
 //!
 //! - Signals: Intel and Motorola order, signed and unsigned, IEEE floats (`SIG_VALTYPE_`),
 //!   multiplexed ones, also by a multiplexed multiplexor or by ranges (`SG_MUL_VAL_`), frames of
-//!   CAN FD, standard and extended identifiers. A signal that all pages of a multiplexed message
-//!   have is taken from the pages that have other signals of the reading.
+//!   CAN FD, standard and extended identifiers. Of a multiplexed message, signals that some pages
+//!   have together are taken from these pages.
 //! - A message or signal that can not be used does no harm unless it is named: one of more than 64
 //!   bits, or an identifier of more than 11 bits that is not marked as an extended one.
-//! - SAE J1939 (attribute `VFrameFormat` or `ProtocolType`): the parameter group counts, and not
+//! - SAE J1939 (attribute `VFrameFormat`, else `ProtocolType`): the parameter group counts, and not
 //!   the priority, the source and, where the group has one, the destination that are in the file.
 //!   If the file has several messages of one group, their addresses count. Messages of more than 8
-//!   bytes, which come in several packets, are not read.
+//!   bytes, which come in several packets, are not read. Unsigned numbers of whole bytes of which
+//!   the highest is FE (error) or FF (not available) are no value; others are none if all their
+//!   bits are 1. A counter may have any.
 //! - Names: those in the file, and the long ones that editors keep beside them
 //!   (`SystemMessageLongSymbol`, `SystemSignalLongSymbol`). Where several messages have one name,
 //!   the identifier stands for it, three digits or eight: `"0x1A0.Position"`,
 //!   `"0x18FF0001.Position"`.
 //! - Units: the file's own unit is converted to SI, and must fit the value. Where the file has none
-//!   (or one that is not known), `units` gives it; `units` also overrides the file's.
+//!   (or one that is not known), `units` gives it; `units` also overrides the file's. Case does not
+//!   matter, but for m (a thousandth) and M (a million).
 //! - A reading is complete when each of its signals has come once. If they come in several frames,
 //!   `first` names the message that opens a reading, and the others must follow within
 //!   `pair_timeout_ms`: less than half the period, so that a lost frame never leads to a mixture of

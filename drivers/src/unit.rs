@@ -156,8 +156,8 @@ const UNITS: &[(&[&str], Quantity, f64, f64)] = &[
     (&["mt"], MagneticField, 1e-3, 0.0),
     (&["ut"], MagneticField, 1e-6, 0.0),
     (&["nt"], MagneticField, 1e-9, 0.0),
-    (&["gauss", "gs"], MagneticField, 1e-4, 0.0),
-    (&["mgauss"], MagneticField, 1e-7, 0.0),
+    (&["gauss", "gs", "g"], MagneticField, 1e-4, 0.0),
+    (&["mgauss", "mg"], MagneticField, 1e-7, 0.0),
     (
         &[
             "degc",
@@ -183,7 +183,7 @@ const UNITS: &[(&[&str], Quantity, f64, f64)] = &[
     (&["pa", "pascal"], Pressure, 1.0, 0.0),
     (&["hpa"], Pressure, 1e2, 0.0),
     (&["kpa"], Pressure, 1e3, 0.0),
-    (&["mpa"], Pressure, 1e6, 0.0),
+    (&["Mpa"], Pressure, 1e6, 0.0),
     (&["bar", "bars"], Pressure, 1e5, 0.0),
     (&["mbar"], Pressure, 1e2, 0.0),
     (&["psi"], Pressure, POUND * G / (INCH * INCH), 0.0),
@@ -214,8 +214,8 @@ const RATES: &[(Quantity, Quantity)] = &[
     (Velocity, Acceleration),
 ];
 
-/// `word` in lower case, with signs spelled out, without spaces, brackets and signs of products,
-/// and with a slash before what divides. So `[N·m]` is `nm`, and `°/s²` and
+/// `word` in lower case (but for M, which is no m), with signs spelled out, without spaces, brackets
+/// and signs of products, and with a slash before what divides. So `[N·m]` is `nm`, and `°/s²` and
 /// `deg s^-2` are `deg/s2`.
 fn plain(word: &str) -> String {
     let mut text = String::new();
@@ -230,6 +230,7 @@ fn plain(word: &str) -> String {
             '\u{c2}' => {}
             '*' | '.' | '\u{b7}' | '\u{22c5}' => text.push(' '),
             '^' | '_' | '[' | ']' | '(' | ')' | '\'' => {}
+            'M' => text.push('M'),
             other => text.extend(other.to_lowercase()),
         }
     }
@@ -247,12 +248,23 @@ fn plain(word: &str) -> String {
     plain
 }
 
+/// Whether `text`, as [`plain`] writes it, is the spelling `spelling`, which is one of `all`. Case
+/// does not matter, but for an m of a unit with a prefix: m is a thousandth, and M a million.
+fn is_spelled<'s>(text: &str, spelling: &str, mut all: impl Iterator<Item = &'s str>) -> bool {
+    let mut has_prefix = |of: &str| {
+        let unit = of.strip_prefix(['m', 'M']).filter(|unit| !unit.is_empty());
+        unit.is_some_and(|unit| all.any(|known| known.eq_ignore_ascii_case(unit)))
+    };
+    spelling.eq_ignore_ascii_case(text)
+        && (spelling.get(..1) == text.get(..1) || !has_prefix(spelling))
+}
+
 /// The time that a unit is divided by, one or two factors: how many, and their product \[s\].
 fn times(text: &str) -> Option<(usize, f64)> {
     let time = |text: &str| {
-        let found = TIMES
-            .iter()
-            .find(|(spellings, _)| spellings.contains(&text));
+        let all = || TIMES.iter().flat_map(|(spellings, _)| *spellings).copied();
+        let is = |spelling: &&str| is_spelled(text, spelling, all());
+        let found = TIMES.iter().find(|(spellings, _)| spellings.iter().any(is));
         found.map(|(_, seconds)| *seconds)
     };
     if let Some((first, second)) = text.split_once('/') {
@@ -273,9 +285,11 @@ pub(crate) fn unit(word: &str, legal: &[Quantity]) -> Option<Unit> {
         return None;
     }
     let spelled = |text: &str, legal: &[Quantity]| {
+        let words = || UNITS.iter().flat_map(|unit| unit.0).copied();
+        let is = |spelling: &&str| is_spelled(text, spelling, words());
         let mut units = UNITS.iter();
-        let found = units.find(|u| legal.contains(&u.1) && u.0.contains(&text));
-        let all = || UNITS.iter().find(|unit| unit.0.contains(&text));
+        let found = units.find(|u| legal.contains(&u.1) && u.0.iter().any(is));
+        let all = || UNITS.iter().find(|unit| unit.0.iter().any(is));
         found
             .or_else(all)
             .map(|&(_, quantity, factor, offset)| Unit {
@@ -296,6 +310,23 @@ pub(crate) fn unit(word: &str, legal: &[Quantity]) -> Option<Unit> {
     }
     unit.factor /= seconds;
     Some(unit)
+}
+
+/// Whether `word`, which is no unit, is one behind a number other than 1, as `0.1 degC`.
+pub(crate) fn is_multiple(word: &str) -> bool {
+    let is_number = |c: char| c.is_ascii_digit() || matches!(c, '.' | ',' | '/' | '*' | ' ');
+    let rest = word.trim_start_matches(is_number);
+    rest.len() < word.trim_start().len() && !rest.is_empty() && unit(rest, &[]).is_some()
+}
+
+/// Whether `word`, which is no unit, is one with m for M, or M for m.
+pub(crate) fn is_of_other_case(word: &str) -> bool {
+    let other = |c| match c {
+        'm' => 'M',
+        'M' => 'm',
+        c => c,
+    };
+    unit(&word.chars().map(other).collect::<String>(), &[]).is_some()
 }
 
 /// The usual spellings of the units of `quantities`, for messages.
@@ -451,6 +482,11 @@ mod tests {
             ("degrees C", Temperature, 1.0),
             ("Gauss", MagneticField, 1e-4),
             ("percent", Number, 0.01),
+            ("NMM", Torque, 1e-3),
+            ("1/MIN", AngularVelocity, 0.104_719_755_119_659_77),
+            ("REV/MIN", AngularVelocity, 0.104_719_755_119_659_77),
+            ("M/S", Velocity, 1.0),
+            ("Meters", Length, 1.0),
         ] {
             let unit = unit(word, &[]).unwrap_or_else(|| panic!("{word:?} is not known"));
             assert_eq!(unit.quantity, quantity, "{word:?}");
@@ -479,6 +515,17 @@ mod tests {
             "rad/s^3",
             "*",
             "V",
+            // A million of it.
+            "MN",
+            "MNm",
+            "Mrad",
+            "MM",
+            "Mrad/s",
+            "rad/Ms",
+            "MA",
+            // A thousandth.
+            "mPa",
+            "0.1 degC",
         ] {
             assert_eq!(unit(word, &[]), None, "{word:?}");
         }
@@ -499,6 +546,20 @@ mod tests {
             MagneticField
         );
         assert_eq!(unit("g's", &[Acceleration]).unwrap().quantity, Acceleration);
+        let milli = |legal| unit("mG", &[legal]).map(|unit| (unit.quantity, unit.factor));
+        assert_eq!(milli(Acceleration), Some((Acceleration, G * 1e-3)));
+        assert_eq!(milli(MagneticField), Some((MagneticField, 1e-7)));
+        for (word, of_other_case, multiple) in [
+            ("MNm", true, false),
+            ("mPa", true, false),
+            ("0.1 degC", false, true),
+            ("1/10 \u{b0}C", false, true),
+            ("furlong", false, false),
+            ("3", false, false),
+        ] {
+            let found = (is_of_other_case(word), is_multiple(word));
+            assert_eq!(found, (of_other_case, multiple), "{word}");
+        }
     }
 
     /// What a message offers is read as what it says.

@@ -1,6 +1,6 @@
 //! The device's own side: sends its readings in the frames that the file describes, from power-on.
 
-use super::layout::{Layout, Part, Role};
+use super::layout::{Layout, Part, Role, implies, shared};
 use super::options::Options;
 use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
 use alloc::vec::Vec;
@@ -25,7 +25,7 @@ struct Pending {
     parts: Vec<Part>,
     data: [u8; 64],
     /// The parts whose values are new, one bit each.
-    fresh: u32,
+    fresh: u128,
 }
 
 impl DbcBoard {
@@ -46,28 +46,19 @@ impl DbcBoard {
         }
         let mut frames: Vec<Pending> = Vec::new();
         for (message, layout) in layout.messages.iter().enumerate() {
-            for part in &layout.parts {
-                let same = |pending: &&mut Pending| {
-                    let first = pending.parts.first();
-                    pending.message == message
-                        && first.is_some_and(|first| first.conditions == part.conditions)
-                };
-                match frames.iter_mut().find(same) {
-                    Some(pending) => pending.parts.push(part.clone()),
-                    None => {
-                        let mut data = [0; 64];
-                        for condition in &part.conditions {
-                            let raw = condition.ranges.first().map_or(0, |range| range.0);
-                            condition.bits.set(raw, &mut data);
-                        }
-                        frames.push(Pending {
-                            message,
-                            parts: [part.clone()].to_vec(),
-                            data,
-                            fresh: 0,
-                        });
-                    }
+            for conditions in shared(layout.parts.iter().map(|part| &part.conditions)) {
+                let mut data = [0; 64];
+                for condition in &conditions {
+                    let raw = condition.ranges.first().map_or(0, |range| range.0);
+                    condition.bits.set(raw, &mut data);
                 }
+                let has = |part: &&Part| implies(&conditions, &part.conditions);
+                frames.push(Pending {
+                    message,
+                    parts: layout.parts.iter().filter(has).cloned().collect(),
+                    data,
+                    fresh: 0,
+                });
             }
         }
         let readings = 0..layout.readings.len();

@@ -112,7 +112,7 @@ impl Assembly {
                 taxels: [f64::NAN; 12],
             })
             .values(),
-            Kind::Wrench | Kind::Gauges | Kind::Temperature => [0.0; VALUES],
+            Kind::Wrench | Kind::Gauges | Kind::Temperature => [f64::NAN; VALUES],
         };
         Self {
             layout: layout.clone(),
@@ -145,13 +145,15 @@ impl Assembly {
         let mut values = [0.0; VALUES];
         // The values that have come, and those that ride along, one bit each.
         let (mut come, mut along): (u16, u16) = (0, 0);
-        for Field { role, bits, raw } in &part.fields {
+        for field in &part.fields {
+            let Field { bits, raw, .. } = *field;
             let Some(found) = bits.of(frame.data()) else {
                 continue;
             };
-            match *role {
+            let is_none = field.is_none(found);
+            match field.role {
                 Role::Counter => self.count = Some(found),
-                Role::Fault => self.fault = found != 0,
+                Role::Fault => self.fault = found != 0 && !is_none,
                 Role::Value {
                     index,
                     gain,
@@ -159,8 +161,10 @@ impl Assembly {
                     hold,
                     rides,
                 } => {
-                    let value = gain * raw.number(found, bits.length()) + offset;
-                    if !value.is_finite() {
+                    let number = gain * raw.number(found, bits.length()) + offset;
+                    let absent = self.absent.get(index).copied();
+                    let value = absent.filter(|_| is_none).unwrap_or(number);
+                    if !value.is_finite() && !is_none {
                         out.fault(Counter::Value, 1, frame.id);
                         if hold.is_none() {
                             return false;
@@ -258,7 +262,14 @@ impl Assembly {
         if core::mem::take(&mut self.gap) | after_silence {
             quality |= Quality::GAP_BEFORE;
         }
-        let Some(reading) = Reading::from_values(self.layout.kind, &values) else {
+        let none = |index: usize| values.get(index).is_some_and(|value| value.is_nan());
+        let mut needed = (0..VALUES).filter(|index| self.layout.needed & 1 << index != 0);
+        let means_nothing = match self.layout.kind {
+            Kind::Wrench | Kind::Gauges => (0..6).any(none),
+            _ => needed.all(none),
+        };
+        let reading = Reading::from_values(self.layout.kind, &values);
+        let Some(reading) = reading.filter(|_| !means_nothing) else {
             out.fault(Counter::Value, 1, frame.id);
             return None;
         };
@@ -277,7 +288,8 @@ impl Family for DbcDevice {
     type Questions = NoInquiry;
 
     fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
-        if frame.format == Format::Error {
+        // Who asks for a frame of the device says nothing of it.
+        if matches!(frame.format, Format::Error | Format::Remote) {
             return;
         }
         let data = frame.data();

@@ -3,7 +3,7 @@
 
 use super::options::{Options, ReadingKeys};
 use crate::signal::{Bits, Message, Raw, Signal};
-use crate::unit::{Unit, quantities, spellings, unit};
+use crate::unit::{Unit, is_multiple, is_of_other_case, quantities, spellings, unit};
 use crate::{Claim, Decoded, Format, Id, Spec, SpecError};
 use alloc::collections::BTreeMap;
 use alloc::format;
@@ -23,7 +23,7 @@ pub(super) enum Role {
         offset: f64,
         /// Its last one is used for this long; `None`: it comes with each reading.
         hold: Option<Nanos>,
-        /// Other values of the reading come in fewer of these frames: it is taken along with them.
+        /// A reading needs it of other frames: it is taken along with others of these.
         rides: bool,
     },
     /// It counts the readings.
@@ -32,15 +32,48 @@ pub(super) enum Role {
     Fault,
 }
 
+impl Role {
+    /// Whether it belongs to one reading, and is not kept for the next ones.
+    const fn is_timed(self) -> bool {
+        match self {
+            Self::Value { hold, .. } => hold.is_none(),
+            Self::Counter => true,
+            Self::Fault => false,
+        }
+    }
+}
+
 /// A signal that is used.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Field {
     pub(super) role: Role,
     pub(super) bits: Bits,
     pub(super) raw: Raw,
+    /// The least raw value that stands for none (J1939).
+    pub(super) none_from: Option<u64>,
 }
 
-/// Frames that have a signal: those in which these bits are within one of these ranges.
+impl Field {
+    /// Whether the raw value `found` stands for none.
+    pub(super) fn is_none(&self, found: u64) -> bool {
+        self.none_from.is_some_and(|least| found >= least)
+    }
+}
+
+/// The least raw value of a signal of J1939 that stands for none (SAE J1939-71): of whole bytes,
+/// the highest one is FE for an error, and FF where there is no value. Of others, all bits are 1
+/// where there is none. What has a sign is of a maker's own.
+fn none_from(raw: Raw, bits: Bits) -> Option<u64> {
+    match u32::from(bits.length()) {
+        _ if raw != Raw::Unsigned => None,
+        length if length % 8 == 0 => Some(0xFE << (length - 8)),
+        1 => None,
+        length => Some(u64::MAX >> (64 - length)),
+    }
+}
+
+/// Frames that have a signal: those in which these bits are within one of these ranges, which are
+/// sorted and do not touch each other.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Condition {
     pub(super) bits: Bits,
@@ -57,8 +90,54 @@ impl Condition {
     }
 }
 
-/// The signals of one reading that the same frames have. Signals that all frames of a multiplexed
-/// message have are in the part of each page that has another signal of the reading.
+/// The frames that fulfil both; `None`: there are none.
+pub(super) fn meet(ours: &[Condition], others: &[Condition]) -> Option<Vec<Condition>> {
+    let mut both = ours.to_vec();
+    for other in others {
+        match both.iter_mut().find(|mine| mine.bits == other.bits) {
+            None => both.push(other.clone()),
+            Some(mine) => {
+                let pairs = mine.ranges.iter();
+                let pairs = pairs.flat_map(|a| other.ranges.iter().map(move |b| (a, b)));
+                let common = pairs.map(|(a, b)| (a.0.max(b.0), a.1.min(b.1)));
+                mine.ranges = common.filter(|(first, last)| first <= last).collect();
+                if mine.ranges.is_empty() {
+                    return None;
+                }
+            }
+        }
+    }
+    Some(both)
+}
+
+/// Whether each frame that fulfils `ours` fulfils `others`, too.
+pub(super) fn implies(ours: &[Condition], others: &[Condition]) -> bool {
+    meet(ours, others).is_some_and(|both| both == ours)
+}
+
+/// The frames that have several of the signals with these conditions: for each signal, those that
+/// it shares with as many of the others as go together, so that they are taken from one frame.
+pub(super) fn shared<'c>(
+    all: impl Iterator<Item = &'c Vec<Condition>> + Clone,
+) -> Vec<Vec<Condition>> {
+    let mut shared: Vec<Vec<Condition>> = Vec::new();
+    for own in all.clone() {
+        let mut frames = own.clone();
+        for other in all.clone() {
+            frames = meet(&frames, other).unwrap_or(frames);
+        }
+        if !shared
+            .iter()
+            .any(|known| implies(known, &frames) && implies(&frames, known))
+        {
+            shared.push(frames);
+        }
+    }
+    shared
+}
+
+/// The signals of one reading that the same frames have. A signal that more frames have is in the
+/// parts of all those that have another signal of the reading.
 #[derive(Debug, Clone)]
 pub(super) struct Part {
     /// The reading's number.
@@ -70,13 +149,12 @@ pub(super) struct Part {
 }
 
 impl Part {
-    /// Whether each frame that has these signals also has those of `other`.
-    fn has_conditions_of(&self, other: &Self) -> bool {
-        let mut conditions = other.conditions.iter();
-        conditions.all(|condition| self.conditions.contains(condition))
+    /// Whether its signals belong to one reading: it has no held values and no fault.
+    fn is_timed(&self) -> bool {
+        self.fields.iter().all(|field| field.role.is_timed())
     }
 
-    /// The values that only these frames have and each reading needs, one bit each.
+    /// The values that a reading needs of these frames, one bit each.
     pub(super) fn needed(&self) -> u16 {
         let bit = |field: &Field| match field.role {
             Role::Value {
@@ -112,29 +190,34 @@ impl MessageLayout {
         }
     }
 
-    /// Moves the signals of reading `reading` that more frames have than others of its signals into
-    /// the parts of those.
-    fn join_riders(&mut self, reading: usize) {
-        let mine = |part: &&Part| part.reading == reading;
-        let parts: Vec<Part> = self.parts.iter().filter(mine).cloned().collect();
-        let is_narrower = |part: &Part, than: &Part| {
-            part.has_conditions_of(than) && !than.has_conditions_of(part)
-        };
-        let rides = |part: &Part| parts.iter().any(|other| is_narrower(other, part));
-        self.parts
-            .retain(|part| part.reading != reading || !rides(part));
-        for part in self.parts.iter_mut().filter(|part| part.reading == reading) {
-            let riders = parts.iter().filter(|rider| is_narrower(part, rider));
-            for rider in riders.collect::<Vec<_>>() {
-                part.reach = part.reach.max(rider.reach);
-                for field in &rider.fields {
-                    let mut field = field.clone();
-                    if let Role::Value { rides, .. } = &mut field.role {
-                        *rides = true;
-                    }
-                    part.fields.push(field);
+    /// Puts the signals of reading `reading` that a frame has together into one part.
+    fn join(&mut self, reading: usize) {
+        let is_mine = |part: &Part| part.reading == reading && part.is_timed();
+        let mine: Vec<Part> = self.parts.iter().filter(|p| is_mine(p)).cloned().collect();
+        self.parts.retain(|part| !is_mine(part));
+        let mut taken: u16 = 0;
+        for conditions in shared(mine.iter().map(|part| &part.conditions)) {
+            let mut joint = Part {
+                reading,
+                conditions,
+                fields: Vec::new(),
+                reach: 0,
+            };
+            for part in &mine {
+                if !implies(&joint.conditions, &part.conditions) {
+                    continue;
+                }
+                joint.reach = joint.reach.max(part.reach);
+                joint.fields.extend(part.fields.iter().cloned());
+            }
+            for field in &mut joint.fields {
+                if let Role::Value { index, rides, .. } = &mut field.role {
+                    *rides = taken & 1 << *index != 0;
                 }
             }
+            taken |= joint.needed();
+            // After what only joins a reading: it is of the same frame.
+            self.parts.push(joint);
         }
     }
 
@@ -328,7 +411,7 @@ impl Layout {
         };
         let mut frames = 0;
         for message in &mut self.messages {
-            message.join_riders(number);
+            message.join(number);
             for part in message.parts.iter().filter(|part| part.reading == number) {
                 let needed = part.needed();
                 frames += usize::from(needed != 0);
@@ -368,15 +451,12 @@ impl Layout {
         let most = Decoded::MOST;
         for message in &self.messages {
             let overlaps = |other: &&MessageLayout| other.frames.overlaps(&message.frames);
-            for part in &message.parts {
-                // Those of the same frames, and of more.
-                let others = self.messages.iter().filter(overlaps);
-                let comes = |other: &&Part| part.has_conditions_of(other);
-                let mut readings: Vec<usize> = others
-                    .flat_map(|other| &other.parts)
-                    .filter(comes)
-                    .map(|part| part.reading)
-                    .collect();
+            let others = self.messages.iter().filter(overlaps);
+            let parts: Vec<&Part> = others.flat_map(|other| &other.parts).collect();
+            for conditions in shared(parts.iter().map(|part| &part.conditions)) {
+                let comes = |part: &&&Part| implies(&conditions, &part.conditions);
+                let readings = parts.iter().filter(comes).map(|part| part.reading);
+                let mut readings: Vec<usize> = readings.collect();
                 readings.sort_unstable();
                 readings.dedup();
                 if readings.len() > most {
@@ -416,6 +496,7 @@ impl Layout {
             role,
             bits,
             raw: signal.raw,
+            none_from: none_from(signal.raw, bits).filter(|_| j1939 && role != Role::Counter),
         };
         let messages = &mut self.messages;
         let known = messages.iter().position(|m| m.frames == frames);
@@ -431,7 +512,11 @@ impl Layout {
         let Some(layout) = messages.get_mut(at) else {
             return Ok(());
         };
-        let same = |part: &&mut Part| part.reading == reading && part.conditions == conditions;
+        let same = |part: &&mut Part| {
+            part.reading == reading
+                && part.conditions == conditions
+                && part.is_timed() == role.is_timed()
+        };
         match layout.parts.iter_mut().find(same) {
             Some(part) => {
                 part.fields.push(field);
@@ -538,22 +623,40 @@ fn shown(message: &Message) -> String {
     id.map_or_else(Clone::clone, ToString::to_string)
 }
 
-/// The message that has the name `wanted`, or the identifier.
-fn find_message<'o>(options: &'o Options, wanted: &str) -> Result<&'o Message, String> {
-    let digits = wanted.strip_prefix("0x").filter(|digits| digits.len() <= 8);
-    let raw = digits.and_then(|digits| u32::from_str_radix(digits, 16).ok());
+/// The identifier that `wanted` is: its number, and whether it is an extended one.
+fn id_in(wanted: &str) -> Option<(u32, bool)> {
+    let digits = wanted
+        .strip_prefix("0x")
+        .filter(|digits| digits.len() <= 8)?;
     // As candump writes them: eight digits are an extended identifier.
-    let is_extended = digits.is_some_and(|digits| digits.len() == 8);
-    let is_wanted = |message: &&Message| match (raw, &message.id) {
-        (Some(raw), Ok(id)) => id.raw() == raw && matches!(id, Id::Extended(_)) == is_extended,
+    Some((u32::from_str_radix(digits, 16).ok()?, digits.len() == 8))
+}
+
+/// The messages that have the name `wanted`, or the identifier.
+fn messages_of<'o>(options: &'o Options, wanted: &str) -> Vec<&'o Message> {
+    let id = id_in(wanted);
+    let is_wanted = |message: &&Message| match (id, &message.id) {
+        (Some(wanted), Ok(id)) => (id.raw(), matches!(id, Id::Extended(_))) == wanted,
         (Some(_), Err(_)) => false,
         (None, _) => message.name == wanted || message.long_name.as_deref() == Some(wanted),
     };
-    let found: Vec<&Message> = options.messages.iter().filter(is_wanted).collect();
-    match *found {
+    let mut found: Vec<&Message> = Vec::new();
+    for message in options.messages.iter().filter(is_wanted) {
         // Some files have the same message twice.
-        [message, ref others @ ..] if others.iter().all(|other| *other == message) => Ok(message),
-        [] if raw.is_some() => Err(format!(
+        if !found.contains(&message) {
+            found.push(message);
+        }
+    }
+    found
+}
+
+/// The message that has the name `wanted`, or the identifier.
+fn find_message<'o>(options: &'o Options, wanted: &str) -> Result<&'o Message, String> {
+    let is_id = id_in(wanted).is_some();
+    let found = messages_of(options, wanted);
+    match *found {
+        [message] => Ok(message),
+        [] if is_id => Err(format!(
             "{:?} has no message with this identifier; a standard one has three digits, an \
              extended one eight",
             options.file
@@ -570,11 +673,19 @@ fn find_message<'o>(options: &'o Options, wanted: &str) -> Result<&'o Message, S
             let all: Vec<String> = (found.iter())
                 .map(|message| format!("{} {}", name(message), shown(message)))
                 .collect();
+            let is_told = |message: &&Message| match is_id {
+                true => messages_of(options, name(message)).len() == 1,
+                false => messages_of(options, &shown(message)).len() == 1,
+            };
+            let remedy = match (found.iter().all(is_told), is_id) {
+                (true, true) => "write the name of one of them instead",
+                (true, false) => "write the identifier of one of them instead",
+                (false, _) => "give each another name in the file",
+            };
             Err(format!(
-                "{:?} has several messages {wanted:?}: {}; write the {} of one of them instead",
+                "{:?} has several messages {wanted:?}: {}; {remedy}",
                 options.file,
                 all.join(", "),
-                if raw.is_some() { "name" } else { "identifier" }
             ))
         }
     }
@@ -589,7 +700,12 @@ fn find<'o>(options: &'o Options, path: &str) -> Result<(&'o Message, &'o Signal
     let is_wanted = |s: &&Signal| s.name == signal || s.long_name.as_deref() == Some(signal);
     let wanted: Vec<&Signal> = found.signals.iter().filter(is_wanted).collect();
     match *wanted {
-        [signal] => Ok((found, signal)),
+        [signal] => {
+            // Whatever else is missing is no reason then.
+            found.id.as_ref().map_err(Clone::clone)?;
+            signal.bits.as_ref().map_err(Clone::clone)?;
+            Ok((found, signal))
+        }
         [] => {
             let names = found.signals.iter();
             let names = names.map(|s| s.long_name.as_deref().unwrap_or(&s.name));
@@ -625,20 +741,27 @@ fn convert(
     let (legal, word) = (quantities(kind, index), given.unwrap_or(&signal.unit));
     let name = kind.fields().get(index).copied().unwrap_or_default();
     let units = || spellings(legal).join(", ");
+    let add = || format!("add units = {{ {name} = \"...\" }}, one of {}", units());
     match unit(word, legal) {
         Some(unit) if legal.contains(&unit.quantity) => Ok(unit),
-        Some(_) if given.is_none() && word.trim().is_empty() => Err(format!(
-            "the file gives no unit: add units = {{ {name} = \"...\" }}, one of {}",
-            units()
-        )),
+        Some(_) if given.is_none() && word.trim().is_empty() => {
+            Err(format!("the file gives no unit: {}", add()))
+        }
         Some(_) => Err(format!(
             "its unit {word:?} does not fit: it must be one of {}",
             units()
         )),
-        None => Err(format!(
-            "its unit {word:?} is not known: add units = {{ {name} = \"...\" }}, one of {}",
-            units()
+        None if is_multiple(word) => Err(format!(
+            "its unit {word:?} has a number: if the file's factor {} holds it already, {}; else \
+             multiply factor and offset in the file by it first",
+            signal.factor,
+            add()
         )),
+        None if is_of_other_case(word) => Err(format!(
+            "its unit {word:?} is not known: m is a thousandth, and M a million: {}",
+            add()
+        )),
+        None => Err(format!("its unit {word:?} is not known: {}", add())),
     }
 }
 
@@ -661,9 +784,20 @@ fn conditions(message: &Message, signal: &Signal) -> Result<Vec<Condition>, Stri
         if conditions.len() >= message.signals.len() {
             return Err("its multiplexors select each other in a circle".to_string());
         }
+        let mut ranges: Vec<(u64, u64)> = Vec::new();
+        let mut sorted = switch.ranges.clone();
+        sorted.sort_unstable();
+        for (first, last) in sorted {
+            match ranges.last_mut() {
+                Some(before) if first <= before.1.saturating_add(1) => {
+                    before.1 = before.1.max(last);
+                }
+                _ => ranges.push((first, last)),
+            }
+        }
         conditions.push(Condition {
             bits: multiplexor.bits.clone()?,
-            ranges: switch.ranges.clone(),
+            ranges,
         });
         at = multiplexor;
     }

@@ -360,6 +360,113 @@ fn pages_of_one_message_are_one_reading() {
     assert_eq!(values, [[1.0, 2.0, 2.0], [3.0, 4.0, 4.0]]);
 }
 
+/// Signals that a frame has together are taken from that frame, however their pages overlap; and a
+/// simulated device sends them so.
+#[test]
+fn signals_of_one_frame_are_one_reading() {
+    let device = |keys: &str, x: &[(u64, u64)], y: &[(u64, u64)], mode| {
+        let mut messages = messages();
+        for (at, start, ranges) in [(1, 8, x), (2, 24, y)] {
+            let signal = &mut messages[4].signals[at];
+            signal.bits = Bits::new(start, 16, false).ok_or_else(String::new);
+            signal.switch.as_mut().unwrap().ranges = ranges.to_vec();
+        }
+        let mut options = options("dbc", keys);
+        options.describe(messages);
+        let spec = spec(0, mode, &[]);
+        let board = options.board(&spec).unwrap();
+        (options.device(&spec).unwrap(), board)
+    };
+    let page = |number: u8, value: u8, ms| at(0x14, &[number, value, 0, value, 0, 0, 0, 0], ms);
+    let frames = [
+        page(0, 1, 0.0),
+        page(1, 2, 5.0),
+        page(2, 3, 7.0),
+        page(0, 4, 10.0),
+        page(1, 5, 15.0),
+    ];
+    let both = "file = \"device.dbc\"\n[[reading]]\nkind = \"imu\"\n\
+                fields = { ax = \"Page.X\", ay = \"Page.Y\" }\n";
+    let held = format!("{both}hold_ms = {{ ay = 100.0 }}\n");
+    let of_zero = [[1.0; 2], [4.0; 2]];
+    for (keys, x, y, expected) in [
+        // A range that covers the other signal's page, in one piece or in two.
+        (both, &[(0, 0)][..], &[(0, 1)][..], of_zero),
+        (both, &[(0, 1)], &[(0, 0)], of_zero),
+        (both, &[(1, 1), (0, 0)], &[(0, 1)], [[1.0; 2], [2.0; 2]]),
+        // Ranges of which neither covers the other.
+        (both, &[(0, 1)], &[(1, 2)], [[2.0; 2], [5.0; 2]]),
+        (&held, &[(0, 0)], &[(0, 1)], of_zero),
+    ] {
+        let (mut device, mut board) = device(keys, x, y, Mode::Listen);
+        let (readings, faults) = decode(&mut *device, &frames);
+        assert!(faults.is_empty(), "{faults:?}");
+        let values = readings.iter().map(|output| output.reading.values());
+        let values: Vec<[f64; 2]> = values.map(|values| [values[0], values[1]]).collect();
+        assert_eq!(values[..2], expected, "{x:?} {y:?}");
+        device.restart(Nanos::ZERO);
+        let sent = encode(&mut *board, 0, &readings[0].reading, Quality::GOOD);
+        let (back, _) = decode(&mut *device, &sent);
+        assert_eq!((sent.len(), back.len()), (1, 1), "{x:?} {y:?}");
+        assert_eq!(back[0].reading.values()[..2], expected[0]);
+    }
+}
+
+/// In messages of J1939 the highest values stand for none; a request for a message is no message.
+#[test]
+fn values_that_are_not_available_are_none() {
+    let keys = "file = \"device.dbc\"\n[[reading]]\nkind = \"joint\"\n\
+                fields = { position = \"G.Byte\", velocity = \"G.Word\", current = \"G.Bits\" }\n\
+                hold_ms = { current = 1000.0 }\nfault = \"G.Flag\"\n";
+    let told = |j1939: bool, raw: Raw, data: [u8; 5]| {
+        let message = Message {
+            name: "G".to_owned(),
+            id: Ok(Id::extended(0x18FF_1023)),
+            j1939,
+            signals: vec![
+                signal("Byte", 0, 8, raw, 1.0, "rad"),
+                signal("Word", 8, 16, raw, 1.0, "rad/s"),
+                signal("Bits", 24, 4, raw, 1.0, "A"),
+                signal("Flag", 32, 2, raw, 1.0, ""),
+            ],
+            ..messages()[0].clone()
+        };
+        let mut options = options("dbc", keys);
+        options.describe(vec![message]);
+        let mut device = options.device(&spec(0, Mode::Listen, &[0])).unwrap();
+        let id = Id::extended(0x18FF_1023);
+        let (readings, faults) = decode(&mut *device, &[Frame::remote(id, 5)]);
+        assert!(readings.is_empty() && faults.is_empty(), "{faults:?}");
+        let (readings, faults) = decode(&mut *device, &[Frame::new(id, &data)]);
+        let is_faulty = count(&faults, Counter::DeviceFault) != 0;
+        let values = |output: &Output| match output.reading {
+            Reading::Joint(joint) => [joint.position, joint.velocity, joint.current],
+            _ => panic!("{output:?}"),
+        };
+        (readings.first().map(values), is_faulty)
+    };
+    let same = |found: Option<[f64; 3]>, right: [f64; 3]| {
+        let equal = |(a, b): (f64, f64)| a == b || a.is_nan() && b.is_nan();
+        found.is_some_and(|found| found.into_iter().zip(right).all(equal))
+    };
+    const NONE: f64 = f64::NAN;
+    for (data, right, fault) in [
+        ([0xFD, 0xFF, 0xFD, 0x0E, 1], [253.0, 65023.0, 14.0], true),
+        ([0xFE, 0x00, 0x01, 0x0F, 3], [NONE, 256.0, NONE], false),
+        ([0x01, 0x00, 0xFE, 0x01, 0], [1.0, NONE, 1.0], false),
+        ([0x01, 0x34, 0xFF, 0x01, 2], [1.0, NONE, 1.0], true),
+    ] {
+        let (found, is_faulty) = told(true, Raw::Unsigned, data);
+        assert!(same(found, right), "{data:?} {found:?}");
+        assert_eq!(is_faulty, fault, "{data:?}");
+    }
+    let all = [0xFF; 5];
+    assert_eq!(told(true, Raw::Unsigned, all), (None, false));
+    let found = told(false, Raw::Unsigned, all);
+    assert_eq!(found, (Some([255.0, 65535.0, 15.0]), true));
+    assert_eq!(told(true, Raw::Signed, all), (Some([-1.0; 3]), true));
+}
+
 #[test]
 fn numbers_that_are_none_and_short_frames_are_counted() {
     let mut device = listener("dbc", DRIVE, &[0]);
@@ -485,6 +592,14 @@ fn mistakes_are_told() {
         (units("fx = \"*\""), Some("its unit \"*\" is not known")),
         (units("fx = \"--\""), Some("its unit \"--\" is not known")),
         (units("fx = \"kN\""), None),
+        (
+            units("fx = \"MN\""),
+            Some("its unit \"MN\" is not known: m is a thousandth, and M a million: add units"),
+        ),
+        (
+            units("fx = \"10 N\""),
+            Some("its unit \"10 N\" has a number: if the file's factor 0.01 holds it already"),
+        ),
     ] {
         let problem = problem(&keys, messages(), 0);
         assert_eq!(problem.is_some(), told.is_some(), "{keys}{problem:?}");
@@ -702,6 +817,10 @@ fn what_can_not_be_used_harms_nothing_else() {
     let mut messages = messages();
     messages[2].id = Err("its identifier 0x1e36001e has more than 11 bits".to_owned());
     messages[3].signals[1].bits = Err("65 bits".to_owned());
+    // That a unit is missing, too, is not the reason.
+    for (message, signal) in [(2, 0), (3, 1)] {
+        messages[message].signals[signal].unit = String::new();
+    }
     let (readings, _) = {
         let mut options = options("dbc", WRENCH);
         options.describe(messages.clone());
@@ -773,6 +892,23 @@ fn messages_have_two_names_and_an_identifier() {
     );
     let told = problem(&keys("0x77.Temperature"), messages.clone(), 0).unwrap();
     assert!(told.contains("no message with this identifier"), "{told}");
+    // Neither its name nor its identifier tells it from another.
+    let mut twice = messages.clone();
+    twice[5].id = Ok(Id::standard(0x13));
+    twice[5].size = 4;
+    for path in ["State.Temperature", "0x013.Temperature"] {
+        let told = problem(&keys(path), twice.clone(), 0).unwrap();
+        assert!(told.contains("several messages"), "{told}");
+        assert!(
+            told.contains("give each another name in the file"),
+            "{told}"
+        );
+    }
+    twice[5].name = "Other".to_owned();
+    twice[5].long_name = None;
+    let told = problem(&keys("0x013.Temperature"), twice.clone(), 0).unwrap();
+    assert!(told.contains("write the name of one of them"), "{told}");
+    assert_eq!(celsius("State.Temperature", &twice, id), 1);
     let again = messages[3].signals[1].clone();
     messages[3].signals.push(again);
     let told = problem(&keys("0x013.Temperature"), messages, 0).unwrap();
