@@ -6,8 +6,8 @@
 //! it, does no harm. A message or signal that can not be used is kept with the reason, for whoever
 //! asks for it.
 //!
-//! A statement begins with its keyword at the beginning of a line or behind a semicolon, outside of
-//! quotes.
+//! A statement begins with its keyword at the beginning of a line, behind a semicolon, or behind a
+//! message or signal, outside of quotes.
 
 use proprio_drivers::Id;
 use proprio_drivers::signal::{Bits, Message, Raw, Signal, Switch};
@@ -107,6 +107,24 @@ fn words(statement: &str) -> Vec<&str> {
     words
 }
 
+/// The words of a statement, and of those that follow a message or signal on its line: no semicolon
+/// ends these two.
+fn parts(statement: &str) -> Vec<Vec<&str>> {
+    const OPEN: [&str; 2] = ["BO_", "SG_"];
+    let words = words(statement);
+    let mut is_open = words.first().is_some_and(|first| OPEN.contains(first));
+    let is_keyword = |word: &str| {
+        let is_letter = |c: char| c.is_ascii_uppercase() || c == '_';
+        word.ends_with('_') && word.chars().all(is_letter)
+    };
+    let goes_on = |_: &&str, next: &&str| {
+        let begins = is_open && is_keyword(next);
+        is_open &= !begins || OPEN.contains(next);
+        !begins
+    };
+    words.chunk_by(goes_on).map(<[&str]>::to_vec).collect()
+}
+
 /// A message as the file has it.
 struct Section<'t> {
     number: &'t str,
@@ -134,8 +152,8 @@ struct File<'t> {
 impl<'t> File<'t> {
     fn new(text: &'t str) -> Self {
         let mut this = Self::default();
-        for statement in statements(text) {
-            match *words(statement) {
+        for statement in statements(text).flat_map(parts) {
+            match *statement {
                 ["BO_", number, name, ":", size, ..] => this.sections.push(Section {
                     number,
                     name,
@@ -194,12 +212,11 @@ impl<'t> File<'t> {
                 .and_then(|at: usize| self.format_words.get(at));
             word.copied().unwrap_or(format)
         };
-        match self.formats.get(number) {
+        let formats = [self.formats.get(number).copied(), Some(self.usual_format)];
+        let is_given = |format: &&str| !matches!(*format, "" | "\"");
+        match formats.into_iter().flatten().find(is_given) {
             Some(format) => word(format) == "\"J1939PG",
-            None => {
-                word(self.usual_format) == "\"J1939PG"
-                    || self.protocol.eq_ignore_ascii_case("\"J1939")
-            }
+            None => self.protocol.eq_ignore_ascii_case("\"J1939"),
         }
     }
 
@@ -238,21 +255,17 @@ impl<'t> File<'t> {
         let (name, mark) = (*head.first()?, head.get(1).copied().unwrap_or(""));
         let at = (section.number, name);
         let float = self.floats.get(&at).copied();
-        let parts = match *body {
-            [
-                ":",
-                start,
-                "|",
-                length,
-                "@",
-                kind,
-                "(",
-                factor,
-                ",",
-                offset,
-                ")",
-                ref rest @ ..,
-            ] => Numbers::new(float, start, length, kind, factor, offset).map(|n| (n, rest)),
+        // Spaces may be anywhere, also between the order and the sign.
+        let bracket = body.iter().position(|word| *word == "(");
+        let (place, scale) = body.split_at(bracket.unwrap_or(body.len()));
+        let parts = match (place, scale) {
+            (
+                &[":", start, "|", length, "@", ref kind @ ..],
+                &["(", factor, ",", offset, ")", ref rest @ ..],
+            ) => {
+                let numbers = Numbers::new(float, start, length, &kind.concat(), factor, offset);
+                numbers.map(|numbers| (numbers, rest))
+            }
             _ => Err("it is not written name : start|length@order (factor,offset)".to_owned()),
         };
         let (numbers, rest) = match parts {
@@ -536,6 +549,25 @@ mod tests {
         assert_eq!(old, own);
     }
 
+    /// As cantools reads them.
+    #[test]
+    fn lines_and_spaces_may_be_anywhere() {
+        const BO: &str = "BO_ 1 A: 8 N\n";
+        const S: &str = " SG_ S : 7|16@0- (0.5,1) [0|0] \"rad\" N\n";
+        const T: &str = " SG_ T m0 : 23|8@1+ (1,0) [0|0] \"\" N\n";
+        let text = format!("{BO}{S}{T}BO_ 2 B: 8 N\n{S}CM_ SG_ 1 S \"BO_ 3 C: 8 N\";\n");
+        let right = messages(&text);
+        assert_eq!((right.len(), right[0].signals.len()), (2, 2));
+        for spaced in [
+            text.replace("\n SG_", " SG_"),
+            text.replace("N\n", "N "),
+            text.replace("@0- (", " @ 0 - ( "),
+            text.replace("7|16", "7 | 16").replace(')', " )"),
+        ] {
+            assert_eq!(messages(&spaced), right, "{spaced}");
+        }
+    }
+
     #[test]
     fn files_of_windows_editors_are_read() {
         let folder = tempfile::tempdir().unwrap();
@@ -605,6 +637,15 @@ mod tests {
                 [false, false],
             ),
             ("BA_ \"ProtocolType\" \"J1939\";\n", [true, true]),
+            (
+                "BA_ \"ProtocolType\" \"J1939\";\nBA_DEF_DEF_ \"VFrameFormat\" \"ExtendedCAN\";\n\
+                 BA_ \"VFrameFormat\" BO_ 2147483649 3;\n",
+                [true, false],
+            ),
+            (
+                "BA_ \"ProtocolType\" \"J1939\";\nBA_DEF_DEF_ \"VFrameFormat\" \"\";\n",
+                [true, true],
+            ),
         ] {
             let messages = messages(&format!(
                 "BO_ 2147483649 A: 8 Node\nBO_ 2147483650 B: 8 Node\nBO_ 1 C: 8 Node\n{WORDS}{text}"
