@@ -59,11 +59,13 @@ fn parse(text: &str) -> Result<Objects, String> {
     let mut form = IniDefault::default();
     form.delimiters = vec!['='];
     form.comment_symbols = vec![';'];
-    // A section's name that does not end would refuse the whole file. What follows is of no section
-    // that is known.
-    let is_broken = |line: &str| line.trim_start().starts_with('[') && !line.contains(']');
-    let lines = text.lines();
-    let lines = lines.map(|line| if is_broken(line) { "[?]" } else { line });
+    // A section's name that does not end, or a value without a key, would refuse the whole file.
+    // What follows such a name is of no section that is known.
+    let lines = text.lines().map(|line| match line.trim_start() {
+        name if name.starts_with('[') && !name.contains(']') => "[?]",
+        value if value.starts_with('=') => "",
+        _ => line,
+    });
     let sections = Ini::new_from_defaults(form)
         .read(lines.collect::<Vec<_>>().join("\n"))
         .map_err(|e| format!("is no EDS or DCF file: {e}"))?;
@@ -302,7 +304,7 @@ mod tests {
                 "[2000]: defaultvalue = \"0x\" is no number",
             ),
         ] {
-            let right = "[1000]\nObjectType=VAR\nDataType=7\nDefaultValue=0x20192\n";
+            let right = "[1000]\n=5\nObjectType=VAR\nDataType=7\nDefaultValue=0x20192\n";
             let commissioning = "[DeviceComissioning]\nNodeID=x\nBaudrate=fast\n";
             let objects = parse(&format!("{text}{right}{commissioning}")).unwrap();
             assert_eq!(objects.unreadable.len(), 1, "{text}");
@@ -325,7 +327,7 @@ mod tests {
             [1a00Sub1]\r\nDataType=0x00A0\r\nDefaultValue=0x60640020\r\n\
             [6502]\r\nDataType=0x7\r\nDefaultValue=\r\n\
             [1A01]\r\nObjectType=8\r\nDataType=7\r\nDefaultValue=3\r\n\
-            [2000]\r\nDataType=0xF\r\nDefaultValue=#1\r\n\
+            [2000]\r\nDataType=0xF\r\nDefaultValue=#1\r\n = 5\r\n=\r\n\
             [Tools]\r\nItems=0\r\n";
         let objects = parse(text).unwrap();
         let found: Vec<_> = objects
