@@ -61,15 +61,40 @@ pub(crate) fn check_file(node: u8, file: Option<&Objects>) -> Result<(), SpecErr
     }
 }
 
-/// Refuses a file in which an object that is `wanted` of it can not be read.
+/// Refuses a file, of name `name`, in which an object that is `wanted` of it can not be read;
+/// `remedy` replaces it.
 pub(crate) fn check_objects(
-    file: Option<&Objects>,
+    (name, file): (&str, &Objects),
     wanted: impl Fn(u16) -> bool,
+    remedy: &str,
 ) -> Result<(), SpecError> {
-    match file.and_then(|file| file.problem(wanted)) {
-        Some(problem) => Err(SpecError::Description(format!("its file, {problem}"))),
+    match file.problem(wanted) {
+        Some(problem) => Err(SpecError::Description(format!(
+            "eds = {name:?}, {problem}: correct it there, or {remedy}"
+        ))),
         None => Ok(()),
     }
+}
+
+/// Refuses a file in which one of TPDO 1 to 4 that is sent and `has` something of use can not be
+/// read; or any, if there is none.
+pub(crate) fn check_pdos(
+    (name, file): (&str, &Objects),
+    node: u8,
+    has: impl Fn(&Pdo) -> bool,
+    remedy: &str,
+) -> Result<(), SpecError> {
+    let is_wanted = |number| {
+        let (pdo, Object { index, sub }) =
+            (Pdo::of_file(file, node, number), object::tpdo_id(number));
+        has(&pdo) && (pdo.is_on() || file.unreadable.contains_key(&(index, sub)))
+    };
+    let none = !(0..4).any(is_wanted);
+    check_objects(
+        (name, file),
+        |index| is_pdo(index) && (none || is_wanted((index & 3) as u8)),
+        remedy,
+    )
 }
 
 /// Whether an object describes TPDO 1 to 4.
@@ -160,6 +185,53 @@ impl Cycle {
 
     pub(crate) const fn reset(&mut self) {
         *self = Self::new(self.every);
+    }
+}
+
+/// When a TPDO has come last, and how long that was after the time before.
+#[derive(Debug, Clone, Copy)]
+struct Came {
+    t: Nanos,
+    after: Option<Nanos>,
+}
+
+impl Came {
+    /// Whether this TPDO, rather than `other`, makes the readings at `now`: the other comes at less
+    /// than half the rate, or has fallen silent; or it comes at the same, and this one is better.
+    fn is_before(self, other: Self, is_better: bool, now: Nanos) -> bool {
+        let least = (now - other.t).max(other.after.unwrap_or(Nanos::ZERO));
+        let is_slower = |a: Nanos, b: Nanos| a.0 / 2 > b.0;
+        match self.after {
+            Some(mine) if is_slower(least, mine) => true,
+            Some(mine) if other.after.is_some() && is_slower(mine, least) => false,
+            _ => is_better,
+        }
+    }
+}
+
+/// How often TPDOs come of which each has the position: one of them makes the readings, so that two
+/// that have the same position are not two readings.
+#[derive(Debug, Default)]
+pub(crate) struct Rates([Option<Came>; 4]);
+
+impl Rates {
+    /// TPDO `at`, from 0, has come at `now`. Whether it makes a reading; `is_better` says of
+    /// another one whether this one is better, if they come at one rate.
+    pub(crate) fn is_first(
+        &mut self,
+        at: usize,
+        now: Nanos,
+        is_better: impl Fn(usize) -> bool,
+    ) -> bool {
+        let Some(place) = self.0.get_mut(at) else {
+            return false;
+        };
+        let after = place.map(|before| now - before.t);
+        let mine = *place.insert(Came { t: now, after });
+        let mut others = self.0.iter().enumerate().filter(|(other, _)| *other != at);
+        others.all(|(number, other)| {
+            other.is_none_or(|other| mine.is_before(other, is_better(number), now))
+        })
     }
 }
 

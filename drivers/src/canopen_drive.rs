@@ -33,16 +33,20 @@
 //! - If the position is sent by SYNC (transmission 0 to 240), a reading holds the values of all
 //!   TPDOs that one SYNC has caused, and `acquired` is the time of that SYNC. An incomplete reading
 //!   is dropped, and the next one too: it may hold a late value of the one before.
+//! - Torque or current whose rated value is not known is left out, and that is told; if `pdos` of
+//!   the keys ask for it, the drive is refused.
 //! - If the position is sent by events or a timer (254, 255), each makes a reading, with the last
 //!   values of the others if they are not older than `hold_ms`. If several TPDOs have a position,
-//!   the best that comes makes the readings: one by SYNC, else that with most values.
+//!   the best that comes makes the readings: one by SYNC, else one at more than twice the rate of
+//!   the others, else that with most values.
 //! - DRIVE_FAULT: the fault bit of the status word, or an emergency message; DEVICE_FAULT: an
 //!   emergency message about a sensor (73xx), which makes the position doubtful.
 //!
 //! A node that boots or leaves the operational state is started again.
 //!
 //! Mapping and scales are those of the keys; else what the drive says; else those of the maker's
-//! file, `eds`, in which what is not used may be wrong. A drive is asked. If another program
+//! file, `eds`, in which what is not used may be wrong (a TPDO without the objects above, one that
+//! is off, or one of identifier 0). A drive is asked. If another program
 //! commands it (`listen_only`, or a recorded log), its answers to that program count, and what that
 //! program writes to it. Of scales a file counts if it is a DCF that states them (ParameterValue),
 //! or if they are constants: an EDS is of a kind of drive, and knows no motor; but its units (60A8,

@@ -29,7 +29,8 @@
 //! If another program commands the node (`listen_only`, or a recorded log), the counts per turn are
 //! those of its answers to that program, or the key, or those of its DCF file, or of an EDS file if
 //! they are constants there. With `configure = false` such a file, `eds`, also says which TPDO has
-//! the position, and where in it.
+//! the position, and where in it. If several have it, the one that comes at more than twice the
+//! rate of the others makes the readings, else one by SYNC, else the first.
 //!
 //! Sources: CiA 301 4.2, CiA 306 1.3, CiA 406 3.2 as public drivers use it. Certain; makers differ
 //! in objects that they leave out: 6000 and 1017 may be missing, and 6200 replaces the timer.
@@ -46,8 +47,8 @@
 use crate::bringup::Bringup;
 use crate::bytes;
 use crate::canopen::{
-    self, Cycle, NMT, NO_RTR, Node, NodeState, Object, Pdo, Plan, Recognised, SYNC, Script, Step,
-    TPDO_OFF, is_free, nmt, node_of, object, tpdo,
+    self, Cycle, NMT, NO_RTR, Node, NodeState, Object, Pdo, Plan, Rates, Recognised, SYNC, Script,
+    Step, TPDO_OFF, is_free, nmt, node_of, object, tpdo,
 };
 use crate::family::{Family, Link, Supervised};
 use crate::objects::Objects;
@@ -61,6 +62,7 @@ use alloc::boxed::Box;
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
+use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
 use proprio_topics::{Counter, JointState, Kind, Nanos, Quality, Reading, Refusal};
 use serde::Deserialize;
@@ -149,39 +151,77 @@ struct Place {
 }
 
 impl Place {
-    /// As the driver maps it, or as the file says of a node that it does not map.
-    fn new(node: u8, options: &Options) -> Result<Self, SpecError> {
-        let of_file = |file: &Objects| {
-            let mut pdos = (0..4).map(|number| Pdo::of_file(file, node, number));
-            pdos.find_map(|pdo| {
-                let found =
-                    |(object, _, bits): &(Object, u64, u64)| *object == POSITION && *bits == 32;
-                let (_, first, length) = pdo.objects().find(found)?;
-                Some(Self {
-                    id: pdo.used_id().filter(|id| is_free(*id))?,
-                    bits: Bits::new(first, length, false)?,
-                    sync: if pdo.by_sync() {
-                        pdo.transmission.max(1)
-                    } else {
-                        0
-                    },
-                })
-            })
-        };
-        let no_place = SpecError::Keys {
-            key: "eds",
-            expected: "a file in which a TPDO has the position (6004), if configure = false",
-        };
-        if let (false, Some(file)) = (options.configure, &options.objects) {
-            canopen::check_objects(Some(file), canopen::is_pdo)?;
-            return of_file(file).ok_or(no_place);
+    /// As the driver maps it, or as the file says of a node that it does not map: those that a SYNC
+    /// causes first.
+    fn all(node: u8, options: &Options) -> Result<ArrayVec<Self, 4>, SpecError> {
+        let name = options.eds.as_deref().unwrap_or_default();
+        let mut places = ArrayVec::new();
+        match &options.objects {
+            Some(file) if !options.configure => {
+                let has = |pdo: &Pdo| position_of(pdo).is_some();
+                let remedy = "set configure = true";
+                canopen::check_pdos((name, file), node, has, remedy)?;
+                let pdos = [0, 1, 2, 3].map(|number| Pdo::of_file(file, node, number));
+                let mut problem = None;
+                for (number, pdo) in (0_u8..).zip(&pdos) {
+                    match Self::of_file(pdo, &pdos) {
+                        Some(Ok(place)) => places.push(place),
+                        Some(Err(why)) => problem = problem.or(Some((number, why))),
+                        None => {}
+                    }
+                }
+                places.sort_by_key(|place: &Self| place.sync == 0);
+                if places.is_empty() {
+                    let problem = match problem {
+                        Some((number, why)) => format!(
+                            ", [{:04X}sub1]: TPDO {} has the position (6004), but {why}",
+                            0x1800 + u16::from(number),
+                            number + 1
+                        ),
+                        None => ": no TPDO has the position (6004)".into(),
+                    };
+                    return Err(SpecError::Description(format!(
+                        "eds = {name:?}{problem}: correct it there, or {remedy}"
+                    )));
+                }
+            }
+            _ => places.extend(Bits::new(0, 32, false).map(|bits| Self {
+                id: tpdo(node, 0),
+                bits,
+                sync: options.sync,
+            })),
         }
-        Ok(Self {
-            id: tpdo(node, 0),
-            bits: Bits::new(0, 32, false).ok_or(no_place)?,
-            sync: options.sync,
+        Ok(places)
+    }
+
+    /// The place of the position in a TPDO, or why it can not be received; `None` if it has none.
+    fn of_file(pdo: &Pdo, all: &[Pdo]) -> Option<Result<Self, &'static str>> {
+        let bits = position_of(pdo)?;
+        let is_same = |other: &&Pdo| other.used_id() == pdo.used_id();
+        Some(match pdo.used_id() {
+            None if pdo.is_off() => Err("is switched off (bit 31 of its COB-ID)"),
+            None => Err("has no COB-ID"),
+            Some(id) if !is_free(id) => {
+                Err("has an identifier that CiA 301 keeps for other things")
+            }
+            Some(_) if all.iter().filter(is_same).count() > 1 => Err("another one has its COB-ID"),
+            Some(id) => Ok(Self {
+                id,
+                bits,
+                sync: match pdo.by_sync() {
+                    true => pdo.transmission.max(1),
+                    false => 0,
+                },
+            }),
         })
     }
+}
+
+/// Where a TPDO has the position, whether it is sent or not.
+fn position_of(pdo: &Pdo) -> Option<Bits> {
+    let is_position = |(object, _, bits): &(Object, u64, u64)| *object == POSITION && *bits == 32;
+    let (_, first, length) = pdo.objects().find(is_position)?;
+    Bits::new(first, length, false)
 }
 
 impl Driver for Options {
@@ -366,7 +406,9 @@ impl Start {
 #[derive(Debug)]
 struct Encoder {
     node: u8,
-    place: Place,
+    /// Those that a SYNC causes are first.
+    places: ArrayVec<Place, 4>,
+    rates: Rates,
     cycle: Cycle,
     state: NodeState,
 }
@@ -376,14 +418,16 @@ impl Encoder {
         options.check()?;
         let node = node_of(spec)?;
         canopen::check_file(node, options.objects.as_ref())?;
-        let place = Place::new(node, options)?;
+        let places = Place::all(node, options)?;
         let listens = spec.mode == Mode::Listen;
-        if listens && options.counts_per_turn.is_none() {
+        if let (true, None, Some(file)) = (listens, options.counts_per_turn, &options.objects) {
             let scales = [OPERATING, SCALED_PER_TURN, PER_TURN];
             let is_scale = |index| scales.iter().any(|scale| scale.index == index);
-            canopen::check_objects(options.objects.as_ref(), is_scale)?;
+            let name = options.eds.as_deref().unwrap_or_default();
+            canopen::check_objects((name, file), is_scale, "set counts_per_turn")?;
         }
-        let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, place.id);
+        let first = places.first().map_or(tpdo(node, 0), |place| place.id);
+        let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, first);
         bringup.start_with(NMT, &[nmt::START, node]);
         bringup.stop_with(NMT, &[nmt::PRE_OPERATIONAL, node]);
         let start = Start {
@@ -395,13 +439,15 @@ impl Encoder {
             no_timer: false,
         };
         let claims = canopen::claims(node)
-            .chain([Claim::exclusive(place.id), Claim::shared(SYNC)])
+            .chain(places.iter().map(|place| Claim::exclusive(place.id)))
+            .chain([Claim::shared(SYNC)])
             .collect::<Vec<_>>();
         let script = Script::new(node, spec.mode, start);
         let this = Self {
             node,
-            place,
-            cycle: Cycle::new(place.sync),
+            cycle: Cycle::new(places.first().map_or(0, |place| place.sync)),
+            places,
+            rates: Rates::default(),
             state: NodeState::default(),
         };
         Ok(Supervised::boxed(claims, bringup, script, this))
@@ -409,18 +455,29 @@ impl Encoder {
 
     fn position(
         &mut self,
+        at: usize,
         data: &[u8],
         frame: &Frame,
         link: &mut Link<Script<Start>>,
         out: &mut Decoded,
     ) {
-        let Some(counts) = self.place.bits.of(data) else {
+        let Some(place) = self.places.get(at).copied() else {
+            return;
+        };
+        let Some(counts) = place.bits.of(data) else {
             return out.fault(Counter::Length, 1, frame.id);
         };
         let Some(counts_per_turn) = link.questions.plan.known() else {
             return link.questions.missed();
         };
-        let Some((acquired, stamp)) = self.cycle.measured(frame) else {
+        if !self.rates.is_first(at, frame.t, |other| at < other) {
+            return;
+        }
+        let measured = match place.sync {
+            1.. if at == 0 => self.cycle.measured(frame),
+            _ => Some((frame.t, frame.stamp)),
+        };
+        let Some((acquired, stamp)) = measured else {
             link.bringup.lost();
             return out.fault(Counter::Unpaired, 1, frame.id);
         };
@@ -457,13 +514,14 @@ impl Family for Encoder {
         };
         if frame.id == SYNC {
             self.cycle.sync(frame);
-        } else if frame.id == self.place.id {
-            self.position(data, frame, link, out);
+        } else if let Some(at) = self.places.iter().position(|place| place.id == frame.id) {
+            self.position(at, data, frame, link, out);
         }
     }
 
     fn reset(&mut self) {
         self.cycle.reset();
+        self.rates = Rates::default();
     }
 }
 
@@ -491,7 +549,11 @@ impl EncoderBoard {
         options.check()?;
         let id = node_of(spec)?;
         canopen::check_file(id, options.objects.as_ref())?;
-        let place = Place::new(id, options)?;
+        let places = Place::all(id, options)?;
+        let place = places.first().copied().ok_or(SpecError::Keys {
+            key: "eds",
+            expected: "a file in which a TPDO has the position (6004), if configure = false",
+        })?;
         let per_turn = options.counts_per_turn.or(options.counts_of_file());
         let per_turn = per_turn.map_or(USUAL_PER_TURN, |n| n as u32);
         // As another program, or the maker's tool, has left it.

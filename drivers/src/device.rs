@@ -449,6 +449,11 @@ pub trait Device: Send {
     /// Starts again at `now` after a link loss, because the board may have been reset.
     fn restart(&mut self, now: Nanos);
 
+    /// Of a device that streams: why a value that it sends is not in its readings.
+    fn lacks(&self) -> Option<Refusal> {
+        None
+    }
+
     /// The largest magnitudes fx fy fz tx ty tz for which an F/T sensor is made \[N, Nm\], if they
     /// are known: values may be beyond them.
     fn full_scale(&self) -> Option<[f64; 6]> {

@@ -12,7 +12,7 @@ use crate::{
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Temperature};
+use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Refusal, Temperature};
 
 /// What the host's side of a family has of its own.
 pub(crate) trait Family: Send {
@@ -48,6 +48,11 @@ pub(crate) trait Family: Send {
 
     /// The board is not started: requests are not sent, and their answers do not come.
     fn interrupt(&mut self) {}
+
+    /// As [`Device::lacks`].
+    fn lacks(&self) -> Option<Refusal> {
+        None
+    }
 
     /// As [`Device::full_scale`].
     fn full_scale(&self, link: &Link<Self::Questions>) -> Option<[f64; 6]> {
@@ -267,6 +272,10 @@ impl<F: Family> Device for Supervised<F> {
         self.link.bringup.restart();
         self.family.interrupt();
         self.family.reset();
+    }
+
+    fn lacks(&self) -> Option<Refusal> {
+        self.family.lacks()
     }
 
     fn full_scale(&self) -> Option<[f64; 6]> {

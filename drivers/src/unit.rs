@@ -214,9 +214,9 @@ const RATES: &[(Quantity, Quantity)] = &[
     (Velocity, Acceleration),
 ];
 
-/// `word` in lower case (but for M, which is no m), with signs spelled out, without spaces, brackets
-/// and signs of products, and with a slash before what divides. So `[N·m]` is `nm`, and `°/s²` and
-/// `deg s^-2` are `deg/s2`.
+/// `word` in lower case (but for M, which is no m), with signs spelled out, without spaces,
+/// brackets and signs of products, and with a slash before what divides. So `[N·m]` is `nm`, and
+/// `°/s²` and `deg s^-2` are `deg/s2`.
 fn plain(word: &str) -> String {
     let mut text = String::new();
     for letter in word.trim().chars() {

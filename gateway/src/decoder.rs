@@ -222,7 +222,7 @@ impl Decoder {
                 self.status.count(number, Counter::Readings, 1);
                 publish(&mut Sample::new(header, route.channel, &output.reading));
             }
-            self.status.set_state(number, running.device.state());
+            self.status.set_state(number, &*running.device);
         }
         if !claimed {
             self.status.unclaimed.fetch_add(1, Relaxed);
@@ -245,7 +245,7 @@ impl Decoder {
                 self.status
                     .count(number, fault.counter, u64::from(fault.count));
             }
-            self.status.set_state(number, running.device.state());
+            self.status.set_state(number, &*running.device);
         }
     }
 
@@ -272,7 +272,7 @@ impl Decoder {
             self.status.count(device, Counter::Unsent, 1);
         }
         if let Some(running) = self.devices.get(usize::from(device)) {
-            self.status.set_state(device, running.device.state());
+            self.status.set_state(device, &*running.device);
         }
     }
 
@@ -378,7 +378,7 @@ impl Decoder {
                 running.repeats.fill(Repeats::default());
             }
             std::mem::swap(&mut new.routes, &mut running.routes);
-            self.status.set_state(number, running.device.state());
+            self.status.set_state(number, &*running.device);
         }
         Reply::Replaced(new)
     }
@@ -406,7 +406,7 @@ impl Decoder {
 
     fn store_states(&self) {
         for (running, number) in self.devices.iter().zip(0..) {
-            self.status.set_state(number, running.device.state());
+            self.status.set_state(number, &*running.device);
         }
     }
 }

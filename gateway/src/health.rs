@@ -308,6 +308,12 @@ fn log_state(device: &DeviceHealth, before: Option<&DeviceHealth>, trouble: &mut
     let again = trouble.as_mut().is_some_and(Trouble::goes_on);
     let since = trouble.map_or_else(String::new, |t| format!(" for {} s", t.seconds()));
     match (Refusal::from_code(device.refusal), state) {
+        (Some(lack), DeviceState::Streaming) => {
+            *trouble = None;
+            if changed {
+                tracing::warn!(device = name, "streaming, but without a value: {lack}");
+            }
+        }
         (Some(refusal), _) => {
             if changed {
                 tracing::error!(device = name, "refused: {refusal}");
@@ -644,6 +650,25 @@ mod tests {
         assert_eq!(tick(DeviceState::Silent, 0, 1).len(), 1);
         let lines = tick(DeviceState::Silent, 0, 1);
         assert!(lines[0].contains("the program that starts it"), "{lines:?}");
+    }
+
+    /// Once: nothing is wrong with what it does send.
+    #[test]
+    fn a_value_that_is_left_out_is_told_with_the_reason() {
+        let mut log = HealthLog::default();
+        let mut health = health(BusHealth::EMPTY);
+        health.device_count = 1;
+        health.devices[0].state = DeviceState::Streaming.in_memory();
+        health.devices[0].refusal = Refusal::Untold { object: 0x6076 }.code();
+        let lines = logged(|| (0..600).for_each(|_| log.log_changes(&health, &[])));
+        let [line] = &lines[..] else {
+            panic!("{lines:?}")
+        };
+        assert!(
+            line.starts_with("WARN streaming, but without a value: object 6076"),
+            "{line}"
+        );
+        assert!(line.contains("set rated_torque"), "{line}");
     }
 
     /// As a silent one: whoever looks at the end of a log must find it.

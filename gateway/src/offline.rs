@@ -11,7 +11,7 @@ use crate::plan::{BusPlan, ChannelPlan, Plan};
 use crate::status::BusStatus;
 use proprio_drivers::{Board, Format, Frame, Frames, Mode, Spec};
 use proprio_topics::csv::{self, Columns, Item, Series, Value, What};
-use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Sample, StampKind};
+use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Refusal, Sample, StampKind};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt::Display;
 use std::io::{self, BufRead, Write};
@@ -95,6 +95,8 @@ pub struct DeviceReport {
     pub counts: Vec<(Counter, u64)>,
     /// Why it was refused, if it was.
     pub refusal: Option<String>,
+    /// Why its readings lack a value that it sends, if they do.
+    pub lack: Option<String>,
 }
 
 /// Delays items until no earlier one can come, so that a table is sorted by time.
@@ -309,6 +311,9 @@ pub fn decode_with(
                     .filter(|(_, n)| *n > 0)
                     .collect(),
                 refusal: state.refusal().map(|refusal| refusal.to_string()),
+                lack: Refusal::from_code(health.refusal)
+                    .filter(|_| state.refusal().is_none())
+                    .map(|lack| lack.to_string()),
             });
         }
     }

@@ -5,7 +5,7 @@ use crate::link::LinkCounters;
 use crate::link::error_frame::ErrorFrame;
 use crate::load::{Bits, Totals, bits_on_wire};
 use crate::plan::BusPlan;
-use proprio_drivers::{Frame, State};
+use proprio_drivers::{Device, Frame, State};
 use proprio_topics::{
     BusError, BusHealth, Code, Counter, DeviceHealth, LinkState, MAX_CHANNELS, Name, Nanos, Refusal,
 };
@@ -149,10 +149,12 @@ impl BusStatus {
         }
     }
 
-    /// Sets the state of a device.
-    pub fn set_state(&self, device: u16, state: State) {
+    /// Sets the state of a device, and what is told of it.
+    pub fn set_state(&self, device: u16, now: &dyn Device) {
         if let Some(status) = self.devices.get(usize::from(device)) {
-            let refusal = state.refusal().map_or(0, Refusal::code);
+            let state = now.state();
+            let lacks = now.lacks().filter(|_| state == State::Streaming);
+            let refusal = state.refusal().or(lacks).map_or(0, Refusal::code);
             status.state.store(state.published() as u32, Relaxed);
             status.refusal.store(refusal, Relaxed);
             if state != State::Streaming {

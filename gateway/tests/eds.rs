@@ -189,7 +189,8 @@ fn a_drive_is_read_as_its_file_says() {
     let keys = "address = 5\nlisten_only = true\neds = \"drive.eds\"";
     let mut device = build(&drive(keys), None).unwrap();
     assert!(joints(&mut *device, &frames).is_empty());
-    assert_eq!(device.state(), State::Refused(Refusal::NoCalibration));
+    let object = 0x608F;
+    assert_eq!(device.state(), State::Refused(Refusal::Untold { object }));
 }
 
 #[test]
@@ -401,7 +402,7 @@ fn files_that_do_not_fit_are_refused() {
             "",
             "address = 5\ndriver = \"canopen_encoder\"\nconfigure = false\neds = \"drive.eds\""
                 .into(),
-            "a TPDO has the position (6004)",
+            "eds = \"drive.eds\": no TPDO has the position (6004)",
         ),
     ] {
         let problem = plan(bus, &keys).unwrap_err();

@@ -117,7 +117,8 @@ impl Pdo {
         let [_, kind] = object.index.to_le_bytes();
         #[allow(clippy::cast_possible_truncation)] // these entries are bytes
         match (kind, object.sub) {
-            (0x18, 1) => self.id = value,
+            // Makers write 0 where there is none.
+            (0x18, 1) => self.id = value.filter(|id| *id != 0),
             (0x18, 2) => self.transmission = value.map_or(u8::MAX, |v| v as u8),
             // Above 64 there is no mapping: each frame says which object it has.
             (0x1A, 0) => {
@@ -136,6 +137,11 @@ impl Pdo {
     /// Whether it is sent at all.
     pub(crate) fn is_on(&self) -> bool {
         self.id.is_some_and(|id| id & TPDO_OFF == 0)
+    }
+
+    /// Whether it could be sent, and is switched off.
+    pub(crate) fn is_off(&self) -> bool {
+        self.id.is_some_and(|id| id & TPDO_OFF != 0)
     }
 
     /// Its identifier, if it is sent and holds something.

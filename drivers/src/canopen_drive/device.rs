@@ -1,19 +1,19 @@
 //! The host's side of a drive: puts the values of its TPDOs together.
 
-use super::layout::{Layout, Quantity, fields, values};
+use super::layout::{Quantity, fields, values};
 use super::options::Options;
 use super::start::{Scales, Start};
 use crate::bringup::Bringup;
 use crate::bytes;
 use crate::canopen::{
-    self, Cycle, NMT, NodeState, Plan, SYNC, Script, nmt, node_of, sdo_from, tpdo,
+    self, Cycle, NMT, NodeState, Plan, Rates, SYNC, Script, nmt, node_of, sdo_from, tpdo,
 };
 use crate::family::{Family, Link, Supervised};
 use crate::{Claim, Decoded, Device, Frame, Id, Output, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind};
+use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Refusal, StampKind};
 
 /// The fault bit of the status word.
 const FAULT: u32 = 1 << 3;
@@ -38,11 +38,12 @@ struct Table {
     group: u8,
     /// Those of which each makes a reading.
     alone: u8,
+    lacks: Option<Refusal>,
 }
 
 impl Table {
-    fn new(layout: &Layout, scales: Scales) -> (Self, u8) {
-        let mut used = ArrayVec::new();
+    fn new(plan: &Start, scales: Scales) -> (Self, u8) {
+        let (layout, mut used) = (&plan.layout, ArrayVec::new());
         for (at, pdo) in (0_u8..).zip(&layout.pdos) {
             let Some(id) = pdo.used_id() else {
                 continue;
@@ -62,21 +63,19 @@ impl Table {
             used,
             group,
             alone: layout.alone(),
+            lacks: plan.lacks(),
         };
         (this, if group == 0 { 0 } else { every.max(1) })
     }
 }
 
-/// Which of the TPDOs that have a position makes the readings: the best one that comes. So two that
-/// an event causes are not two readings.
+/// The order of TPDOs that have a position, and come at one rate: those with most values, then the
+/// first. The best makes the readings, so that two that an event causes are not two readings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Rank(usize);
 
 impl Rank {
-    /// Those that a SYNC causes are best: the time is known.
-    const BY_SYNC: Self = Self(usize::MAX);
-
-    /// Of TPDO `number` with this number of values: those with most values, then the first.
+    /// Of TPDO `number` with this number of values.
     fn alone(values: usize, number: u8) -> Self {
         Self(values * 4 + usize::from(3 - number.min(3)))
     }
@@ -96,8 +95,10 @@ pub(super) struct Drive {
     began: Nanos,
     /// The reading before was incomplete: a late value of it may be in the next.
     suspect: bool,
-    /// What has made the last reading, and when.
-    giver: Option<(Rank, Nanos)>,
+    /// The last reading of a SYNC. Those are best: the time is known.
+    synced: Option<Nanos>,
+    /// How often the TPDOs come that make readings alone.
+    rates: Rates,
     /// The last values in SI units, and when they came.
     values: [Option<(Nanos, f64)>; Quantity::JOINT],
     status: u32,
@@ -130,7 +131,8 @@ impl Drive {
             have: 0,
             began: Nanos::MIN,
             suspect: false,
-            giver: None,
+            synced: None,
+            rates: Rates::default(),
             values: [None; Quantity::JOINT],
             status: 0,
             mode: 0,
@@ -142,9 +144,8 @@ impl Drive {
 
     /// Makes the table, if all that it needs is known.
     fn prepare(&mut self, plan: &Start) {
-        let scales = plan.scales().filter(|_| plan.ready().is_ok());
-        if let Some(scales) = scales {
-            let (table, every) = Table::new(&plan.layout, scales);
+        if let (Ok(()), Ok(scales)) = (plan.ready(), plan.scales()) {
+            let (table, every) = Table::new(plan, scales);
             self.table = Some(table);
             self.cycle.set_every(every);
         }
@@ -212,9 +213,11 @@ impl Drive {
             out.push(Output::new(0, frame, self.quality(), reading), frame.id);
         }
         if alone & bit != 0 {
-            let better = |(giver, t)| giver > rank && self.is_fresh(t, frame.t);
-            if !self.giver.is_some_and(better) {
-                self.giver = Some((rank, frame.t));
+            let at = |bit: u8| bit.trailing_zeros() as usize;
+            let rank_of = |other| table.used.iter().find(|used| at(used.bit) == other);
+            let is_better = |other| rank_of(other).is_none_or(|other| rank > other.rank);
+            let is_first = self.rates.is_first(at(bit), frame.t, is_better);
+            if is_first && !self.synced.is_some_and(|t| self.is_fresh(t, frame.t)) {
                 self.give(None, frame, link, out);
             }
             return;
@@ -240,7 +243,7 @@ impl Drive {
             out.fault(Counter::Unpaired, 1, frame.id);
             return link.bringup.lost();
         }
-        self.giver = Some((Rank::BY_SYNC, frame.t));
+        self.synced = Some(frame.t);
         let measured = self.measured.take();
         self.give(measured, frame, link, out);
     }
@@ -326,12 +329,17 @@ impl Family for Drive {
         }
     }
 
+    fn lacks(&self) -> Option<Refusal> {
+        self.table.as_ref()?.lacks
+    }
+
     fn reset(&mut self) {
         self.cycle.reset();
         self.have = 0;
         self.measured = None;
         self.suspect = false;
-        self.giver = None;
+        self.synced = None;
+        self.rates = Rates::default();
         self.values = [None; Quantity::JOINT];
         self.table = None;
     }

@@ -152,14 +152,31 @@ impl Layout {
         }
     }
 
-    /// The identifier of a TPDO that another one has too, or that CiA 301 keeps for other things.
-    pub(super) fn wrong_id(&self) -> Option<Id> {
-        let mut seen = ArrayVec::<Id, 4>::new();
-        self.pdos.iter().filter_map(Pdo::used_id).find(|id| {
-            let is_wrong = !is_free(*id) || seen.contains(id);
-            let _ = seen.try_push(*id);
-            is_wrong
-        })
+    /// The TPDO that has something of use, with its identifier, if another one has that, too, or
+    /// CiA 301 keeps it for other things.
+    pub(super) fn wrong_id(&self) -> Option<(usize, Id)> {
+        let sent = |at: usize| self.pdos.get(at).and_then(Pdo::used_id);
+        let of_use = (0..self.pdos.len()).filter(|at| {
+            let pdo = self.pdos.get(*at);
+            pdo.is_some_and(|pdo| !fields(pdo).0.is_empty())
+        });
+        of_use
+            .filter_map(|at| Some((at, sent(at)?)))
+            .find(|(at, id)| {
+                let is_same = |other| other != *at && sent(other) == Some(*id);
+                !is_free(*id) || (0..self.pdos.len()).any(is_same)
+            })
+    }
+
+    /// The number of a TPDO that has the position, and is switched off.
+    pub(super) fn off(&self) -> Option<u8> {
+        let has_position = |pdo: &Pdo| {
+            let (fields, _) = fields(pdo);
+            fields.iter().any(|f| f.quantity == Quantity::Position)
+        };
+        let mut pdos = (0..).zip(&self.pdos);
+        let found = pdos.find(|(_, pdo)| pdo.is_off() && has_position(pdo));
+        found.map(|(number, _)| number)
     }
 
     /// The number of the TPDO that has the position.

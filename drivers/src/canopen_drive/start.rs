@@ -1,8 +1,8 @@
 //! What a drive is asked at its start: its profile, its mapping, and its scales.
 
-use super::layout::{Layout, Quantity};
+use super::layout::{Layout, Quantity, fields};
 use super::options::{CurrentUnit, Options, TorqueUnit, Unit};
-use crate::canopen::{self, MAPPED_MOST, Object, Pdo, Plan, Step, nmt, object, tpdo};
+use crate::canopen::{self, MAPPED_MOST, Object, Pdo, Plan, Step, is_free, nmt, object, tpdo};
 use crate::objects::Objects;
 use crate::{Id, Mode, SpecError};
 use alloc::format;
@@ -153,45 +153,54 @@ impl Start {
         let of_keys = Layout::of_keys(node, &options.pdos())?;
         let configured = of_keys.position().is_some();
         let listens = mode == Mode::Listen;
+        let name = options.eds.as_deref().unwrap_or_default();
         let stated = match file {
-            Some(file) if !configured => {
-                canopen::check_objects(Some(file), canopen::is_pdo)?;
-                Layout::of_file(node, file)
-            }
+            Some(file) if !configured => Layout::of_file(node, file),
             _ => of_keys,
         };
-        if let Some(id) = stated.wrong_id() {
-            return Err(SpecError::Description(format!(
-                "its file gives a TPDO the identifier {id}, which another one, or CiA 301 itself, \
-                 uses"
-            )));
-        }
-        if listens {
-            // One that is asked need not have them in its file.
-            let (torque, current) = (options.rated_torque, options.rated_current);
-            let wanted = [
-                (COUNTS, options.counts_per_turn.is_none()),
+        // One that is asked need not have them in its file.
+        if let (Some(file), true) = (file, listens) {
+            let file = (name, file);
+            if !configured {
+                let has = |pdo: &Pdo| !fields(pdo).0.is_empty();
+                canopen::check_pdos(file, node, has, "state pdos")?;
+                if let Some((number, id)) = stated.wrong_id() {
+                    return Err(SpecError::Description(format!(
+                        "eds = {name:?}, [{:04X}sub1]: TPDO {} has the identifier {id}, which \
+                         another one, or CiA 301 itself, uses: correct it there, or state pdos",
+                        0x1800 + number,
+                        number + 1
+                    )));
+                }
+            }
+            // Torque and current of the file are left out if their scale is not known.
+            let asked = |quantity| configured && stated.has(quantity);
+            let per_mille = options.current_unit == CurrentUnit::PerMille;
+            for (object, key, wanted) in [
+                (COUNTS, "counts_per_turn", options.counts_per_turn.is_none()),
                 (
                     RATED_TORQUE,
-                    torque.is_none() && stated.has(Quantity::Torque),
+                    "rated_torque",
+                    options.rated_torque.is_none() && asked(Quantity::Torque),
                 ),
                 (
                     RATED_CURRENT,
-                    current.is_none() && stated.has(Quantity::Current),
+                    "rated_current",
+                    options.rated_current.is_none() && per_mille && asked(Quantity::Current),
                 ),
-            ];
-            let is_wanted = |index| {
-                wanted
-                    .iter()
-                    .any(|(of, wanted)| *wanted && of.index == index)
-            };
-            canopen::check_objects(file, is_wanted)?;
+            ] {
+                let is_wanted = |index| wanted && index == object.index;
+                canopen::check_objects(file, is_wanted, &format!("set {key}"))?;
+            }
         }
-        let usual = |number| tpdo(node, number);
-        let ids = (0..4).zip(&stated.pdos).filter_map(|(number, pdo)| {
-            (pdo.used_id()).or_else(|| (!configured).then(|| usual(number)))
-        });
-        let ids = ids.collect();
+        let mut ids = ArrayVec::<Id, 4>::new();
+        for (number, pdo) in (0..4).zip(&stated.pdos) {
+            let usual = || (!configured).then(|| tpdo(node, number));
+            let id = pdo.used_id().filter(|id| is_free(*id)).or_else(usual);
+            if let Some(id) = id.filter(|id| !ids.contains(id)) {
+                let _ = ids.try_push(id);
+            }
+        }
         let file = Told::of_file(file);
         let initial = (
             if configured || listens {
@@ -249,27 +258,46 @@ impl Start {
         self.options.rated_current.or(self.known().rated_current())
     }
 
-    /// The scales, once they are known. Torque and current are not a number if they are not sent.
-    pub(super) fn scales(&self) -> Option<Scales> {
-        let needs = |quantity, known: Option<f64>| match known {
-            Some(known) => Some(known),
-            None if self.layout.has(quantity) => None,
-            None => Some(f64::NAN),
+    /// The scales; or what is needed and not known. Torque and current are not a number if theirs
+    /// is not known.
+    pub(super) fn scales(&self) -> Result<Scales, Refusal> {
+        let needs = |object: Object, known: Option<f64>| match known {
+            None if self.needs(object) => Err(Refusal::Untold {
+                object: object.index,
+            }),
+            known => Ok(known.unwrap_or(f64::NAN)),
         };
-        let position = self.position()?;
+        let position = needs(COUNTS, self.position())?;
         let velocity = self.velocity().map(|unit| unit.radians(position));
         let current = match self.options.current_unit {
             CurrentUnit::Milliampere => 1e-3,
-            CurrentUnit::PerMille => needs(Quantity::Current, self.rated_current())? * 1e-3,
+            CurrentUnit::PerMille => needs(RATED_CURRENT, self.rated_current())? * 1e-3,
         };
-        Some(Scales {
+        Ok(Scales {
             per_step: [
                 position,
-                needs(Quantity::Velocity, velocity)?,
-                needs(Quantity::Torque, self.rated_torque())? * 1e-3,
+                velocity.unwrap_or(f64::NAN),
+                needs(RATED_TORQUE, self.rated_torque())? * 1e-3,
                 current,
             ],
         })
+    }
+
+    /// What is sent, and left out because its scale is not known.
+    pub(super) fn lacks(&self) -> Option<Refusal> {
+        let is_lacking = |object: &Object| match *object {
+            RATED_TORQUE => self.layout.has(Quantity::Torque) && self.rated_torque().is_none(),
+            _ => self.scales_current() && self.rated_current().is_none(),
+        };
+        let lacking = [RATED_TORQUE, RATED_CURRENT].into_iter().find(is_lacking)?;
+        Some(Refusal::Untold {
+            object: lacking.index,
+        })
+    }
+
+    /// Whether the current is sent in thousandths of the rated one.
+    fn scales_current(&self) -> bool {
+        self.options.current_unit == CurrentUnit::PerMille && self.layout.has(Quantity::Current)
     }
 
     /// Whether what is told of `object` counts: no key states it.
@@ -288,16 +316,14 @@ impl Start {
 
     /// Whether there are no readings without `object`.
     fn needs(&self, object: Object) -> bool {
-        let has = |quantity| self.layout.has(quantity);
+        // What the drive, or its file, maps is left out then; what the keys ask for is needed.
         let is_needed = match object {
             COUNTS | TURNS => {
                 let unit = self.known().value(POSITION_UNIT).and_then(Unit::of_code);
                 !matches!(unit, Some(Unit::Radians(_)))
             }
-            RATED_TORQUE => has(Quantity::Torque),
-            RATED_CURRENT => {
-                self.options.current_unit == CurrentUnit::PerMille && has(Quantity::Current)
-            }
+            RATED_TORQUE => self.configured && self.layout.has(Quantity::Torque),
+            RATED_CURRENT => self.configured && self.scales_current(),
             _ => false,
         };
         is_needed && self.counts(object)
@@ -309,7 +335,8 @@ impl Start {
             POSITION_UNIT => true,
             VELOCITY_UNIT => self.layout.has(Quantity::Velocity),
             VENDOR | MOST_SPEED => self.checks_torque(),
-            RATED_CURRENT => self.needs(object) || self.checks_torque(),
+            RATED_TORQUE => self.layout.has(Quantity::Torque),
+            RATED_CURRENT => self.scales_current() || self.checks_torque(),
             _ => self.needs(object),
         };
         is_of_use && self.counts(object)
@@ -459,16 +486,19 @@ impl Plan for Start {
 
     fn ready(&self) -> Result<(), Refusal> {
         if self.layout.position().is_none() {
-            return Err(Refusal::NotMapped);
+            let off = self.layout.off().map(|number| Refusal::SwitchedOff {
+                object: object::tpdo_id(number).index,
+            });
+            return Err(off.unwrap_or(Refusal::NotMapped));
         }
         let other = self.layout.ids().find(|id| !self.ids.contains(id));
-        if let Some(id) = other.or(self.layout.wrong_id()) {
+        if let Some(id) = other.or(self.layout.wrong_id().map(|(_, id)| id)) {
             return Err(Refusal::OtherIdentifier { id: id.raw() });
         }
         if let Some(object) = self.implausible() {
             return Err(Refusal::Implausible { object });
         }
-        self.scales().map(|_| ()).ok_or(Refusal::NoCalibration)
+        self.scales().map(|_| ())
     }
 
     fn begin(&mut self) {

@@ -300,7 +300,10 @@ fn scales_of_keys_count_before_those_of_the_drive() {
 /// A drive that sends torque or current in thousandths of a rated value that nobody has told.
 #[test]
 fn a_scale_that_is_not_known_is_missed() {
-    for (object, keys) in [(0x6077, "rated_torque"), (0x6078, "rated_current")] {
+    for (object, keys, scale) in [
+        (0x6077, "rated_torque", 0x6076),
+        (0x6078, "rated_current", 0x6075),
+    ] {
         let mapped =
             format!("counts_per_turn = 4\npdos = [{{ number = 1, objects = [0x6064, {object}] }}]");
         let position = [frame("181#010000000000", 1.0)];
@@ -308,8 +311,13 @@ fn a_scale_that_is_not_known_is_missed() {
         assert!(decode(&mut *unknown, &position).0.is_empty());
         assert_eq!(
             unknown.state(),
-            State::Refused(Refusal::NoCalibration),
+            State::Refused(Refusal::Untold { object: scale }),
             "{keys}"
+        );
+        let told = Refusal::Untold { object: scale }.to_string();
+        assert!(
+            told.contains(&format!("{scale:04X}")) && told.contains(keys),
+            "{told}"
         );
         let known = format!("{keys} = 1.0\n{mapped}");
         let mut known = listener("canopen_drive", &known, &[0]);

@@ -113,18 +113,233 @@ fn a_file_tells_where_the_position_of_an_encoder_is() {
     let (readings, _) = decode(&mut *device, &[frame("00010285#FFFF19000000", 1.0)]);
     assert_eq!(turns(&readings)[0].0, 0.25);
     // The identifier of something else, one that is off, and a file without the position.
+    let keys = "configure = false\neds = \"left.dcf\"";
     let spec = spec(5, Mode::Listen, &[0]);
-    for file in [
-        with(0x700, 254),
-        with(0x8000_0280, 254),
-        file(&[(0x6501, 0, 100)]),
+    for (file, told) in [
+        (
+            with(0x700, 254),
+            "eds = \"left.dcf\", [1801sub1]: TPDO 2 has the position (6004), but has an identifier",
+        ),
+        (
+            with(0x8000_0280, 254),
+            "but is switched off (bit 31 of its COB-ID)",
+        ),
+        (
+            file(&[(0x6501, 0, 100)]),
+            "no TPDO has the position (6004): correct it there, or set",
+        ),
     ] {
         let refused = described("canopen_encoder", keys, file).device(&spec);
-        assert!(matches!(
-            refused.map(|_| ()),
-            Err(SpecError::Keys { key: "eds", .. })
-        ));
+        let problem = refused.map(|_| ()).unwrap_err().to_string();
+        assert!(problem.contains(told), "{problem}");
     }
+}
+
+/// As CiA 406 maps it: in TPDO 1 by events, and in TPDO 2 by SYNC. What comes is read, once.
+#[test]
+fn an_encoder_may_have_its_position_in_two_tpdos() {
+    let entries = [
+        (0x6501, 0, 4),
+        (0x1800, 1, 0x180),
+        (0x1800, 2, 254),
+        (0x1A00, 1, 0x6004_0020),
+        (0x1801, 1, 0x280),
+        (0x1801, 2, 1),
+        (0x1A01, 1, 0x6004_0020),
+    ];
+    let read = |frames: &[(&str, f64)]| {
+        let mut device = listener("canopen_encoder", "configure = false", file(&entries));
+        let frames: Vec<_> = frames.iter().map(|(text, ms)| frame(text, *ms)).collect();
+        let (readings, faults) = decode(&mut *device, &frames);
+        assert!(faults.is_empty(), "{faults:?}");
+        let at = |output: &Output| output.acquired.0 / 100_000;
+        readings.iter().map(at).collect::<Vec<_>>()
+    };
+    let (sync, first, second) = ("080#", "185#01000000", "285#01000000");
+    assert_eq!(read(&[(first, 1.0), (first, 11.0)]), [10, 110]);
+    assert_eq!(
+        read(&[(sync, 1.0), (second, 1.5), (sync, 11.0), (second, 11.5)]),
+        [10, 110]
+    );
+    let both = [
+        (sync, 1.0),
+        (second, 1.2),
+        (first, 5.0),
+        (sync, 11.0),
+        (second, 11.2),
+        (first, 15.0),
+    ];
+    assert_eq!(read(&both), [10, 110]);
+}
+
+/// What nobody needs of a file of a drive refuses nothing; what is needed is told with its place.
+#[test]
+fn a_tpdo_that_is_not_needed_refuses_nothing() {
+    let made = |keys: &str, more: &[(u16, u8, u32)], wrong: &[(u16, u8)], mode| {
+        let right = [
+            (0x608F, 1, 4),
+            (0x1800, 1, 0x180),
+            (0x1800, 2, 255),
+            (0x1A00, 1, 0x6064_0020),
+        ];
+        let mut objects = file(&[&right[..], more].concat());
+        for at in wrong {
+            objects.entries.remove(at);
+            let problem = format!(
+                "[{:04x}sub{}]: defaultvalue = \"x\" is no number",
+                at.0, at.1
+            );
+            objects.unreadable.insert(*at, problem);
+        }
+        let keys = format!("eds = \"left.dcf\"\n{keys}");
+        let mut device = described("canopen_drive", &keys, objects)
+            .device(&spec(5, mode, &[0]))
+            .map_err(|e| e.to_string())?;
+        let (readings, _) = decode(&mut *device, &[frame("185#01000000", 1.0)]);
+        assert_eq!(
+            readings.len(),
+            usize::from(mode == Mode::Listen),
+            "{more:x?}"
+        );
+        Ok::<(), String>(())
+    };
+    // TPDO 4, which has an object of a maker, or the velocity. The node is added to identifiers.
+    let fourth = |id: u32, object: u32| {
+        let id = if id == 0 { 0_u32.wrapping_sub(5) } else { id };
+        [(0x1803, 1, id), (0x1A03, 1, object)]
+    };
+    let (maker, velocity) = (0x2000_0020, 0x606C_0020);
+    for (more, wrong) in [
+        (&fourth(0x480, maker)[..], &[(0x1803, 1)][..]),
+        (&fourth(0x480, maker), &[(0x1A03, 1)]),
+        (&fourth(0x480, maker), &[(0x1803, 2), (0x1A03, 0)]),
+        // Twice one identifier, one that is another's, and none.
+        (
+            &[&fourth(0x380, maker)[..], &[(0x1802, 1, 0x380)]].concat(),
+            &[],
+        ),
+        (&fourth(0x700, maker), &[]),
+        (&fourth(0, velocity), &[]),
+        // It is off.
+        (&fourth(0x8000_0480, velocity), &[(0x1A03, 2)]),
+    ] {
+        for mode in [Mode::Listen, Mode::Supervise] {
+            assert_eq!(made("", more, wrong, mode), Ok(()), "{more:x?} {wrong:x?}");
+        }
+    }
+    for (more, wrong, told) in [
+        (
+            &fourth(0x480, velocity),
+            &[(0x1803, 1)][..],
+            "eds = \"left.dcf\", [1803sub1]: defaultv",
+        ),
+        (
+            &fourth(0x480, velocity),
+            &[(0x1A03, 2)],
+            "[1a03sub2]: defaultvalue",
+        ),
+        (
+            &fourth(0x480, maker),
+            &[(0x1A00, 1)],
+            "[1a00sub1]: defaultvalue",
+        ),
+        (
+            &fourth(0x180, velocity),
+            &[],
+            "left.dcf\", [1800sub1]: TPDO 1 has the identifier 0x185",
+        ),
+        (
+            &fourth(0x700, velocity),
+            &[],
+            "[1803sub1]: TPDO 4 has the identifier 0x705",
+        ),
+    ] {
+        let problem = made("", more, wrong, Mode::Listen).unwrap_err();
+        assert!(problem.contains(told), "{problem}");
+        assert!(
+            problem.contains("correct it there, or state pdos"),
+            "{problem}"
+        );
+        // The drive is asked; and keys count before a file.
+        assert_eq!(made("", more, wrong, Mode::Supervise), Ok(()));
+        let pdos = "pdos = [{ number = 1, objects = [0x6064] }]";
+        assert_eq!(made(pdos, more, wrong, Mode::Listen), Ok(()));
+    }
+}
+
+/// Torque and current whose rated values nobody tells are absent, and that is told.
+#[test]
+fn a_rated_value_that_is_not_known_takes_only_its_own() {
+    let entries = [
+        (0x608F, 1, 4),
+        (0x1800, 1, 0x180),
+        (0x1A00, 1, 0x6064_0020),
+        (0x1A00, 2, 0x6077_0010),
+        (0x1A00, 3, 0x6078_0010),
+    ];
+    let frames = [frame("185#01000000E803E803", 1.0)];
+    for (keys, object) in [
+        ("", Some(0x6076)),
+        ("rated_torque = 2.0", Some(0x6075)),
+        ("rated_torque = 2.0\ncurrent_unit = \"mA\"", None),
+    ] {
+        let mut device = listener("canopen_drive", keys, file(&entries));
+        let (readings, faults) = decode(&mut *device, &frames);
+        let Reading::Joint(joint) = readings[0].reading else {
+            panic!("{readings:?}")
+        };
+        assert!(faults.is_empty() && (joint.position - TAU / 4.0).abs() < 1e-12);
+        assert_eq!(joint.torque.is_nan(), keys.is_empty());
+        assert_eq!(joint.current.is_nan(), object.is_some());
+        assert_eq!(
+            device.lacks(),
+            object.map(|object| Refusal::Untold { object })
+        );
+    }
+}
+
+#[test]
+fn a_position_that_is_switched_off_is_named() {
+    let entries = [
+        (0x608F, 1, 4),
+        (0x1802, 1, 0x8000_0380),
+        (0x1A02, 1, 0x6064_0020),
+    ];
+    let mut device = listener("canopen_drive", "", file(&entries));
+    decode(&mut *device, &[frame("385#01000000", 1.0)]);
+    let refusal = Refusal::SwitchedOff { object: 0x1802 };
+    assert_eq!(device.state(), State::Refused(refusal));
+    assert!(refusal.to_string().contains("object 1802 sub 1, bit 31"));
+}
+
+/// The TPDO that comes more often makes the readings, with the last values of the other.
+#[test]
+fn a_slow_tpdo_does_not_hold_a_fast_one_up() {
+    let entries = [
+        (0x608F, 1, 4),
+        (0x1800, 1, 0x180),
+        (0x1A00, 1, 0x6064_0020),
+        (0x1801, 1, 0x280),
+        (0x1A01, 1, 0x6064_0020),
+        (0x1A01, 2, 0x606C_0020),
+    ];
+    let mut frames = Vec::new();
+    for ms in 0..200 {
+        if ms % 50 == 5 {
+            frames.push(frame("285#0100000001000000", f64::from(ms) - 0.4));
+        }
+        frames.push(frame("185#01000000", f64::from(ms)));
+    }
+    let mut device = listener("canopen_drive", "", file(&entries));
+    let (readings, faults) = decode(&mut *device, &frames);
+    assert!(faults.is_empty(), "{faults:?}");
+    assert!((195..=202).contains(&readings.len()), "{}", readings.len());
+    assert!(
+        turns(&readings)
+            .iter()
+            .skip(6)
+            .all(|(_, velocity)| *velocity == 0.25)
+    );
 }
 
 /// TPDO 3 of a drive that sends position and velocity after each SYNC. Files leave out the number
@@ -391,7 +606,9 @@ fn what_is_wrong_in_a_file_harms_only_where_it_is_needed() {
     let pdos = "pdos = [{ number = 1, objects = [0x6064, 0x6077] }]";
     for (driver, keys, at, mode, is_needed) in [
         (drive, "", (0x2000, 1), Mode::Listen, false),
-        (drive, "", (0x1A02, 3), Mode::Listen, true),
+        (drive, "", (0x1A02, 3), Mode::Listen, false),
+        (drive, "", (0x1A00, 2), Mode::Listen, true),
+        (drive, "", (0x1A00, 2), Mode::Supervise, false),
         (drive, pdos, (0x1A02, 3), Mode::Listen, false),
         (drive, "", (0x6076, 0), Mode::Listen, false),
         (drive, pdos, (0x6076, 0), Mode::Listen, true),

@@ -375,6 +375,16 @@ pub enum Refusal {
         /// What: the index of the object of a CANopen node.
         object: u16,
     },
+    /// What its values are scaled by is not known.
+    Untold {
+        /// What: the index of the object of a CANopen node.
+        object: u16,
+    },
+    /// What is needed of it is switched off.
+    SwitchedOff {
+        /// What: the index of the object of a CANopen node.
+        object: u16,
+    },
     /// It does not send what is needed of it.
     NotMapped,
     /// It sends with an identifier that is not received.
@@ -399,6 +409,8 @@ impl Refusal {
             Self::OtherDevice { profile } => 0x1_0000 | profile as u32,
             Self::Rejected { object } => 0x2_0000 | object as u32,
             Self::Implausible { object } => 0x3_0000 | object as u32,
+            Self::Untold { object } => 0x4_0000 | object as u32,
+            Self::SwitchedOff { object } => 0x5_0000 | object as u32,
             Self::OtherIdentifier { id } => 0x4000_0000 | id,
         }
     }
@@ -426,6 +438,12 @@ impl Refusal {
                 object: (code & 0xFFFF) as u16,
             }),
             0x3_0000..=0x3_FFFF => Some(Self::Implausible {
+                object: (code & 0xFFFF) as u16,
+            }),
+            0x4_0000..=0x4_FFFF => Some(Self::Untold {
+                object: (code & 0xFFFF) as u16,
+            }),
+            0x5_0000..=0x5_FFFF => Some(Self::SwitchedOff {
                 object: (code & 0xFFFF) as u16,
             }),
             0x4000_0000..=0x5FFF_FFFF => Some(Self::OtherIdentifier {
@@ -485,9 +503,29 @@ impl fmt::Display for Refusal {
                 };
                 write!(f, "object {object:04X} tells {problem}; set {keys}")
             }
+            Self::Untold { object } => {
+                let (what, key) = match object {
+                    0x6076 => ("the rated torque", "rated_torque"),
+                    0x6075 => ("the rated current", "rated_current"),
+                    0x608F => ("the counts per turn", "counts_per_turn"),
+                    _ => ("a scale", "the key that replaces it"),
+                };
+                write!(
+                    f,
+                    "object {object:04X} ({what}) is not known: neither the node nor its file \
+                     (eds; a default does not count) states it; set {key}"
+                )
+            }
+            Self::SwitchedOff { object } => write!(
+                f,
+                "the process data that have the position are switched off (object {object:04X} \
+                 sub 1, bit 31): switch them on with the maker's tool, or, if the file (eds) is \
+                 wrong, correct it there"
+            ),
             Self::NotMapped => f.write_str(
-                "none of its process data has the position; map it with the maker's tool, or, if \
-                 another program commands it, state the mapping (the driver's page says how)",
+                "none of its process data that are switched on has the position; map it with the \
+                 maker's tool, or, if another program commands it, state the mapping (the driver's \
+                 page says how)",
             ),
             Self::OtherIdentifier { id } => write!(
                 f,
@@ -508,7 +546,8 @@ pub struct DeviceHealth {
     pub counters: [u64; Counter::ALL.len()],
     /// Its state.
     pub state: Code<DeviceState>,
-    /// Why it was refused ([`Refusal::from_code`]); 0 if it was not.
+    /// Why it was refused ([`Refusal::from_code`]), or, while it streams, why its readings lack a
+    /// value that it sends; else 0.
     pub refusal: u32,
     /// The number of its bus.
     pub bus: u32,
@@ -752,6 +791,8 @@ mod tests {
             Refusal::OtherDevice { profile: 0xFFFF },
             Refusal::Rejected { object: 0x608F },
             Refusal::Implausible { object: 0x6076 },
+            Refusal::Untold { object: 0x6075 },
+            Refusal::SwitchedOff { object: 0x1803 },
             Refusal::OtherIdentifier { id: 0x1B2 },
             Refusal::OtherIdentifier { id: 0x1FFF_FFFF },
         ];
@@ -764,7 +805,7 @@ mod tests {
             0xFF,
             0x300,
             0xFFFF,
-            0x4_0000,
+            0x6_0000,
             0x3FFF_FFFF,
             0x6000_0000,
             u32::MAX,
