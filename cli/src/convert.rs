@@ -9,7 +9,7 @@ use proprio_estimator::reading::{self, ReadingError};
 use proprio_estimator::setup::Setup;
 use proprio_estimator::{files, offline as estimates};
 use proprio_gateway::log::{LogFormat, Stamps};
-use proprio_gateway::offline;
+use proprio_gateway::offline::{self, DecodeReport};
 use proprio_gateway::plan::Plan;
 use proprio_identification::{Role, implausible};
 use proprio_topics::csv::{self, Columns, Report};
@@ -285,6 +285,9 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
         if let Some(refusal) = &device.refusal {
             eprintln!("{}: refused: {refusal}", device.name);
         }
+        if let Some(lack) = &device.lack {
+            eprintln!("{}: without a value: {lack}", device.name);
+        }
         for (counter, count) in &device.counts {
             eprintln!("{}: {}: {count}", device.name, counter.word());
         }
@@ -300,7 +303,7 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
                     .collect();
                 json!({
                     "name": d.name, "frames": d.frames, "readings": d.readings, "counts": counts,
-                    "refusal": d.refusal,
+                    "refusal": d.refusal, "lack": d.lack,
                 })
             })
             .collect();
@@ -334,18 +337,28 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
         }
     }
     if report.samples == 0 {
-        let hint = if report.other_interfaces == report.frames {
-            "its interfaces are not buses of the configuration"
-        } else {
-            "are the devices' addresses in gateway.toml right?"
-        };
         bail!(
-            "{}: no sample in {} frames: {hint}",
+            "{}: no sample in {} frames: {}",
             args.log.display(),
-            report.frames
+            report.frames,
+            why_none(&report)
         );
     }
     Ok(())
+}
+
+/// Why a log gives no sample.
+fn why_none(report: &DecodeReport) -> &'static str {
+    let mut devices = report.devices.iter();
+    if report.other_interfaces == report.frames {
+        "its interfaces are not buses of the configuration"
+    } else if devices.clone().any(|device| device.refusal.is_some()) {
+        "devices were refused: that is said of each"
+    } else if devices.any(|device| device.frames > 0) {
+        "the frames of its devices make no whole reading: what was wrong with them is counted"
+    } else {
+        "are the devices' addresses in gateway.toml right?"
+    }
 }
 
 /// Encodes a table.
@@ -620,5 +633,39 @@ fn print_json(out: &Path, summary: &serde_json::Value) {
         eprintln!("{summary}");
     } else {
         print_line!("{summary}");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proprio_gateway::offline::DeviceReport;
+
+    /// Addresses are in doubt only where nothing else is known.
+    #[test]
+    fn a_log_without_samples_has_its_reason() {
+        let why = |other_interfaces, frames, refusal: Option<&str>| {
+            why_none(&DecodeReport {
+                frames: 9,
+                other_interfaces,
+                devices: vec![DeviceReport {
+                    name: "d".into(),
+                    frames,
+                    readings: 0,
+                    counts: Vec::new(),
+                    refusal: refusal.map(str::to_owned),
+                    lack: None,
+                }],
+                ..DecodeReport::default()
+            })
+        };
+        for (why, told) in [
+            (why(9, 0, None), "interfaces are not buses"),
+            (why(0, 3, Some("object 608F")), "were refused"),
+            (why(0, 3, None), "no whole reading"),
+            (why(0, 0, None), "addresses"),
+        ] {
+            assert!(why.contains(told), "{why}");
+        }
     }
 }
