@@ -2,8 +2,10 @@
 //! each of these stamps gives one estimate.
 //!
 //! # The path of a reading
-//! 1. [`Pipeline::push`] stores a sample in its channel's buffer (`buffers`, [`crate::history`],
-//!    [`crate::differentiate`]). A sample of the trigger channel also queues its stamp.
+//! 1. [`Pipeline::push`] judges a sample by those before it ([`proprio_topics::sanity`]: one that
+//!    repeats or jumps is flagged) and stores it in its channel's buffer (`buffers`,
+//!    [`crate::history`], [`crate::differentiate`]). A sample of the trigger channel also queues
+//!    its stamp.
 //! 2. [`Pipeline::poll`] releases the oldest queued stamp `t` when all its samples are there.
 //! 3. Every channel is evaluated at `t` (`channels`). F/T readings are corrected for calibration,
 //!    temperature and offset.
@@ -85,7 +87,7 @@ use prediction::{Extrapolated, Predictor};
 use proprio_dynamics::model::{JointKind, Model};
 use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
 use proprio_dynamics::{
-    ContactSet, Dependence, FrameMotion, Kinematics, Noise, PlaceErrors, Solver,
+    ContactSet, Dependence, FrameMotion, Kinematics, Noise, PlaceErrors, SensorCut, Solver,
 };
 use proprio_identification::online::state::StateError;
 use proprio_identification::online::{Online, OnlineError};
@@ -177,6 +179,16 @@ impl Pipeline {
                     .flatten(),
             ),
         });
+        let sanity = setup.robot.channels.iter().map(|channel| {
+            Sanity::new(match channel.role {
+                ChannelRole::Joint(_) => [setup.joint_settings.noise; 6],
+                ChannelRole::Sensor(number) => sensor_peaks(&setup, number),
+                ChannelRole::Base => {
+                    let (a, g) = (ACCELEROMETER_NOISE, setup.gyro_settings.noise);
+                    [a, a, a, g, g, g]
+                }
+            })
+        });
         let kinematics = Kinematics::new(&setup.state.model, setup.robot.base_link)
             .expect("the base is a link of the model");
         let (dofs, contacts) = (
@@ -209,7 +221,7 @@ impl Pipeline {
         }
         Self {
             buffers: buffers.collect(),
-            sanity: vec![Sanity::default(); setup.robot.channels.len()],
+            sanity: sanity.collect(),
             grid: Box::default(),
             faults: vec![Reason::NeverSeen; setup.robot.channels.len()],
             base_fault: Reason::None,
@@ -522,11 +534,18 @@ fn sensor_predictor(setup: &Setup, number: usize) -> Option<Predictor<6>> {
     if setup.timing == Timing::Aligned {
         return None;
     }
-    let Noise { force, torque } = setup.robot.structure.sensors().get(number)?.noise();
+    Predictor::new(sensor_peaks(setup, number), setup.joint_settings)
+}
+
+/// Peak noise of F/T sensor `number`.
+fn sensor_peaks(setup: &Setup, number: usize) -> [f64; 6] {
+    let cut = setup.robot.structure.sensors().get(number);
+    let Some(Noise { force, torque }) = cut.map(SensorCut::noise) else {
+        return [0.0; 6];
+    };
     let ([fx, fy, fz], [tx, ty, tz]) = (force, torque);
     // A uniformly distributed error of this peak has this standard deviation.
-    let peak = [fx, fy, fz, tx, ty, tz].map(|std| std * f64::sqrt(3.0));
-    Predictor::new(peak, setup.joint_settings)
+    [fx, fy, fz, tx, ty, tz].map(|std| std * f64::sqrt(3.0))
 }
 
 /// The values of a channel whose last sample is earlier than `t`, extrapolated to `t`, and their

@@ -31,7 +31,8 @@ use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 use std::fmt::Write as _;
 use toml::Table;
-use world::{DURATION, Series, World};
+use trouble::Series;
+use world::{DURATION, World};
 
 /// Deviations within which a valid torque is.
 const DEVIATIONS: f64 = 4.0;

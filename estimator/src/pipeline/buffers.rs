@@ -37,6 +37,14 @@ pub(super) struct Sanity {
 }
 
 impl Sanity {
+    /// For axes whose error is stated to be at most `peaks`.
+    pub(super) fn new(peaks: [f64; 6]) -> Self {
+        Self {
+            jumps: Jumps::new(peaks),
+            ..Self::default()
+        }
+    }
+
     /// The flags of a reading at `t`, NaN where it has fewer than six values, with `quality` as its
     /// device has it. A reading that repeats itself is no news: after `max_silence` it is frozen,
     /// if its noise makes that impossible.

@@ -207,6 +207,8 @@ struct Path {
     most: f64,
     /// The smallest change seen: the resolution.
     step: f64,
+    /// What its stated noise makes of the distance.
+    least: f64,
     /// Readings so far.
     count: u32,
     /// The last reading follows a gap: where it leads is not known.
@@ -219,6 +221,7 @@ impl Path {
     const NEW: Self = Self {
         t: Nanos::ZERO,
         value: f64::NAN,
+        least: 0.0,
         rate: 0.0,
         period: 0.0,
         most: 0.0,
@@ -250,7 +253,8 @@ impl Path {
         if self.resumes {
             return self.accept(t, value, 0.0);
         }
-        let usual = FAR * self.most.max(self.step);
+        let most = self.most.max(self.step).max(self.least);
+        let usual = FAR * most;
         // Smooth values bend with the square of the time.
         let longer = (after / self.period).max(1.0);
         if distance <= usual * longer * longer {
@@ -264,7 +268,7 @@ impl Path {
                 // A step; or a motion, whose readings bend so much.
                 let most = match is_near {
                     true => 0.0,
-                    false => off.min(GROWTH * self.most.max(self.step)),
+                    false => off.min(GROWTH * most),
                 };
                 (self.t, self.value) = (then, before);
                 return self.accept(t, value, most);
@@ -291,9 +295,10 @@ impl Path {
 
 /// The jumps of a channel of `N` axes. A reading is doubtful that is further from the line through
 /// the two before it than five times the largest such distance of late (of white noise: ten
-/// deviations), on any axis. The next reading decides: if it is where the doubtful one leads, or
-/// near it, the value has really changed; if it is where those before lead, one reading was wrong.
-/// A load or motion that sets in at once costs a reading, or a few while it grows.
+/// deviations), on any axis; but never one that is no further than its stated noise may be. The
+/// next reading decides: if it is where the doubtful one leads, or near it, the value has really
+/// changed; if it is where those before lead, one reading was wrong. A load or motion that sets in
+/// at once costs a reading, or a few while it grows.
 #[derive(Debug, Clone, Copy)]
 pub struct Jumps<const N: usize>([Path; N]);
 
@@ -304,6 +309,16 @@ impl<const N: usize> Default for Jumps<N> {
 }
 
 impl<const N: usize> Jumps<N> {
+    /// For axes whose error is stated to be at most `peaks`; 0 where it is not known.
+    #[must_use]
+    pub fn new(peaks: [f64; N]) -> Self {
+        // The line through two readings is off by three errors, and the reading by one.
+        Self(peaks.map(|peak| Path {
+            least: 4.0 * peak,
+            ..Path::NEW
+        }))
+    }
+
     /// Takes a reading at `t`, NaN where it has none; returns whether it is doubtful.
     pub fn look(&mut self, t: Nanos, values: &[f64; N], quality: Quality) -> bool {
         if quality.intersects(Quality::ZERO_CHANGED) {

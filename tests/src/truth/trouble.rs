@@ -1,10 +1,26 @@
 //! What goes wrong in a run.
 
 use super::random::Random;
-use super::world::Series;
 use proprio_dynamics::spatial::{Mat3, Pose, Vec3};
 use proprio_topics::Kind;
 use std::f64::consts::FRAC_PI_2;
+
+/// The readings of a channel, with their stamps \[s\].
+#[derive(Debug, Clone)]
+pub(super) struct Series {
+    /// What it measures.
+    pub(super) kind: Kind,
+    /// The channel.
+    pub(super) name: String,
+    /// Stamp and values: a position; forces and torques; acceleration and angular velocity.
+    pub(super) rows: Vec<(f64, Vec<f64>)>,
+}
+
+impl Series {
+    pub(super) fn each(&mut self, change: impl Fn(&mut [f64])) {
+        self.rows.iter_mut().for_each(|(_, values)| change(values));
+    }
+}
 
 /// When a force acts on the robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -10,30 +10,12 @@ use proprio_dynamics::{
 };
 use proprio_estimator::config::{Base, Config};
 use proprio_estimator::setup::Setup;
-use proprio_topics::Kind;
 use std::f64::consts::TAU;
 
 /// Duration of a run \[s\].
 pub(super) const DURATION: f64 = 45.0;
 /// When a payload is taken \[s\].
 const TAKEN: f64 = 20.0;
-
-/// The readings of a channel, with their stamps \[s\].
-#[derive(Debug, Clone)]
-pub(super) struct Series {
-    /// What it measures.
-    pub(super) kind: Kind,
-    /// The channel.
-    pub(super) name: String,
-    /// Stamp and values: a position; forces and torques; acceleration and angular velocity.
-    pub(super) rows: Vec<(f64, Vec<f64>)>,
-}
-
-impl Series {
-    pub(super) fn each(&mut self, change: impl Fn(&mut [f64])) {
-        self.rows.iter_mut().for_each(|(_, values)| change(values));
-    }
-}
 
 /// A sum of three sines.
 #[derive(Debug, Clone)]

@@ -343,7 +343,10 @@ impl Component {
             .chain(of_sensors)
             .chain(of_joints);
         if let Some((reason, channel)) = faults.find(|(reason, _)| *reason != Reason::None) {
-            self.paused = Paused::Fault(reason, channel);
+            // One doubtful reading is no pause.
+            if reason != Reason::Implausible {
+                self.paused = Paused::Fault(reason, channel);
+            }
             let counts = &mut self.counts;
             *match reason {
                 Reason::Stale => &mut counts.stale,
