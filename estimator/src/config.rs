@@ -97,7 +97,8 @@ pub enum Base {
         /// The links, in order of preference: the first whose contact is present is the base.
         foot: Vec<Foot>,
     },
-    /// An IMU on a link.
+    /// An IMU on a link. Without a contact on the part of the robot that has it, up to the F/T
+    /// sensors, it implies an unknown wrench on that link, as a fixed base does.
     Imu {
         /// Its channel.
         sensor: String,

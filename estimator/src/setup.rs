@@ -193,24 +193,36 @@ impl Setup {
                 )
             }
         };
-        let mut support = None;
-        if let BaseMotion::Standing(_) = base {
-            // The ground reaction of a fixed base, unless the configuration has a contact for it.
-            let there = |(spec, contact): (&ContactSpec, &NamedContact)| {
-                spec.frame.link == base_link && spec.kind == ContactKind::Wrench && contact.always
-            };
-            support = specs.iter().zip(&contacts).position(there);
-            if support.is_none() {
-                let frame = Frame {
-                    link: base_link,
-                    pose: Pose::identity(),
-                };
-                specs.push(ContactSpec {
-                    frame,
-                    kind: ContactKind::Wrench,
-                    position: Vec3::zeros(),
-                });
+        // The ground reaction of the base, unless the configuration has a contact for it.
+        let there = |(spec, contact): (&ContactSpec, &NamedContact)| {
+            spec.frame.link == base_link && spec.kind == ContactKind::Wrench && contact.always
+        };
+        let (support, stands) = match &base {
+            BaseMotion::Standing(_) => {
+                let support = specs.iter().zip(&contacts).position(there);
+                (support, support.is_none())
             }
+            BaseMotion::Imu(_) => (None, is_untouched(&model, &sensors, &specs, base_link)),
+            BaseMotion::Stance(_) => (None, false),
+        };
+        if stands {
+            let frame = Frame {
+                link: base_link,
+                pose: Pose::identity(),
+            };
+            specs.push(ContactSpec {
+                frame,
+                kind: ContactKind::Wrench,
+                position: Vec3::zeros(),
+            });
+        }
+        if stands && matches!(base, BaseMotion::Imu(_)) {
+            let link = model.link_name(base_link);
+            warnings.push(format!(
+                "base: no [[contact]] is on the part of the robot that has the IMU; that part does \
+                 not fly, so an unknown wrench is taken to act on link {link:?}. Add a [[contact]] \
+                 where the robot is held or stands (presence = \"possible\" if it may fly)"
+            ));
         }
         let mut always = ContactSet::first(specs.len());
         contacts
@@ -398,6 +410,18 @@ impl Setup {
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
+}
+
+/// Whether no contact is on the links that are between the F/T sensors around `link`.
+fn is_untouched(model: &Model, sensors: &[SensorCut], specs: &[ContactSpec], link: usize) -> bool {
+    // Of each link, the link at the top of its part. Parents are before their children.
+    let mut top: Vec<usize> = (0..model.link_count()).collect();
+    for (number, joint) in model.joints().iter().enumerate() {
+        if sensors.iter().all(|sensor| sensor.joint() != number) {
+            top[joint.child] = top[joint.parent];
+        }
+    }
+    specs.iter().all(|spec| top[spec.frame.link] != top[link])
 }
 
 /// Holds the joints at the positions of `[locked]` that follow another one in the URDF.

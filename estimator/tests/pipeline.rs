@@ -1074,6 +1074,36 @@ fn a_table_whose_clock_was_set_back_is_told_with_its_place() {
     assert_eq!(report.first_dropped, Some(101));
 }
 
+/// A robot whose IMU reads its weight does not fly because nobody has named what carries it.
+#[test]
+fn what_carries_an_imu_need_not_be_named() {
+    let possible = |config: &mut Config| possible_hand_contact(config);
+    let named = estimates_with_added(possible, "icub_left_arm_mujoco.csv", |_| [0.0; 6]);
+    let unnamed = |config: &mut Config| {
+        possible_hand_contact(config);
+        config.contact.retain(|c| c.name() != "stand");
+    };
+    let others = estimates_with_added(unnamed, "icub_left_arm_mujoco.csv", |_| [0.0; 6]);
+    let torques: Vec<&String> = named
+        .keys()
+        .filter(|name| name.contains("torque"))
+        .collect();
+    assert_eq!(torques.len(), 14);
+    assert!(
+        torques
+            .iter()
+            .all(|name| named[*name] == others[*name] && !named[*name][9].is_empty())
+    );
+    // It is told; and on the part of the robot beyond the sensor a contact carries nothing.
+    let told = |setup: &Setup| setup.warnings().iter().any(|w| w.contains("does not fly"));
+    assert!(told(&setup(unnamed)));
+    assert!(!told(&setup(possible)));
+    // What may fly says so.
+    assert!(!told(&setup(|config| {
+        config.contact[0].presence = Presence::Possible;
+    })));
+}
+
 /// A robot that stands on its chest, then on its hand, then on nothing: the base follows the
 /// declarations, and the torques equal the true ones.
 #[test]

@@ -108,7 +108,7 @@ pub struct Robot {
     pub base: BaseMotion,
     /// Per degree of freedom, its locked position; NaN if it is measured.
     pub locked: Vec<f64>,
-    /// The published contacts. The structure may have one more at the end: the support of a fixed
+    /// The published contacts. The structure may have one more at the end: the support of the
     /// base.
     pub contacts: Vec<NamedContact>,
     /// The contacts that are present without any declaration.
