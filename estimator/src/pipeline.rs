@@ -179,15 +179,13 @@ impl Pipeline {
                     .flatten(),
             ),
         });
-        let sanity = setup.robot.channels.iter().map(|channel| {
-            Sanity::new(match channel.role {
-                ChannelRole::Joint(_) => [setup.joint_settings.noise; 6],
-                ChannelRole::Sensor(number) => sensor_peaks(&setup, number),
-                ChannelRole::Base => {
-                    let (a, g) = (ACCELEROMETER_NOISE, setup.gyro_settings.noise);
-                    [a, a, a, g, g, g]
-                }
-            })
+        let sanity = setup.robot.channels.iter().map(|c| match c.role {
+            ChannelRole::Joint(_) => Sanity::of_encoder(setup.joint_settings.noise),
+            ChannelRole::Sensor(number) => Sanity::of_noisy(sensor_peaks(&setup, number)),
+            ChannelRole::Base => {
+                let (a, g) = (ACCELEROMETER_NOISE, setup.gyro_settings.noise);
+                Sanity::of_noisy([a, a, a, g, g, g])
+            }
         });
         let kinematics = Kinematics::new(&setup.state.model, setup.robot.base_link)
             .expect("the base is a link of the model");

@@ -212,6 +212,52 @@ fn a_frozen_sensor_gives_no_valid_torque() {
     }
 }
 
+/// A joint moves with jitter, stops, and stays at one count: it is not frozen. An F/T sensor whose
+/// noise ends like that is.
+#[test]
+fn a_joint_that_stands_is_not_frozen() {
+    let setup = setup(|_| {});
+    let joint = setup.robot.channel(Kind::Joint, "l_elbow").unwrap();
+    let sensor = setup.robot.channel(Kind::Wrench, "l_arm_ft_sensor");
+    let deviates = normals(300);
+    let count = std::f64::consts::TAU / 65536.0;
+    let of = |noisy: usize| {
+        let found = estimates(&setup, 400, |instant, channel, reading| {
+            let jitter = deviates
+                .get(instant)
+                .map_or([0.0; 6], |d| d.map(|d| 10.0 * d));
+            match reading {
+                Reading::Joint(state) if channel == noisy => {
+                    // It slows down, and stops.
+                    let left = (1.0 - instant as f64 / 300.0).max(0.0);
+                    let moved = (0.2 * (1.0 - left * left) / count + jitter[0]).round();
+                    *state = JointState {
+                        position: 0.3 + count * moved,
+                        ..JointState::ABSENT
+                    };
+                }
+                Reading::Wrench(wrench) if channel == noisy => {
+                    let values = wrench.force.iter_mut().chain(&mut wrench.torque);
+                    for (value, jitter) in values.zip(jitter) {
+                        *value += 1e-3 * jitter.round();
+                    }
+                }
+                _ => {}
+            }
+            Quality::GOOD
+        });
+        let last = found.last().unwrap();
+        let reasons = last.torques.joints().iter().map(|joint| joint.reason.get());
+        reasons.collect::<Vec<_>>()
+    };
+    assert!(of(joint).iter().all(|reason| *reason == Some(Reason::None)));
+    let frozen = of(sensor.unwrap());
+    assert!(
+        frozen.iter().all(|reason| *reason == Some(Reason::Frozen)),
+        "{frozen:?}"
+    );
+}
+
 /// Two unknown wrenches in one sub-tree are twelve unknowns in six equations: each may be anything,
 /// and so may torques between them.
 #[test]

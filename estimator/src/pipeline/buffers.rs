@@ -29,19 +29,32 @@ impl ChannelBuffer {
 }
 
 /// Judges the readings of one channel by those before it.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy)]
 pub(super) struct Sanity {
-    newest: Nanos,
-    repeats: Repeats<6>,
+    /// `None`: a healthy sensor may repeat itself.
+    repeats: Option<Repeats<6>>,
     jumps: Jumps<6>,
+    newest: Nanos,
 }
 
 impl Sanity {
-    /// For axes whose error is stated to be at most `peaks`.
-    pub(super) fn new(peaks: [f64; 6]) -> Self {
+    /// For an encoder whose error is stated to be at most `peak`. The jitter of a joint that moves
+    /// ends when it stands, at one count: no repeat tells a stuck encoder from a joint that stands.
+    /// That a joint should move is told by the F/T residuals alone.
+    pub(super) fn of_encoder(peak: f64) -> Self {
         Self {
+            repeats: None,
+            jumps: Jumps::new([peak; 6]),
+            newest: Nanos::ZERO,
+        }
+    }
+
+    /// For axes with noise of their own, whose error is stated to be at most `peaks`.
+    pub(super) fn of_noisy(peaks: [f64; 6]) -> Self {
+        Self {
+            repeats: Some(Repeats::default()),
             jumps: Jumps::new(peaks),
-            ..Self::default()
+            newest: Nanos::ZERO,
         }
     }
 
@@ -58,7 +71,8 @@ impl Sanity {
         let period = (t - self.newest).0.max(1);
         self.newest = t;
         let least = u32::try_from(max_silence.0 / period).unwrap_or(LONGEST);
-        let frozen = (self.repeats).look(values, quality, least.clamp(2, LONGEST));
+        let least = least.clamp(2, LONGEST);
+        let frozen = (self.repeats.as_mut()).map_or(0, |r| r.look(values, quality, least));
         let jumps = self.jumps.look(t, values, quality);
         let mut flags = quality;
         if frozen != 0 {

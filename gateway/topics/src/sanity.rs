@@ -22,6 +22,8 @@
 //! What this does not see: a value that was constant from the start, and one that is wrong but
 //! goes on changing.
 //!
+//! It is not for encoders: the jitter of a joint that moves ends when it stands, at one count.
+//!
 //! # Jumps
 //! A value that is far from where those before it lead is doubtful until the next one confirms it:
 //! one wrong reading is no motion and no load. See [`Jumps`].
