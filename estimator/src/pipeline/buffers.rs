@@ -34,7 +34,6 @@ pub(super) struct Sanity {
     /// `None`: a healthy sensor may repeat itself.
     repeats: Option<Repeats<6>>,
     jumps: Jumps<6>,
-    newest: Nanos,
 }
 
 impl Sanity {
@@ -45,7 +44,6 @@ impl Sanity {
         Self {
             repeats: None,
             jumps: Jumps::new([peak; 6]),
-            newest: Nanos::ZERO,
         }
     }
 
@@ -54,7 +52,6 @@ impl Sanity {
         Self {
             repeats: Some(Repeats::default()),
             jumps: Jumps::new(peaks),
-            newest: Nanos::ZERO,
         }
     }
 
@@ -68,12 +65,11 @@ impl Sanity {
         quality: Quality,
         max_silence: Nanos,
     ) -> Quality {
-        let period = (t - self.newest).0.max(1);
-        self.newest = t;
+        let jumps = self.jumps.look(t, values, quality);
+        let period = Nanos::from_seconds(self.jumps.period()).0.max(1);
         let least = u32::try_from(max_silence.0 / period).unwrap_or(LONGEST);
         let least = least.clamp(2, LONGEST);
         let frozen = (self.repeats.as_mut()).map_or(0, |r| r.look(values, quality, least));
-        let jumps = self.jumps.look(t, values, quality);
         let mut flags = quality;
         if frozen != 0 {
             flags |= Quality::FROZEN;
@@ -119,5 +115,34 @@ pub(super) fn stale<const D: usize>(held: &ChannelValue<D>, max_silence: Nanos) 
         Reason::Stale
     } else {
         Reason::None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A board that sends each measurement three times: one that comes late is not frozen, and one
+    /// that comes for longer than `max_silence` is.
+    #[test]
+    fn a_late_copy_of_a_measurement_is_not_frozen() {
+        let max_silence = Nanos::from_millis(100);
+        let mut sanity = Sanity::of_noisy([0.0; 6]);
+        let (mut ms, mut frozen) = (0, Vec::new());
+        for k in 0..720_i64 {
+            ms += if k == 500 { 60 } else { 10 };
+            let measurement = k.min(700) / 3;
+            let noise = [7919, 6151, 4099, 3571, 2203, 1447]
+                .map(|a| a * measurement * measurement % 10_007);
+            let t = Nanos::from_millis(ms);
+            let flags = sanity.look(t, &noise.map(|n| n as f64), Quality::GOOD, max_silence);
+            if flags.intersects(Quality::FROZEN) {
+                frozen.push(k);
+            }
+        }
+        // The first copy of the last measurement is number 699; the period is 10 ms or little more.
+        let first = frozen.first().copied().unwrap_or(0);
+        assert!((708..=709).contains(&first), "{frozen:?}");
+        assert!(frozen.into_iter().eq(first..720));
     }
 }

@@ -321,6 +321,13 @@ impl<const N: usize> Jumps<N> {
         }))
     }
 
+    /// The usual time between two readings \[s\]: one that comes early or late hardly changes it. Not
+    /// known before the second reading.
+    #[must_use]
+    pub fn period(&self) -> f64 {
+        self.0.first().map_or(0.0, |path| path.period)
+    }
+
     /// Takes a reading at `t`, NaN where it has none; returns whether it is doubtful.
     pub fn look(&mut self, t: Nanos, values: &[f64; N], quality: Quality) -> bool {
         if quality.intersects(Quality::ZERO_CHANGED) {
