@@ -20,7 +20,10 @@
 //! send one measurement several times: the caller says from how many on a run counts.
 //!
 //! What this does not see: a value that was constant from the start, and one that is wrong but
-//! goes on changing.
+//! goes on changing; and what becomes of a board that sends each measurement eight times or more.
+//! The two bends of a measurement raise the noise by 3/16 each at most, and each copy between them
+//! takes 1/16 away: (19/16)^2 (15/16)^6 < 1, so that no noise is left. Of little noise, fewer
+//! copies leave less than a step.
 //!
 //! It is not for encoders: the jitter of a joint that moves ends when it stands, at one count.
 //!

@@ -172,6 +172,19 @@ fn a_measurement_that_is_sent_several_times_is_not_frozen() {
     assert!(sensor.until(0x3F, 0x3F).is_some());
 }
 
+/// What the copies of a measurement leave of its noise: little, and from eight on nothing.
+#[test]
+fn what_is_sent_too_often_is_never_found_frozen() {
+    for (times, is_found) in [(2, true), (4, true), (7, true), (8, false), (16, false)] {
+        let mut sensor = Sensor::new(3000.0);
+        for k in 0..20_000 {
+            let frozen = if k % times == 0 { 0 } else { 0x3F };
+            assert_eq!(sensor.read(work(k), frozen), 0, "{times} {k}");
+        }
+        assert_eq!(sensor.until(0x3F, 0x3F).is_some(), is_found, "{times}");
+    }
+}
+
 #[test]
 fn what_the_device_says_itself_is_not_judged() {
     let mut sanity = Repeats::default();
