@@ -188,50 +188,39 @@ impl Cycle {
     }
 }
 
-/// When a TPDO has come last, and how long that was after the time before.
-#[derive(Debug, Clone, Copy)]
-struct Came {
-    t: Nanos,
-    after: Option<Nanos>,
-}
-
-impl Came {
-    /// Whether this TPDO, rather than `other`, makes the readings at `now`: the other comes at less
-    /// than half the rate, or has fallen silent; or it comes at the same, and this one is better.
-    fn is_before(self, other: Self, is_better: bool, now: Nanos) -> bool {
-        let least = (now - other.t).max(other.after.unwrap_or(Nanos::ZERO));
-        let is_slower = |a: Nanos, b: Nanos| a.0 / 2 > b.0;
-        match self.after {
-            Some(mine) if is_slower(least, mine) => true,
-            Some(mine) if other.after.is_some() && is_slower(mine, least) => false,
-            _ => is_better,
-        }
-    }
-}
-
-/// How often TPDOs come of which each has the position: one of them makes the readings, so that two
-/// that have the same position are not two readings.
+/// Which of several TPDOs that have the position makes the readings, so that one position is not
+/// two readings. It goes on until another has come more than three times since it came: at more
+/// than three times its rate, or after its silence; or until a better one comes as often. Between
+/// these nothing changes, because the intervals of both scatter.
 #[derive(Debug, Default)]
-pub(crate) struct Rates([Option<Came>; 4]);
+pub(crate) struct Rates {
+    /// The one that makes the readings.
+    first: Option<usize>,
+    /// Of each TPDO, how often each other has come since it came.
+    since: [[u8; 4]; 4],
+}
 
 impl Rates {
-    /// TPDO `at`, from 0, has come at `now`. Whether it makes a reading; `is_better` says of
-    /// another one whether this one is better, if they come at one rate.
-    pub(crate) fn is_first(
-        &mut self,
-        at: usize,
-        now: Nanos,
-        is_better: impl Fn(usize) -> bool,
-    ) -> bool {
-        let Some(place) = self.0.get_mut(at) else {
-            return false;
+    /// TPDO `at`, from 0 to 3, has come. Whether it makes a reading; `is_better` says of another
+    /// one whether this one is better.
+    pub(crate) fn is_first(&mut self, at: usize, is_better: impl Fn(usize) -> bool) -> bool {
+        for count in self.since.iter_mut().filter_map(|row| row.get_mut(at)) {
+            *count = count.saturating_add(1);
+        }
+        let count = |of: usize, since: usize| {
+            let row = self.since.get(since);
+            row.and_then(|row| row.get(of)).copied().unwrap_or(0)
         };
-        let after = place.map(|before| now - before.t);
-        let mine = *place.insert(Came { t: now, after });
-        let mut others = self.0.iter().enumerate().filter(|(other, _)| *other != at);
-        others.all(|(number, other)| {
-            other.is_none_or(|other| mine.is_before(other, is_better(number), now))
-        })
+        let is_first = self.first.is_none_or(|first| {
+            at == first || count(at, first) > 3 || is_better(first) && count(first, at) <= 1
+        });
+        if is_first {
+            self.first = Some(at);
+        }
+        if let Some(row) = self.since.get_mut(at) {
+            *row = [0; 4];
+        }
+        is_first
     }
 }
 

@@ -37,8 +37,8 @@
 //!   the keys ask for it, the drive is refused.
 //! - If the position is sent by events or a timer (254, 255), each makes a reading, with the last
 //!   values of the others if they are not older than `hold_ms`. If several TPDOs have a position,
-//!   the best that comes makes the readings: one by SYNC, else one at more than twice the rate of
-//!   the others, else that with most values.
+//!   one makes the readings: one by SYNC; else one until another comes more than three times as
+//!   often, or one with more values as often.
 //! - DRIVE_FAULT: the fault bit of the status word, or an emergency message; DEVICE_FAULT: an
 //!   emergency message about a sensor (73xx), which makes the position doubtful.
 //!

@@ -29,8 +29,8 @@
 //! If another program commands the node (`listen_only`, or a recorded log), the counts per turn are
 //! those of its answers to that program, or the key, or those of its DCF file, or of an EDS file if
 //! they are constants there. With `configure = false` such a file, `eds`, also says which TPDO has
-//! the position, and where in it. If several have it, the one that comes at more than twice the
-//! rate of the others makes the readings, else one by SYNC, else the first.
+//! the position, and where in it. If several have it, one makes the readings until another comes
+//! more than three times as often, or a better one as often: best is one by SYNC, else the first.
 //!
 //! Sources: CiA 301 4.2, CiA 306 1.3, CiA 406 3.2 as public drivers use it. Certain; makers differ
 //! in objects that they leave out: 6000 and 1017 may be missing, and 6200 replaces the timer.
@@ -406,7 +406,7 @@ impl Start {
 #[derive(Debug)]
 struct Encoder {
     node: u8,
-    /// Those that a SYNC causes are first.
+    /// The best first.
     places: ArrayVec<Place, 4>,
     rates: Rates,
     cycle: Cycle,
@@ -470,7 +470,7 @@ impl Encoder {
         let Some(counts_per_turn) = link.questions.plan.known() else {
             return link.questions.missed();
         };
-        if !self.rates.is_first(at, frame.t, |other| at < other) {
+        if !self.rates.is_first(at, |other| at < other) {
             return;
         }
         let measured = match place.sync {

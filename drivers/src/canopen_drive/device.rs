@@ -97,7 +97,7 @@ pub(super) struct Drive {
     suspect: bool,
     /// The last reading of a SYNC. Those are best: the time is known.
     synced: Option<Nanos>,
-    /// How often the TPDOs come that make readings alone.
+    /// Which of the TPDOs makes readings alone.
     rates: Rates,
     /// The last values in SI units, and when they came.
     values: [Option<(Nanos, f64)>; Quantity::JOINT],
@@ -216,7 +216,7 @@ impl Drive {
             let at = |bit: u8| bit.trailing_zeros() as usize;
             let rank_of = |other| table.used.iter().find(|used| at(used.bit) == other);
             let is_better = |other| rank_of(other).is_none_or(|other| rank > other.rank);
-            let is_first = self.rates.is_first(at(bit), frame.t, is_better);
+            let is_first = self.rates.is_first(at(bit), is_better);
             if is_first && !self.synced.is_some_and(|t| self.is_fresh(t, frame.t)) {
                 self.give(None, frame, link, out);
             }

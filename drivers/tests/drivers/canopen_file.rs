@@ -172,6 +172,55 @@ fn an_encoder_may_have_its_position_in_two_tpdos() {
     assert_eq!(read(&both), [10, 110]);
 }
 
+/// The same position by two timers: which one makes the readings does not change by their jitter.
+#[test]
+fn two_tpdos_with_the_position_do_not_take_turns() {
+    let entries = [
+        (0x6501, 0, 100),
+        (0x1800, 1, 0x180),
+        (0x1800, 2, 254),
+        (0x1A00, 1, 0x6004_0020),
+        (0x1801, 1, 0x280),
+        (0x1801, 2, 254),
+        (0x1A01, 1, 0x6004_0020),
+    ];
+    // The TPDO of each reading, which is its position; the second comes each 10 ms.
+    let read = |period: i32, silent: std::ops::Range<i32>| {
+        let mut frames = Vec::new();
+        for k in (0..1000).filter(|k| !silent.contains(&(k * period))) {
+            let late = 0.1 * f64::from(k * 7919 % 11);
+            frames.push(frame("185#01000000", f64::from(k * period) + late));
+        }
+        for k in 0..1000 {
+            let late = 0.1 * f64::from(k * 6151 % 13) + 0.05;
+            frames.push(frame("285#02000000", f64::from(k * 10) + late));
+        }
+        frames.retain(|frame| frame.t.0 < 10_000_000_000);
+        frames.sort_by_key(|frame| frame.t);
+        let mut device = listener("canopen_encoder", "configure = false", file(&entries));
+        let (readings, faults) = decode(&mut *device, &frames);
+        assert!(faults.is_empty(), "{faults:?}");
+        let tpdo = |(position, _): (f64, f64)| (100.0 * position).round() as i32;
+        let found: Vec<i32> = turns(&readings).into_iter().map(tpdo).collect();
+        let mut runs: Vec<(i32, usize)> = Vec::new();
+        for tpdo in found {
+            match runs.last_mut() {
+                Some((last, count)) if *last == tpdo => *count += 1,
+                _ => runs.push((tpdo, 1)),
+            }
+        }
+        runs
+    };
+    // The first is better, and stays at half the rate; not at a quarter.
+    assert_eq!(read(10, 0..0), [(1, 1000)]);
+    assert_eq!(read(20, 0..0), [(1, 500)]);
+    assert_eq!(read(40, 0..0), [(1, 1), (2, 997)]);
+    let runs = read(30, 0..0);
+    assert!(runs.len() <= 2, "{runs:?}");
+    // Silent, it is replaced at the fourth reading, until it comes as often again.
+    assert_eq!(read(10, 2000..5000), [(1, 200), (2, 300), (1, 498)]);
+}
+
 /// What nobody needs of a file of a drive refuses nothing; what is needed is told with its place.
 #[test]
 fn a_tpdo_that_is_not_needed_refuses_nothing() {
@@ -423,12 +472,14 @@ fn two_tpdos_with_the_position_are_one_series_of_readings() {
         ("285#270400080000", 20.0),
         ("485#0008000064000000", 20.5),
         ("285#2704000C0000", 120.0),
-        ("285#270400100000", 130.0),
-        ("285#270400140000", 140.0),
+        ("285#2704000C0000", 130.0),
+        ("285#2704000C0000", 140.0),
+        ("285#270400100000", 150.0),
+        ("285#270400140000", 160.0),
     ];
     assert_eq!(
         heard(&both),
-        [quarter(1), quarter(2), (130, TAU), (140, 1.25 * TAU)]
+        [quarter(1), quarter(2), (150, TAU), (160, 1.25 * TAU)]
     );
     // One by SYNC is better than any.
     let mut mixed = entries;
