@@ -30,7 +30,8 @@
 //! those of its answers to that program, or the key, or those of its DCF file, or of an EDS file if
 //! they are constants there. With `configure = false` such a file, `eds`, also says which TPDO has
 //! the position, and where in it. If several have it, one makes the readings until another comes
-//! more than three times as often, or a better one as often: best is one by SYNC, else the first.
+//! more than three times as often, or a better one as often: best is one by SYNC, of several the
+//! one of most SYNCs, else the first.
 //!
 //! Sources: CiA 301 4.2, CiA 306 1.3, CiA 406 3.2 as public drivers use it. Certain; makers differ
 //! in objects that they leave out: 6000 and 1017 may be missing, and 6200 replaces the timer.
@@ -152,7 +153,7 @@ struct Place {
 
 impl Place {
     /// As the driver maps it, or as the file says of a node that it does not map: those that a SYNC
-    /// causes first.
+    /// causes first, and of these the one that most SYNCs cause.
     fn all(node: u8, options: &Options) -> Result<ArrayVec<Self, 4>, SpecError> {
         let name = options.eds.as_deref().unwrap_or_default();
         let mut places = ArrayVec::new();
@@ -170,7 +171,7 @@ impl Place {
                         None => {}
                     }
                 }
-                places.sort_by_key(|place: &Self| place.sync == 0);
+                places.sort_by_key(|place: &Self| place.sync.wrapping_sub(1));
                 if places.is_empty() {
                     let problem = match problem {
                         Some((number, why)) => format!(

@@ -172,6 +172,35 @@ fn an_encoder_may_have_its_position_in_two_tpdos() {
     assert_eq!(read(&both), [10, 110]);
 }
 
+/// Of those by SYNC, the one that follows each makes the readings: its time is that of the SYNC.
+#[test]
+fn an_encoder_has_its_position_at_each_sync() {
+    let entries = [
+        (0x6501, 0, 4),
+        (0x1800, 1, 0x180),
+        (0x1800, 2, 10),
+        (0x1A00, 1, 0x6004_0020),
+        (0x1801, 1, 0x280),
+        (0x1801, 2, 1),
+        (0x1A01, 1, 0x6004_0020),
+    ];
+    let mut device = listener("canopen_encoder", "configure = false", file(&entries));
+    let mut frames = Vec::new();
+    for cycle in 0..40 {
+        let ms = 10.0 * f64::from(cycle);
+        frames.push(frame("080#", ms));
+        if cycle % 10 == 5 {
+            frames.push(frame("185#01000000", ms + 0.2));
+        }
+        frames.push(frame("285#01000000", ms + 0.4));
+    }
+    let (readings, faults) = decode(&mut *device, &frames);
+    assert!(faults.is_empty(), "{faults:?}");
+    let found: Vec<i64> = readings.iter().map(|output| output.acquired.0).collect();
+    let syncs: Vec<i64> = (0..40).map(|cycle| 10_000_000 * cycle).collect();
+    assert_eq!(found, syncs);
+}
+
 /// The same position by two timers: which one makes the readings does not change by their jitter.
 #[test]
 fn two_tpdos_with_the_position_do_not_take_turns() {
