@@ -14,8 +14,9 @@
 //!   the priority, the source and, where the group has one, the destination that are in the file.
 //!   If the file has several messages of one group, their addresses count. Messages of more than 8
 //!   bytes, which come in several packets, are not read. Unsigned numbers of whole bytes of which
-//!   the highest is FE (error) or FF (not available) are no value; others are none if all their
-//!   bits are 1. A counter may have any.
+//!   the highest is FE (error) or FF (not available) are no value, nor are two bits that are 10
+//!   (error) or 11; others are none if all their bits are 1. An error of `fault` itself is a fault.
+//!   A counter may have any.
 //! - Names: those in the file, and the long ones that editors keep beside them
 //!   (`SystemMessageLongSymbol`, `SystemSignalLongSymbol`). Where several messages have one name,
 //!   the identifier stands for it, three digits or eight: `"0x1A0.Position"`,

@@ -61,15 +61,20 @@ impl Field {
 }
 
 /// The least raw value of a signal of J1939 that stands for none (SAE J1939-71): of whole bytes,
-/// the highest one is FE for an error, and FF where there is no value. Of others, all bits are 1
-/// where there is none. What has a sign is of a maker's own.
-fn none_from(raw: Raw, bits: Bits) -> Option<u64> {
-    match u32::from(bits.length()) {
-        _ if raw != Raw::Unsigned => None,
-        length if length % 8 == 0 => Some(0xFE << (length - 8)),
-        1 => None,
-        length => Some(u64::MAX >> (64 - length)),
+/// the highest one is FE for an error, and FF where there is no value; of two bits these are 2 and
+/// 3. Of others, all bits are 1 where there is none. An error of a fault flag is a fault. What has
+/// a sign is of a maker's own.
+fn none_from(raw: Raw, bits: Bits, role: Role) -> Option<u64> {
+    let length = u32::from(bits.length());
+    if raw != Raw::Unsigned || role == Role::Counter || length == 1 {
+        return None;
     }
+    let has_error = role != Role::Fault;
+    Some(match length {
+        2 if has_error => 2,
+        _ if length % 8 == 0 => (if has_error { 0xFE } else { 0xFF }) << (length - 8),
+        _ => u64::MAX >> (64 - length),
+    })
 }
 
 /// Frames that have a signal: those in which these bits are within one of these ranges, which are
@@ -496,7 +501,7 @@ impl Layout {
             role,
             bits,
             raw: signal.raw,
-            none_from: none_from(signal.raw, bits).filter(|_| j1939 && role != Role::Counter),
+            none_from: none_from(signal.raw, bits, role).filter(|_| j1939),
         };
         let messages = &mut self.messages;
         let known = messages.iter().position(|m| m.frames == frames);

@@ -416,9 +416,10 @@ fn signals_of_one_frame_are_one_reading() {
 #[test]
 fn values_that_are_not_available_are_none() {
     let keys = "file = \"device.dbc\"\n[[reading]]\nkind = \"joint\"\n\
-                fields = { position = \"G.Byte\", velocity = \"G.Word\", current = \"G.Bits\" }\n\
-                hold_ms = { current = 1000.0 }\nfault = \"G.Flag\"\n";
-    let told = |j1939: bool, raw: Raw, data: [u8; 5]| {
+                fields = { position = \"G.Byte\", velocity = \"G.Word\", current = \"G.Bits\", \
+                torque = \"G.Two\" }\n\
+                hold_ms = { current = 1000.0, torque = 1000.0 }\nfault = \"G.Flag\"\n";
+    let told = |j1939: bool, raw: Raw, flag: u64, data: [u8; 6]| {
         let message = Message {
             name: "G".to_owned(),
             id: Ok(Id::extended(0x18FF_1023)),
@@ -427,7 +428,8 @@ fn values_that_are_not_available_are_none() {
                 signal("Byte", 0, 8, raw, 1.0, "rad"),
                 signal("Word", 8, 16, raw, 1.0, "rad/s"),
                 signal("Bits", 24, 4, raw, 1.0, "A"),
-                signal("Flag", 32, 2, raw, 1.0, ""),
+                signal("Flag", 32, flag, raw, 1.0, ""),
+                signal("Two", 40, 2, raw, 1.0, "Nm"),
             ],
             ..messages()[0].clone()
         };
@@ -435,36 +437,54 @@ fn values_that_are_not_available_are_none() {
         options.describe(vec![message]);
         let mut device = options.device(&spec(0, Mode::Listen, &[0])).unwrap();
         let id = Id::extended(0x18FF_1023);
-        let (readings, faults) = decode(&mut *device, &[Frame::remote(id, 5)]);
+        let (readings, faults) = decode(&mut *device, &[Frame::remote(id, 6)]);
         assert!(readings.is_empty() && faults.is_empty(), "{faults:?}");
         let (readings, faults) = decode(&mut *device, &[Frame::new(id, &data)]);
         let is_faulty = count(&faults, Counter::DeviceFault) != 0;
         let values = |output: &Output| match output.reading {
-            Reading::Joint(joint) => [joint.position, joint.velocity, joint.current],
+            Reading::Joint(joint) => [joint.position, joint.velocity, joint.current, joint.torque],
             _ => panic!("{output:?}"),
         };
         (readings.first().map(values), is_faulty)
     };
-    let same = |found: Option<[f64; 3]>, right: [f64; 3]| {
+    let same = |found: Option<[f64; 4]>, right: [f64; 4]| {
         let equal = |(a, b): (f64, f64)| a == b || a.is_nan() && b.is_nan();
         found.is_some_and(|found| found.into_iter().zip(right).all(equal))
     };
     const NONE: f64 = f64::NAN;
     for (data, right, fault) in [
-        ([0xFD, 0xFF, 0xFD, 0x0E, 1], [253.0, 65023.0, 14.0], true),
-        ([0xFE, 0x00, 0x01, 0x0F, 3], [NONE, 256.0, NONE], false),
-        ([0x01, 0x00, 0xFE, 0x01, 0], [1.0, NONE, 1.0], false),
-        ([0x01, 0x34, 0xFF, 0x01, 2], [1.0, NONE, 1.0], true),
+        (
+            [0xFD, 0xFF, 0xFD, 0x0E, 1, 1],
+            [253.0, 65023.0, 14.0, 1.0],
+            true,
+        ),
+        (
+            [0xFE, 0x00, 0x01, 0x0F, 3, 3],
+            [NONE, 256.0, NONE, NONE],
+            false,
+        ),
+        ([0x01, 0x00, 0xFE, 0x01, 0, 0], [1.0, NONE, 1.0, 0.0], false),
+        ([0x01, 0x34, 0xFF, 0x01, 2, 2], [1.0, NONE, 1.0, NONE], true),
     ] {
-        let (found, is_faulty) = told(true, Raw::Unsigned, data);
+        let (found, is_faulty) = told(true, Raw::Unsigned, 2, data);
         assert!(same(found, right), "{data:?} {found:?}");
         assert_eq!(is_faulty, fault, "{data:?}");
     }
-    let all = [0xFF; 5];
-    assert_eq!(told(true, Raw::Unsigned, all), (None, false));
-    let found = told(false, Raw::Unsigned, all);
-    assert_eq!(found, (Some([255.0, 65535.0, 15.0]), true));
-    assert_eq!(told(true, Raw::Signed, all), (Some([-1.0; 3]), true));
+    // A flag that tells an error of itself tells a fault.
+    for (flag, raw, fault) in [
+        (2, 2, true),
+        (8, 0xFE, true),
+        (8, 0xFF, false),
+        (1, 1, true),
+    ] {
+        let (_, is_faulty) = told(true, Raw::Unsigned, flag, [1, 1, 1, 1, raw, 1]);
+        assert_eq!(is_faulty, fault, "{flag} {raw:x}");
+    }
+    let all = [0xFF; 6];
+    assert_eq!(told(true, Raw::Unsigned, 2, all), (None, false));
+    let found = told(false, Raw::Unsigned, 2, all);
+    assert_eq!(found, (Some([255.0, 65535.0, 15.0, 3.0]), true));
+    assert_eq!(told(true, Raw::Signed, 2, all), (Some([-1.0; 4]), true));
 }
 
 #[test]
