@@ -286,7 +286,8 @@ impl Bank {
             .components
             .iter_mut()
             .for_each(|own| own.leading = None);
-        for unit in units {
+        // Before the first motion the torques are those of the setup as it is stated.
+        for unit in units.iter().filter(|unit| unit.fits[0].has_evidence()) {
             let dofs = place.dofs(unit);
             let (leading, alternatives) = (unit.leading(), unit.alternatives());
             let of_component = &mut solution.components[unit.component].leading;
@@ -308,10 +309,7 @@ impl Bank {
                     }
                 }
                 for (&dof, deviation) in dofs.iter().zip(deviations) {
-                    let before = doubts[dof].unwrap_or(Doubt {
-                        deviation: 0.0,
-                        leading: None,
-                    });
+                    let before = doubts[dof].unwrap_or(Doubt::NONE);
                     doubts[dof] = Some(Doubt {
                         deviation: deviation.max(before.deviation),
                         leading: before.leading.or(leading),
