@@ -2,9 +2,7 @@
 //!
 //! Writes into one folder, each file atomically: `summary.json` (for programs: [`summary`]),
 //! `parameters.toml`, `identified.urdf` and `report.html` (for a person). If nothing can be
-//! identified, or what was identified explains too little, is no better than the CAD, or comes from
-//! a wrong configuration, summary and report give the reason, there are no parameters, and the
-//! program exits with 1.
+//! identified, summary and report give the reason and there are no parameters.
 
 pub(crate) mod advice;
 #[cfg(test)]
@@ -13,7 +11,7 @@ mod page;
 pub(crate) mod summary;
 
 use crate::convert::check_columns;
-use advice::{Advice, Grade, findings, sentence};
+use advice::{Advice, findings, sentence};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use proprio_dynamics::model::Model;
@@ -125,7 +123,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let json = summary::summary(&outcome, &advice);
     let mut text = serde_json::to_string_pretty(&json)?;
     text.push('\n');
-    if advice.grade != Grade::Reject {
+    if !matches!(outcome.verdict, Verdict::Nothing(_)) {
         let parameters = export::parameters(
             &outcome,
             &setup.robot,
@@ -160,12 +158,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         bail!(
             "nothing was identified: {}",
             reason.trim().trim_end_matches('.')
-        );
-    }
-    if advice.grade == Grade::Reject {
-        bail!(
-            "the result was rejected, and no parameters were written: {} gives the reasons",
-            args.out.join("report.html").display()
         );
     }
     Ok(())

@@ -152,8 +152,8 @@ mod tests {
     use crate::setup::Setup;
     use proprio_dynamics::spatial::RigidInertia;
     use proprio_identification::{
-        ChannelNoise, CovarianceRoot, FrictionOutcome, LinkOutcome, ModelComparison, OffsetOutcome,
-        Predicted, RotorOutcome, Verdict,
+        ChannelNoise, Consistency, CovarianceRoot, FrictionOutcome, LinkOutcome, ModelComparison,
+        OffsetOutcome, Predicted, RotorOutcome, Verdict,
     };
     use proprio_topics::Nanos;
     use std::collections::BTreeMap;
@@ -209,6 +209,7 @@ mod tests {
             excluded: vec![],
             onset: None,
             predicted: Predicted::default(),
+            fitted_error: ModelComparison::default(),
             joints: vec![],
             sensors: vec![],
             two_route: vec![],
@@ -218,6 +219,7 @@ mod tests {
                 end,
                 deviation: [0.0; 6],
                 rate: [0.1, 0.2, 0.3, 0.01, 0.02, 0.03],
+                offset_jumps: vec![],
             }],
             friction: vec![FrictionOutcome {
                 joint: "l_elbow".into(),
@@ -228,6 +230,13 @@ mod tests {
             }],
             findings: vec![],
             curves: vec![],
+            spectra: vec![],
+        };
+        let consistency = Consistency {
+            feasible: Some(true),
+            deviations: 0.0,
+            links: vec![],
+            text: String::new(),
         };
         Outcome {
             robot: robot.name.clone(),
@@ -263,6 +272,7 @@ mod tests {
                 })
                 .collect(),
             time_offsets: vec![],
+            consistency,
             logs: vec![
                 log("train.csv", Role::Train, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
                 log("validate.csv", Role::Validate, [9.0; 6]),

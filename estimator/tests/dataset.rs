@@ -159,7 +159,7 @@ impl Table {
     /// All its defects, including the offset jumps.
     fn defects(&self, robot: &Robot) -> Vec<Defect> {
         let dataset = self.dataset(robot);
-        dataset.defects().to_vec()
+        all_defects(&dataset).into_iter().cloned().collect()
     }
 }
 
@@ -404,6 +404,7 @@ fn a_clean_log_has_no_defects_and_its_instants_are_true() {
     for (rate, jitter) in [(100.0, 0.5), (500.0, 0.3)] {
         let instants = log(&robot, 20.0, rate, jitter, 0.0, 7).dataset(&robot);
         assert_eq!(instants.defects(), []);
+        assert_eq!(instants.offset_jumps(), []);
         let usable: Vec<&Observation> = instants
             .observations()
             .iter()
@@ -470,7 +471,7 @@ fn a_log_that_holds_everything_is_used_row_by_row() {
         .collect();
     let table = Table { header, rows };
     let check = |instants: &Dataset| {
-        assert_eq!(instants.defects(), []);
+        assert_eq!(all_defects(instants), [] as [&Defect; 0]);
         assert_eq!(instants.observations().len(), table.rows.len());
         for (instant, (_, row)) in instants.observations().iter().zip(&table.rows) {
             assert!(instant.faults.iter().all(|f| *f == Reason::None));
@@ -539,7 +540,7 @@ fn given_velocities_are_kept_and_differentiated() {
         row.extend(given.collect::<Vec<_>>());
     }
     let instants = table.dataset(&robot);
-    assert_eq!(instants.defects(), []);
+    assert_eq!(all_defects(&instants), [] as [&Defect; 0]);
     let usable = instants
         .observations()
         .iter()
@@ -560,6 +561,15 @@ fn given_velocities_are_kept_and_differentiated() {
     assert!(velocity < 1e-6 && acceleration < 1e-5);
 }
 
+/// The defects, including the offset jumps.
+fn all_defects(instants: &Dataset) -> Vec<&Defect> {
+    instants
+        .defects()
+        .iter()
+        .chain(instants.offset_jumps().iter().map(|b| &b.jump))
+        .collect()
+}
+
 /// The kind of a defect, without its numbers.
 fn kind(defect: &Defect) -> &'static str {
     match defect {
@@ -576,6 +586,7 @@ fn kind(defect: &Defect) -> &'static str {
         Defect::Derivative { .. } => "derivative",
         Defect::NoMotion { .. } => "no motion",
         Defect::TooShort { .. } => "too short",
+        Defect::Jump { .. } => "jump",
         Defect::Outliers { .. } => "outliers",
         _ => "other",
     }
@@ -777,6 +788,40 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
             "the log of 1.",
         ),
         (
+            "a jump",
+            Box::new(|t| {
+                each(t, &mut |t, r| {
+                    if t > 9 * second {
+                        r[2] += 3.0
+                    }
+                })
+            }),
+            &["jump"],
+            "wrench/ft: fx jumps by 3.",
+        ),
+        (
+            "a slide",
+            Box::new(|t| {
+                each(t, &mut |t, r| {
+                    r[3] += 40.0 * ((t - 9 * second) as f64 / (0.3 * second as f64)).clamp(0.0, 1.0)
+                })
+            }),
+            &["jump"],
+            "wrench/ft: fy jumps by ",
+        ),
+        (
+            "blows",
+            Box::new(|t| {
+                each(t, &mut |t, r| {
+                    if between(t, 90, 91) && t % second < 30_000_000 {
+                        r[4] += 9.0
+                    }
+                })
+            }),
+            &["outliers"],
+            "outliers of fz",
+        ),
+        (
             "ticks of the encoder",
             Box::new(|t| {
                 for i in [400, 900, 1300] {
@@ -903,7 +948,7 @@ fn gating_follows_contacts_quality_and_edges() {
         ]);
     }
     let instants = table.dataset(&robot);
-    let defects = instants.defects();
+    let defects = all_defects(&instants);
     let kinds: Vec<&str> = defects.iter().map(|defect| kind(defect)).collect();
     assert_eq!(kinds, ["saturated"], "{defects:#?}");
     let sensor = robot.channels.iter().position(|c| c.name == "ft").unwrap();
@@ -1032,21 +1077,40 @@ fn the_leg_of_a_real_icub_has_its_true_defects_and_no_others() {
         .defects()
         .iter()
         .for_each(|d| println!("{:?}: {d}", d.severity()));
-    println!("{} instants", instants.observations().len());
+    println!(
+        "{} instants, breaks {:?}",
+        instants.observations().len(),
+        instants.offset_jumps()
+    );
     assert_eq!(instants.observations().len(), 1981);
-    let warnings = instants
-        .defects()
-        .iter()
-        .filter(|d| d.severity() > Severity::Note);
+    let warnings: Vec<&Defect> = all_defects(&instants)
+        .into_iter()
+        .filter(|d| d.severity() > Severity::Note)
+        .collect();
     // The left leg's board repeats one reading for nine seconds, and others now and then. All other
     // streams have no defect.
-    let (left, right): (Vec<&Defect>, Vec<&Defect>) =
-        warnings.partition(|d| d.to_string().contains("l_leg_ft_sensor"));
+    let (left, right): (Vec<&Defect>, Vec<&Defect>) = warnings
+        .into_iter()
+        .partition(|d| d.to_string().contains("l_leg_ft_sensor"));
     assert!(
         left.iter()
             .any(|d| matches!(d, Defect::Frozen { from, to, .. } if (*to - *from).seconds() > 9.0))
     );
-    assert_eq!(right, [] as [&Defect; 0]);
+    // The right hip stops abruptly: an outlier in the leg's sensor, and before it a force that no
+    // motion explains.
+    let leg = "wrench/r_leg_ft_sensor";
+    let blow = |d: &&Defect| {
+        matches!(d, Defect::Outliers { channel, t, .. }
+            if channel == leg && (25.5..25.7).contains(&t.seconds()))
+    };
+    let slide = |d: &&Defect| {
+        matches!(d, Defect::Jump { channel, axis: "fx", t, size }
+            if channel == leg
+                && (25.0..25.5).contains(&t.seconds())
+                && (4.0..8.0).contains(size))
+    };
+    assert!(right.iter().any(blow) && right.iter().any(slide) && right.len() == 2);
+    assert_eq!(instants.offset_jumps().len(), 1);
 }
 
 #[test]
@@ -1065,7 +1129,7 @@ fn the_logs_of_a_real_kuka_are_clean() {
             .defects()
             .iter()
             .for_each(|d| println!("{:?}: {d}", d.severity()));
-        assert_eq!(instants.defects(), []);
+        assert_eq!(all_defects(&instants), [] as [&Defect; 0]);
         let usable = instants
             .observations()
             .iter()

@@ -19,8 +19,8 @@ use proprio_estimator::setup::Setup;
 use proprio_estimator::{offline, reading};
 use proprio_identification::robot::{IdentificationInput, TorqueSide};
 use proprio_identification::{
-    Finding, FindingCode, JointOutcome, LogOutcome, Options, Outcome, Predicted, Role, Severity,
-    TwoRouteOutcome, Verdict, identify, implausible,
+    Finding, FindingCode, LogOutcome, Options, Outcome, Predicted, Role, Severity, Verdict,
+    identify, implausible,
 };
 use std::collections::HashMap;
 use std::ops::Range;
@@ -68,7 +68,7 @@ fn run(setup: &Setup, logs: &[(&str, Role, &str)], inputs: &[IdentificationInput
 fn describe(o: &Outcome) {
     println!(
         "{:?}: tau {:.3} shrink {:.1} unknowns {} rank {} structural {} effective {:.1} condition \
-         {:.1e}",
+         {:.1e}; {}",
         o.verdict,
         o.tau,
         o.least_retained_fraction,
@@ -76,7 +76,8 @@ fn describe(o: &Outcome) {
         o.rank,
         o.structural_rank,
         o.effective,
-        o.condition
+        o.condition,
+        o.consistency.text
     );
     for c in &o.channels {
         println!(
@@ -109,9 +110,9 @@ fn describe(o: &Outcome) {
         println!("  {:?} {} {}: {}", f.severity, f.code, f.subject, f.text);
     }
     for log in &o.logs {
-        let e = &log.predicted.relative_error;
+        let e = &log.fitted_error;
         println!(
-            "  {} {:?}: used {} left out {:?}; relative error {:.4} {:.4}",
+            "  {} {:?}: used {} left out {:?}; relative error {:.4} {:.4} {:.4}",
             log.file,
             log.role,
             log.used,
@@ -120,6 +121,7 @@ fn describe(o: &Outcome) {
                 .map(|l| (l.reason.as_str(), l.instants))
                 .collect::<Vec<_>>(),
             e.cad,
+            e.cad_fitted,
             e.identified
         );
         for j in &log.joints {
@@ -157,19 +159,6 @@ fn describe(o: &Outcome) {
     }
 }
 
-/// Relative error of all joint torques with friction fitted to the log: with CAD, identified.
-fn fitted_error(log: &LogOutcome) -> [f64; 2] {
-    let size = |of: &dyn Fn(&JointOutcome) -> f64| {
-        let squares = log.joints.iter().map(|joint| of(joint).powi(2));
-        squares.sum::<f64>().sqrt()
-    };
-    let measured = size(&|joint| joint.measured_rms_nm);
-    [
-        size(&|joint| joint.rms_nm.cad_fitted) / measured,
-        size(&|joint| joint.rms_nm.identified) / measured,
-    ]
-}
-
 fn kuka() -> Option<Setup> {
     let model = PathBuf::from(std::env::var_os("PROPRIO_DATA")?).join("kuka_lwr4.urdf");
     let text = format!(
@@ -197,7 +186,7 @@ fn kuka_one_predicts_the_other() {
             ],
             &TORQUE,
         );
-        let [cad, identified] = fitted_error(&outcome.logs[1]);
+        let error = &outcome.logs[1].fitted_error;
         let codes = [
             FindingCode::WrongSign,
             FindingCode::WrongUnits,
@@ -215,13 +204,20 @@ fn kuka_one_predicts_the_other() {
             found.is_empty(),
             "the torques are as they should be: {found:?}"
         );
-        assert!(identified < 0.024, "{identified}");
-        assert!((0.055..0.075).contains(&cad), "{cad}");
+        assert!(error.identified < 0.024, "{error:?}");
+        assert!((0.055..0.075).contains(&error.cad_fitted), "{error:?}");
         nothing_is_suspected(&outcome);
     }
-    // No encoder offset is found in both together.
+    // Together they determine nearly everything: no consistent bodies fit exactly, which is known
+    // long before the nearest are found. No encoder offset is found in any of them.
     let both = [("one", Role::Train, &*one), ("two", Role::Train, &*two)];
     let outcome = run(&setup, &both, &TORQUE);
+    assert_eq!(
+        outcome.consistency.feasible,
+        Some(false),
+        "{}",
+        outcome.consistency.text
+    );
     assert!(
         outcome
             .findings
@@ -245,8 +241,8 @@ fn kuka_half_a_log_predicts_the_other_half() {
             ],
             &TORQUE,
         );
-        let [cad, identified] = fitted_error(&outcome.logs[1]);
-        assert!(identified < 0.6 * cad, "{identified} {cad}");
+        let error = &outcome.logs[1].fitted_error;
+        assert!(error.identified < 0.6 * error.cad_fitted, "{error:?}");
     }
 }
 
@@ -292,10 +288,10 @@ fn kuka_one_region_predicts_the_other() {
                 ],
                 &TORQUE,
             );
-            let [cad, identified] = fitted_error(&outcome.logs[1]);
+            let error = &outcome.logs[1].fitted_error;
             assert!(
-                identified < 0.04 && identified < cad,
-                "{joint}: {identified} {cad}"
+                error.identified < 0.04 && error.identified < error.cad_fitted,
+                "{joint}: {error:?}"
             );
         }
     }
@@ -345,8 +341,8 @@ fn kuka_touched_is_identified_all_the_same() {
         ],
         &TORQUE,
     );
-    let [_, identified] = fitted_error(&outcome.logs[1]);
-    assert!(identified < 0.024, "{identified}");
+    let error = &outcome.logs[1].fitted_error;
+    assert!(error.identified < 0.024, "{error:?}");
     let mut suspected = outcome.logs[0]
         .excluded
         .iter()
@@ -410,9 +406,7 @@ fn a_touch_in_held_out_data_is_told() {
     );
     let [free, pushed] = [1, 2].map(|log| &outcome.logs[log]);
     assert_eq!((free.used, &free.excluded), (pushed.used, &pushed.excluded));
-    assert!(
-        pushed.predicted.relative_error.identified > 3.0 * free.predicted.relative_error.identified
-    );
+    assert!(pushed.fitted_error.identified > 3.0 * free.fitted_error.identified);
     // Whether the stated deviations of held-out readings are correct.
     let coverage = free.sensors[0].coverage;
     assert!(
@@ -421,9 +415,10 @@ fn a_touch_in_held_out_data_is_told() {
     );
 }
 
-/// In held-out data, too, a jump of an offset and a hand that held on and let go are named.
+/// In held-out data, too, a sudden change is classified correctly: an offset jump, or a hand that
+/// held on and let go.
 #[test]
-fn jumps_and_grips_in_held_out_data_are_told() {
+fn jumps_and_grips_in_held_out_data_are_told_apart() {
     let setup = arm();
     let [train, again] = [15, 17].map(|seed| simulate(&setup, &real(&setup, 5), 20.0, 3.0, seed));
     let changed = |rows: Range<usize>, log: &str| {
@@ -438,12 +433,26 @@ fn jumps_and_grips_in_held_out_data_are_told() {
         ("gripped", Role::Validate, &gripped),
     ];
     let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
-    let is_named = |log: &LogOutcome| {
-        let mut codes = log.findings.iter().map(|f| f.code);
-        codes.any(|code| code == FindingCode::Disturbance)
-    };
-    let named: Vec<bool> = outcome.logs.iter().map(is_named).collect();
-    assert_eq!(named, [false, false, true, true]);
+    let codes = |log: &LogOutcome| log.findings.iter().map(|f| f.code).collect::<Vec<_>>();
+    let told: Vec<_> = outcome.logs.iter().map(codes).collect();
+    assert_eq!(
+        told,
+        [
+            &[][..],
+            &[],
+            &[FindingCode::OffsetJump],
+            &[FindingCode::Disturbance]
+        ],
+        "{:?}",
+        outcome.logs
+    );
+    let breaks = |log: &LogOutcome| log.offsets[0].offset_jumps.len();
+    assert_eq!(
+        outcome.logs.iter().map(breaks).collect::<Vec<_>>(),
+        [0, 0, 1, 0]
+    );
+    let [free, slipped] = [1, 2].map(|log| outcome.logs[log].fitted_error.identified);
+    assert!(slipped < 1.3 * free, "{slipped}, without the jump {free}");
 }
 
 /// Undeclared pushes in a training or validation log do not cause a false encoder offset or sign.
@@ -489,9 +498,11 @@ fn what_pushes_leave_is_not_unexplained() {
     }
 }
 
-/// A sensor whose offset jumps, as when its cable slips: parameters become little worse.
+/// A sensor whose offset jumps, as when its cable slips: the jump is reported, the offset is
+/// re-initialised there, and nothing else becomes worse.
 #[test]
 fn a_jump_of_an_offset_is_told_and_does_no_harm() {
+    // Of two sensors, the load of the links between them shows which one jumped.
     for (sensors, slipped, seconds) in [
         (&["ft"][..], "ft", 0.0),
         (&["ft"], "ft", 0.1),
@@ -516,24 +527,62 @@ fn a_jump_of_an_offset_is_told_and_does_no_harm() {
             outcome
         };
         let (free, jumped) = (of(&train), of(&slip));
-        let named = |outcome: &Outcome| -> Vec<FindingCode> {
+        let said = |outcome: &Outcome| -> Vec<(FindingCode, String, String)> {
             let findings = outcome.logs.iter().flat_map(|log| &log.findings);
-            findings.map(|f| f.code).collect()
+            let said = findings.map(|f| (f.code, f.subject.clone(), f.text.clone()));
+            said.collect()
         };
-        assert_eq!(named(&free), [], "{sensors:?}");
-        // (Between two sensors the drift of the offsets follows it, and it is not named.)
-        if sensors.len() == 1 {
-            assert!(named(&jumped).contains(&FindingCode::Disturbance));
+        assert_eq!(said(&free), [], "{sensors:?}");
+        let told = said(&jumped);
+        let [(FindingCode::OffsetJump, subject, text)] = told.as_slice() else {
+            panic!("{slipped} of {sensors:?}: {told:?}")
+        };
+        assert!(
+            *subject == format!("wrench/{slipped}") && text.contains("fx jumps by "),
+            "{text}"
+        );
+        // A sudden jump costs no data; a gradual one costs the data of the transition.
+        let left_out = &jumped.logs[0].excluded;
+        let count: u64 = left_out.iter().map(|l| l.instants).sum();
+        let expected = if seconds > 0.0 { 1..80 } else { 0..1 };
+        assert!(expected.contains(&count), "{left_out:?}");
+        assert!(
+            left_out.iter().all(|l| l.reason.contains("jump")),
+            "{left_out:?}"
+        );
+        for offset in &jumped.logs[0].offsets {
+            let breaks: Vec<f64> = offset.offset_jumps.iter().map(|t| t.seconds()).collect();
+            if offset.sensor == slipped {
+                assert!(
+                    matches!(*breaks, [t] if (t - 9.0).abs() < 0.02 + seconds),
+                    "{breaks:?}"
+                );
+                let change = offset.end[0] - offset.start[0];
+                println!("{slipped} of {sensors:?} jumps at {breaks:?} by {change:.3} N");
+                assert!((change - 5.0).abs() < 0.5, "{change}");
+            } else {
+                assert_eq!(breaks, [], "{}", offset.sensor);
+            }
         }
-        let [without, with] =
-            [&free, &jumped].map(|outcome| outcome.logs[1].predicted.relative_error.identified);
-        println!("{slipped} of {sensors:?}: without the jump {without:.5}, with it {with:.5}");
-        assert!(with < 1.5 * without, "{slipped} of {sensors:?}");
+        assert_eq!(jumped.logs[0].offsets.len(), sensors.len());
+        // A jump and its instant cost little information: with the same noise, the errors differ
+        // but have the same size.
+        let errors = [&free, &jumped].map(|outcome| {
+            let (_, torque, ..) = torque_errors(&setup, &truth, outcome, 505);
+            [torque, outcome.logs[1].fitted_error.identified]
+        });
+        println!(
+            "{slipped} of {sensors:?}: without the jump {:.5?}, with it {:.5?}",
+            errors[0], errors[1]
+        );
+        for (without, with) in errors[0].iter().zip(errors[1]) {
+            assert!(with < 1.5 * without, "{slipped} of {sensors:?}: {errors:?}");
+        }
     }
 }
 
 /// There are no undeclared disturbances in the recorded logs: none may be found, despite errors of
-/// CAD.
+/// CAD and structural vibration.
 fn nothing_is_suspected(outcome: &Outcome) {
     let findings = outcome.logs.iter().flat_map(|log| &log.findings);
     let suspected: Vec<_> = findings
@@ -576,6 +625,7 @@ fn leg_torques_from_either_sensor_agree() {
         ],
         &[IdentificationInput::Wrench],
     );
+    nothing_is_suspected(&outcome);
     let log: &LogOutcome = &outcome.logs[1];
     assert_eq!(log.two_route.len(), 4);
     println!("{:#?}", log.two_route);
@@ -591,16 +641,27 @@ fn leg_torques_from_either_sensor_agree() {
             .expect("a joint of the leg");
         assert!(route.rms_nm.identified <= bound, "{route:?}");
     }
-    // Together; the knee's alone is no better than CAD's.
-    let size = |of: &dyn Fn(&TwoRouteOutcome) -> f64| {
-        let squares = log.two_route.iter().map(|route| of(route).powi(2));
-        squares.sum::<f64>().sqrt()
+    // The robot vibrates on its left leg. Only the left foot's sensor shows how: the one above was
+    // frozen most of the time, and the sensors of the same sub-tree do not count.
+    let between = |f: &&Finding| {
+        f.code == FindingCode::StructuralVibration
+            && f.subject == "r_leg_ft_sensor and r_foot_ft_sensor"
     };
-    let (cad, own) = (
-        size(&|route| route.rms_nm.cad_fitted),
-        size(&|route| route.rms_nm.identified),
+    let finding = outcome
+        .findings
+        .iter()
+        .find(between)
+        .expect("the leg shakes");
+    println!("{}", finding.text);
+    assert!(
+        finding.text.contains("is observed by l_foot_ft_sensor,"),
+        "{}",
+        finding.text
     );
-    assert!(own < 0.7 * cad, "{own} {cad}");
+    for route in &log.two_route {
+        let (cad, own) = (route.rms_nm.cad_fitted, route.rms_nm.identified);
+        assert!(own <= cad + (0.05 * cad).max(0.01), "{route:?}");
+    }
 }
 
 /// Every non-empty choice of this number of logs.
@@ -687,10 +748,10 @@ fn leg_is_never_worse(choices: Vec<Vec<usize>>) {
     for (trained, log, ratio) in
         predicted_ratios(&setup, &logs, &[IdentificationInput::Wrench], choices)
     {
-        // The last log, in which the foot touches the ground, predicts the second one 10 % worse
-        // than CAD.
+        // The last log, in which the foot touches the ground, predicts the second one: with
+        // constant offsets 5 % worse than CAD, with drifting ones 9 % better.
         let most = if (&trained[..], log) == (&[2][..], 1) {
-            1.12
+            1.07
         } else {
             1.02
         };
@@ -1666,8 +1727,11 @@ fn torques_of_a_rich_log_come_within_a_hundredth() {
         .collect();
     let outcome = run(&setup, &given, &TORQUE);
     assert_eq!(outcome.verdict, Verdict::Identified);
-    let error = &outcome.logs[1].predicted.relative_error;
-    assert!(error.identified < 0.011 && error.cad > 0.02, "{error:?}");
+    let error = &outcome.logs[1].fitted_error;
+    assert!(
+        error.identified < 0.011 && error.cad_fitted > 0.02,
+        "{error:?}"
+    );
 }
 
 /// Inertia of the arm's rotors, reflected [kg m^2]: about that of the links that each joint turns.
@@ -1738,14 +1802,17 @@ fn rotors_are_identified_from_torques_of_motors() {
         let known = if rotor.joint == "j1" { 0.5 } else { 0.05 };
         assert!(rotor.deviation < known * truth.max(0.1), "{rotor:?}");
     }
-    let error = |outcome: &Outcome| outcome.logs[2].predicted.relative_error;
+    let error = |outcome: &Outcome| outcome.logs[2].fitted_error;
     let (right, wrong) = (error(&outcome), error(&wrong));
     assert!(
         3.0 * right.identified < wrong.identified,
         "{right:?} {wrong:?}"
     );
     // Rotors are not attributed to errors of CAD.
-    assert!(2.0 * right.cad < wrong.cad, "{right:?} {wrong:?}");
+    assert!(
+        2.0 * right.cad_fitted < wrong.cad_fitted,
+        "{right:?} {wrong:?}"
+    );
     let (cad, own, inside, _) = torque_errors(&setup, &truth, &outcome, 77);
     println!("torques of the links: {cad:.4} -> {own:.4} Nm, covered {inside:.3}");
     assert!(5.0 * own < cad && inside > 0.85, "{cad} {own} {inside}");
@@ -1838,7 +1905,7 @@ fn a_negative_rotor_is_no_help_on_held_out_data() {
         let (cad, own, inside, _) = torque_errors(&setup, &truth, &outcome, 77);
         println!("torques of the links: {cad:.4} -> {own:.4} Nm, covered {inside:.3}");
         assert!(
-            own <= cad && inside > 0.65,
+            own <= cad && inside > 0.7,
             "{seed} {negative}: {cad} {own} {inside}"
         );
         assert!(outcome.rotors.iter().all(|rotor| rotor.inertia >= 0.0));
@@ -2361,7 +2428,7 @@ fn gains_of_a_sensor_are_identified() {
     assert!(inside > 0.9 && missed < 0.85, "{inside} {missed}");
     assert!(deviation < 3.0 * fine, "{deviation} {fine}");
     // Held-out data are predicted better.
-    let rms = |outcome: &Outcome| outcome.logs[1].predicted.relative_error.identified;
+    let rms = |outcome: &Outcome| outcome.logs[1].fitted_error.identified;
     assert!(
         rms(&with) < 0.5 * rms(&without),
         "{} {}",
@@ -2467,7 +2534,7 @@ fn cross_talk_of_a_sensor_is_identified() {
         fine < 0.5 * rough && inside > 0.85,
         "{fine} {rough} {inside}"
     );
-    let rms = |outcome: &Outcome| outcome.logs[1].predicted.relative_error.identified;
+    let rms = |outcome: &Outcome| outcome.logs[1].fitted_error.identified;
     assert!(
         rms(&with) < 0.3 * rms(&without),
         "{} {}",
@@ -2558,40 +2625,56 @@ fn a_gain_that_no_motion_tells_stays_the_workbenchs() {
     assert!(text.contains("the gain of fz"), "{text}");
 }
 
-/// Gains are identified unless the configuration says otherwise. Where they are right they cost
-/// nothing; where one is wrong, another log is predicted better.
+/// Automatic choice of gains: only if the gain error of a sensor exceeds the deviation of the
+/// factory calibration. All masses may differ from CAD.
 #[test]
-fn gains_cost_nothing_where_they_are_right() {
+fn gains_are_found_out_only_where_readings_ask_for_them() {
     let mut setup = arm_with(&["ft", "wrist"]);
     assert_eq!(setup.robot.calibrated.gain, Gain::Auto);
-    let truth = real(&setup, 3);
-    let logs = [3, 4].map(|seed| simulate(&setup, &truth, 12.0, 0.01, seed));
-    for (channels, gain) in [
-        (&["ft/fz", "ft/tx"][..], 1.0),
-        (&["wrist/fz", "wrist/tx"], 1.12),
+    let mut truth = real(&setup, 3);
+    for link in 1..truth.link_count() {
+        let light = truth.inertias()[link].parameters().map(|x| 0.75 * x);
+        truth
+            .set_inertia(link, RigidInertia::from_parameters(&light))
+            .expect("a body");
+    }
+    let log = simulate(&setup, &truth, 12.0, 0.01, 3);
+    let of_both = ["ft/fz", "ft/tx"];
+    // Only the sensor with the smaller load.
+    let of_wrist = ["wrist/fz", "wrist/tx"];
+    for (channels, gain, noise, workbench, expected) in [
+        (&of_both[..], 1.0, 0.0, 0.05, false),
+        (&of_both, 1.04, 0.0, 0.05, false),
+        (&of_both, 1.4, 0.0, 0.05, true),
+        (&of_both, 1.04, 0.0, 0.005, true),
+        // An error that no gain explains.
+        (&of_both, 1.04, 0.3, 0.05, false),
+        (&of_wrist, 1.12, 0.0, 0.05, true),
     ] {
-        let [train, other] = logs.each_ref().map(|log| {
-            channels.iter().fold(log.clone(), |log, channel| {
-                change(&log, &format!("wrench/{channel}"), |x| gain * x)
+        setup.robot.gain_std = workbench;
+        let mut normal = Noise(5);
+        let log = channels.iter().fold(log.clone(), |log, channel| {
+            let column = format!("wrench/{channel}");
+            let size = rms(&log, &column);
+            change_rows(&log, &column, |_, x| {
+                gain * x + noise * size * normal.normal()
             })
         });
-        let [own, without] = [Gain::Auto, Gain::None].map(|kind| {
-            setup.robot.calibrated.gain = kind;
-            let logs = [
-                ("train", Role::Train, &*train),
-                ("other", Role::Validate, &*other),
-            ];
-            let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
-            assert_eq!(
-                outcome.calibrations.len(),
-                if kind == Gain::Auto { 2 } else { 0 }
-            );
-            outcome.logs[1].predicted.relative_error.identified
-        });
-        println!("{channels:?} {gain}: {own:.5}, without gains {without:.5}");
-        let most = if gain == 1.0 { 1.02 } else { 0.5 };
-        assert!(own < most * without, "{channels:?} {gain}: {own} {without}");
+        let outcome = run(&setup, &[("log", Role::Train, &log)], &[]);
+        let is_told = outcome
+            .findings
+            .iter()
+            .any(|f| f.code == FindingCode::GainChosen);
+        assert_eq!(is_told, !outcome.calibrations.is_empty());
+        assert_eq!(is_told, expected, "{channels:?} {gain} {noise} {workbench}");
     }
+}
+
+/// RMS of a column about its mean.
+fn rms(log: &str, column: &str) -> f64 {
+    let values = values(log, column);
+    let mean = values.iter().sum::<f64>() / values.len() as f64;
+    (values.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / values.len() as f64).sqrt()
 }
 
 /// The estimated drift of an offset is never larger than that of a real sensor, at any actual

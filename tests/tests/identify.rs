@@ -209,6 +209,7 @@ fn check_shape(summary: &Json, logs: &[(&str, &str)]) {
             (entry["file"].as_str(), entry["role"].as_str()),
             (Some(*file), Some(*role))
         );
+        three(&entry["fitted_error"], 1, "fitted_error");
         for (name, joint) in entry["joints"].as_object().expect("joints by name") {
             three(&joint["rms_nm"], 1, name);
         }
@@ -243,6 +244,9 @@ fn check_shape(summary: &Json, logs: &[(&str, &str)]) {
     ] {
         assert!(summary[key].is_array(), "{key}: {}", summary[key]);
     }
+    let feasible = &summary["feasibility"]["feasible"];
+    assert!(feasible.is_boolean() || feasible.is_null(), "{feasible}");
+    assert!(summary["feasibility"]["text"].is_string());
     for key in ["tau", "rank", "condition"] {
         assert!(
             summary
@@ -431,7 +435,7 @@ fn a_wrong_cad_is_put_right_from_logs_of_the_simulated_arm() {
     assert_eq!(summary["verdict"], "identified");
     let validated = &summary["logs"][2];
     let [fitted, identified] =
-        ["cad", "identified"].map(|key| number(validated, &["predicted", "relative_error", key]));
+        ["cad_fitted", "identified"].map(|key| number(validated, &["fitted_error", key]));
     assert!(identified < fitted / 3.0, "{identified} against {fitted}");
     let report = place.read("out/report.html");
     assert!(report.len() < 2_000_000 && report.contains("three.csv"));
@@ -583,10 +587,10 @@ fn an_arm_with_joint_torque_sensors() {
             &summary,
             &[(&name(train), "train"), (&name(validate), "validate")],
         );
-        let error = |key| number(&summary["logs"][1], &["predicted", "relative_error", key]);
+        let error = |key| number(&summary["logs"][1], &["fitted_error", key]);
         println!(
             "{train} to {validate}: {} with the CAD, {} identified",
-            error("cad"),
+            error("cad_fitted"),
             error("identified")
         );
         assert!(error("identified") < 0.024, "{}", error("identified"));

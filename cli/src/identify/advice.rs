@@ -47,13 +47,8 @@ pub(crate) struct Advice {
     pub(crate) next: Vec<String>,
 }
 
-/// Relative difference of two validation errors below which they count as equal; and the error of
-/// the CAD below which there is nothing to gain: measured torques repeat to a hundredth or two.
+/// Relative difference of two validation errors below which they count as equal.
 const NOTICEABLE: f64 = 0.02;
-
-/// Relative error above which less than half of the power of what was measured is explained: to
-/// predict zero has an error of one.
-const UNEXPLAINED: f64 = std::f64::consts::FRAC_1_SQRT_2;
 
 impl Advice {
     /// What `outcome` means.
@@ -72,14 +67,8 @@ impl Advice {
             return this;
         }
         this.assess_errors(outcome);
-        this.refuse_wrong_configuration(outcome);
         if outcome.verdict == Verdict::NoBetterThanCad {
-            let has_errors = |log: &&LogOutcome| log.predicted.relative_error.cad > NOTICEABLE;
-            this.worsen(if outcome.logs.iter().any(|log| has_errors(&log)) {
-                Grade::Reject
-            } else {
-                Grade::Care
-            });
+            this.worsen(Grade::Care);
             let why = if findings(outcome).any(|(_, f)| f.code == FindingCode::NotCrossValidated) {
                 "The logs are too short for cross-validation, so the parameters keep their CAD \
                  values"
@@ -105,11 +94,29 @@ impl Advice {
                 ));
             }
         }
+        if outcome.consistency.feasible.is_none() {
+            this.worsen(Grade::Care);
+            this.why
+                .push("Physical consistency of the parameters could not be decided.".into());
+        }
+        if outcome.consistency.feasible == Some(false) {
+            // The parameters written are the nearest consistent ones; their validation error
+            // decides.
+            this.worsen(Grade::Care);
+            this.why.push(
+                "The parameters that fit the logs best are physically inconsistent; the nearest \
+                 consistent ones were written."
+                    .into(),
+            );
+            this.next.push(
+                "Check the signs, frames and units of the sensors, the joints' zero positions, and \
+                 that every contact is declared."
+                    .into(),
+            );
+        }
         this.look_at_findings(outcome);
         this.assess_excitation(outcome);
-        if this.grade == Grade::Reject {
-            this.why.push("No parameters were written.".into());
-        } else {
+        if this.grade != Grade::Reject {
             if !outcome.logs.iter().any(|log| log.role == Role::Validate) {
                 this.next.push(
                     "Record a different motion and pass it with --validate: only that shows how \
@@ -142,7 +149,6 @@ impl Advice {
             Role::Train
         };
         let mut compared = false;
-        let (mut least, mut gained, mut to_gain) = (f64::INFINITY, false, false);
         for log in outcome.logs.iter().filter(|log| log.role == role) {
             let Both { cad, identified } = log.predicted.relative_error;
             if !(cad.is_finite() && identified.is_finite()) {
@@ -156,16 +162,6 @@ impl Advice {
                 continue;
             }
             compared = true;
-            let is_disturbed = log
-                .findings
-                .iter()
-                .any(|f| f.code == FindingCode::Disturbance);
-            // Errors where something touched the robot say little about the parameters.
-            if validated && !is_disturbed {
-                least = least.min(identified);
-                to_gain |= cad > NOTICEABLE;
-            }
-            gained |= identified < cad;
             let how = if validated {
                 ", which was not used for training"
             } else {
@@ -186,8 +182,12 @@ impl Advice {
             ));
             if identified > cad * (1.0 + NOTICEABLE) {
                 if validated {
-                    if is_disturbed {
-                        self.worsen(Grade::Care);
+                    self.worsen(Grade::Reject);
+                    if log
+                        .findings
+                        .iter()
+                        .any(|f| f.code == FindingCode::Disturbance)
+                    {
                         self.why.push(format!(
                             "That is worse than the CAD, but {} contains undeclared contacts or \
                              loads.",
@@ -199,7 +199,6 @@ impl Advice {
                             log.file
                         ));
                     } else {
-                        self.worsen(Grade::Reject);
                         self.why.push(
                             "That is worse than the CAD: the parameters are not valid outside the \
                              training motion."
@@ -228,43 +227,8 @@ impl Advice {
                     .into(),
             );
         }
-        if least.is_finite() && least > UNEXPLAINED {
-            self.worsen(Grade::Reject);
-            self.why.push(
-                "An error of this size explains little of what was measured: a prediction of zero \
-                 has 100 %."
-                    .into(),
-            );
-        }
-        if to_gain && !gained {
-            self.worsen(Grade::Reject);
-            self.why
-                .push("Nothing was gained over the CAD on any of them.".into());
-        }
         if !validated {
             self.why.push("No validation log was given.".into());
-        }
-    }
-
-    /// With a wrong sign, frame or gravity in the configuration, the parameters make up for it in
-    /// the training motion alone. (A log that was refused for it is not part of them.)
-    fn refuse_wrong_configuration(&mut self, outcome: &Outcome) {
-        let is_wrong = |(log, finding): &(Option<&LogOutcome>, &Finding)| {
-            finding.severity >= Severity::Warning
-                && log.is_none_or(|log| log.role == Role::Train && log.used > 0)
-                && [
-                    FindingCode::WrongSign,
-                    FindingCode::WrongFrame,
-                    FindingCode::WrongGravity,
-                ]
-                .contains(&finding.code)
-        };
-        if findings(outcome).any(|found| is_wrong(&found)) {
-            self.worsen(Grade::Reject);
-            self.why.push(
-                "The configuration is wrong, see \"Findings\": parameters cannot make up for it."
-                    .into(),
-            );
         }
     }
 
@@ -283,7 +247,6 @@ impl Advice {
                 f.code,
                 FindingCode::WrongSign
                     | FindingCode::WrongFrame
-                    | FindingCode::WrongGravity
                     | FindingCode::EncoderOffset
                     | FindingCode::WrongUnits
                     | FindingCode::Scale
@@ -487,19 +450,11 @@ mod tests {
             "{advice:?}"
         );
         outcome.logs[1].findings.clear();
-        // Equal to the CAD is no gain, and a hundredth is not accepted without a remark.
+        // Equal to the CAD is not accepted without a remark, nor is a hundredth better or worse.
         outcome.logs[1].predicted.relative_error.identified = 0.0645;
-        assert_eq!(Advice::of(&outcome).grade, Grade::Reject);
-        outcome.logs[1].predicted.relative_error.identified = 0.064;
-        assert_eq!(Advice::of(&outcome).grade, Grade::Reject);
-        outcome.logs[1].predicted.relative_error.identified = 0.0635;
         assert_eq!(Advice::of(&outcome).grade, Grade::Care);
-        // An error of the size of what was measured is no use, however bad the CAD is.
-        outcome.logs[1].predicted.relative_error = Both {
-            cad: 1.1,
-            identified: 0.8,
-        };
-        assert_eq!(Advice::of(&outcome).grade, Grade::Reject);
+        outcome.logs[1].predicted.relative_error.identified = 0.064;
+        assert_eq!(Advice::of(&outcome).grade, Grade::Care);
     }
 
     #[test]
@@ -516,17 +471,15 @@ mod tests {
     }
 
     #[test]
-    fn findings_and_no_gain_each_lower_the_grade() {
+    fn inconsistency_findings_and_no_gain_each_lower_the_grade() {
+        let mut outcome = good();
+        outcome.consistency.feasible = Some(false);
+        let advice = Advice::of(&outcome);
+        assert_eq!(advice.grade, Grade::Care);
+        assert!(advice.next[0].starts_with("Check the signs"), "{advice:?}");
+        assert_eq!(Advice::of(&example::outcome()).grade, Grade::Care);
         let mut outcome = good();
         outcome.verdict = Verdict::NoBetterThanCad;
-        assert_eq!(Advice::of(&outcome).grade, Grade::Reject);
-        // Where the CAD is right to a hundredth there is nothing to gain.
-        for log in &mut outcome.logs {
-            log.predicted.relative_error = Both {
-                cad: 0.01,
-                identified: 0.01,
-            };
-        }
         assert_eq!(Advice::of(&outcome).grade, Grade::Care);
         let mut outcome = good();
         outcome.findings.push(Finding {
@@ -536,7 +489,7 @@ mod tests {
             text: "r_leg_ft_sensor seems to be mounted the wrong way round".into(),
         });
         let advice = Advice::of(&outcome);
-        assert_eq!(advice.grade, Grade::Reject);
+        assert_eq!(advice.grade, Grade::Care);
         assert!(
             advice
                 .next
@@ -597,7 +550,10 @@ mod tests {
     }
 
     #[test]
-    fn partial_retention_is_reported() {
+    fn undecided_consistency_and_partial_retention_are_reported() {
+        let mut outcome = good();
+        outcome.consistency.feasible = None;
+        assert_eq!(Advice::of(&outcome).grade, Grade::Care);
         let mut outcome = good();
         outcome.links[2].retained_fraction = 0.0;
         let advice = Advice::of(&outcome);

@@ -210,7 +210,8 @@ fn wrench(torque_first: &Vector6<f64>) -> Wrench {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Gain {
-    /// All 36 where there is a sensor: the prior keeps those that the logs do not determine.
+    /// Chosen by cross-validation: more entries only if they predict held-out data better than
+    /// fewer.
     #[default]
     Auto,
     /// None: the factory gain is correct.
@@ -258,7 +259,7 @@ impl Kind {
     #[must_use]
     pub fn count(&self) -> usize {
         let gains = match self.gain {
-            // `Auto` has none until the logs are known.
+            // `Auto` has none until it is chosen.
             Gain::None | Gain::Auto => 0,
             Gain::Diagonal => 6,
             Gain::Full => 36,

@@ -5,38 +5,40 @@
 //! 2. [`plausible_model`]: the measurement model, which makes rows of observations
 //!    ([`crate::measurement::model`]). Logs with F/T readings in wrong units
 //!    ([`crate::diagnose::wrench_units`]) are refused, and so is a wrong measurement frame or
-//!    direction of a sensor, in all logs or in one ([`crate::diagnose::sensor_frame`]), and a wrong
-//!    gravity ([`crate::diagnose::gravity`]).
+//!    direction of a sensor, in all logs or in one ([`crate::diagnose::sensor_frame`]).
 //! 3. [`exclude_disturbed`]: noise and MAP estimate in turn, until the noise converges
 //!    ([`crate::fit::alternate_noise_and_map`]). After each such fit, undeclared contacts
-//!    ([`crate::diagnose::undeclared`]) and loads ([`crate::diagnose::load`]) are excluded; then
-//!    the next fit, until they do not change.
-//! 4. [`with_gains`]: all gains of the F/T sensors, unless the configuration says otherwise; then 3
-//!    again.
-//! 5. [`cross_validated_fit`]: fifths of the logs are predicted from the others. That share of the
-//!    change from CAD is retained which predicts best ([`crate::cross_validation`]).
-//! 6. Disturbances in validation logs, encoder errors ([`encoder_offsets::encoder_errors`]) and
+//!    ([`crate::diagnose::undeclared`]) and loads ([`crate::diagnose::load`]) are excluded and
+//!    offset jumps that the fit does not confirm are dropped; then the next fit, until neither
+//!    changes.
+//! 4. [`choose_gain`]: gains of the F/T sensors, if requested or worth it; then 3 again, with these
+//!    unknown ([`with_gains`]).
+//! 5. [`cross_validated_fit`]: segments of the logs are predicted from the others. The change from
+//!    CAD is shrunk where it does not improve the prediction ([`crate::cross_validation`]).
+//! 6. [`without_vibration`]: structural vibration that other sensors observe
+//!    ([`crate::diagnose::structural_vibration`]) is subtracted; then the fit of 3 and the
+//!    cross-validation of 5 once more.
+//! 7. Disturbances in validation logs, encoder errors ([`encoder_offsets::encoder_errors`]) and
 //!    delays ([`delay::delays`]) are reported, not corrected.
-//! 7. [`assemble::outcome`]: figures for every log and the parameters' uncertainty.
+//! 8. [`assemble::outcome`]: figures for every log and the parameters' uncertainty.
 
 mod gains;
 
-use crate::batch::gains::fit_gains;
-use crate::cross_validation;
+use crate::batch::gains::{GainChoice, choose_gain, fit_gains};
+use crate::cross_validation::{self, Retention};
 use crate::dataset::{Dataset, Role};
+use crate::diagnose::structural_vibration::StructuralVibration;
 use crate::diagnose::undeclared::{self, Undeclared};
-use crate::diagnose::{
-    delay, encoder_offsets, gravity, load, sensor_frame, torque_units, wrench_units,
-};
+use crate::diagnose::{delay, encoder_offsets, load, sensor_frame, torque_units, wrench_units};
 use crate::finding::{Finding, FindingCode, Severity};
 use crate::fit::{
     Identified, IdentifyError, LOAD_VARIANCE_RATIO, NoiseAndMap, OffsetDrift, added,
     alternate_noise_and_map, negative_rotors, parameters_without_cad, per_column, posterior,
     unsettled, walk_limits, without_negative_rotors,
 };
+use crate::measurement::channels;
 use crate::measurement::model::MeasurementModel;
-use crate::measurement::reduction::{reduce, residuals};
-use crate::measurement::seconds::Seconds;
+use crate::measurement::reduction::reduce;
 use crate::prior::Fit;
 use crate::report::assemble::{self, Diagnosis};
 use crate::report::outcome::Outcome;
@@ -59,7 +61,7 @@ pub struct Options {
 /// Progress of [`identify`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Progress {
-    /// The current step, in a few words: `cross-validation`, `figures`.
+    /// The current step, in a few words: `structural vibration`, `figures`.
     pub step: String,
     /// Fraction done, 0 to 1.
     pub done: f64,
@@ -116,14 +118,12 @@ pub fn identify(
     // 3. Noise and MAP estimate, without undeclared disturbances.
     let mut clean = exclude_disturbed(robot, &measurement, &mut logs, &mut report_progress)?;
 
-    let signs = encoder_offsets::wrong_signs(&measurement, &training_logs(&logs), &clean.estimate);
-
     // 4. Gains of the F/T sensors.
-    let gain = match robot.calibrated.gain {
-        Gain::Auto if measurement.unknowns().sensors.is_empty() => Gain::None,
-        Gain::Auto => Gain::Full,
-        wanted => wanted,
-    };
+    let GainChoice {
+        gain,
+        finding: gain_finding,
+        retention,
+    } = choose_gain(&mut measurement, &mut logs, &clean.estimate)?;
     let calibrated = Kind {
         gain,
         ..robot.calibrated
@@ -153,27 +153,34 @@ pub fn identify(
         inputs.clone(),
         calibrated,
         estimate,
+        retention,
         &mut report_progress,
     )?;
 
+    // 6. Structural vibration.
+    report_progress("structural vibration".into(), 0.75);
+    identified = without_vibration(
+        &measurement,
+        &mut logs,
+        inputs,
+        calibrated,
+        identified,
+        &mut report_progress,
+    )?;
     identified.findings.extend(not_converged);
+    identified.findings.extend(gain_finding);
     identified
         .findings
         .extend(not_available(robot, &identified.inputs));
 
-    // 6. Disturbances in validation logs, encoder errors, delays.
+    // 7. Disturbances in validation logs, encoder errors, delays.
     undeclared::report_validation(&measurement, &mut logs, &identified);
     let training = training_logs(&logs);
     report_progress("figures".into(), 0.88);
-    // A wrong sign looks like offsets of other joints.
-    let encoder_offsets = if signs.is_empty() {
-        encoder_offsets::encoder_errors(&measurement, &training, &identified)
-    } else {
-        signs
-    };
+    let encoder_offsets = encoder_offsets::encoder_errors(&measurement, &training, &identified);
     let (time_offsets, delays) = delay::delays(&measurement, &training, &identified);
 
-    // 7. Figures.
+    // 8. Figures.
     let diagnosis = Diagnosis {
         encoder_offsets,
         time_offsets,
@@ -289,13 +296,6 @@ fn plausible_model<'a>(
         return Ok(ControlFlow::Break(Box::new(outcome)));
     }
 
-    // Gravity.
-    if let Some(wrong) = gravity::wrong(&measurement, &training) {
-        let mut outcome = assemble::nothing(robot, logs, wrong.text.clone());
-        outcome.findings.push(wrong);
-        return Ok(ControlFlow::Break(Box::new(outcome)));
-    }
-
     // ... and in each log alone.
     let found = sensor_frame::wrong_alone(&measurement, &training, logs);
     let before = training.len();
@@ -328,6 +328,52 @@ fn surveyed_again<'a>(
     Ok(Some(MeasurementModel::for_observations(
         robot, inputs, instants,
     )?))
+}
+
+/// Subtracts structural vibration, if other sensors observe it, from all logs and fits again.
+fn without_vibration(
+    measurement: &MeasurementModel<'_>,
+    logs: &mut [TrainingLog],
+    inputs: Vec<IdentificationInput>,
+    calibrated: Kind,
+    identified: Identified,
+    progress: &mut dyn FnMut(String, f64),
+) -> Result<Identified, IdentifyError> {
+    let Some(vibration) = StructuralVibration::find(
+        measurement,
+        &sample(measurement, &training_logs(logs)),
+        &identified.noise,
+        &identified.d,
+    ) else {
+        return Ok(identified);
+    };
+    for log in &mut *logs {
+        vibration.apply(measurement, &mut log.instants, &log.offset_jumps);
+    }
+    // Rounds start again here: their fraction done is not shown.
+    let mut progress = |step: String, _| progress(format!("{step}, vibration subtracted"), 0.75);
+    let training = training_logs(logs);
+    let estimate = alternate_noise_and_map(
+        measurement.robot(),
+        measurement,
+        &training,
+        OffsetDrift::AsStated,
+        Some(identified.noise),
+        &mut progress,
+    )?;
+    let mut identified = cross_validated_fit(
+        measurement,
+        &training,
+        inputs,
+        calibrated,
+        estimate,
+        None,
+        &mut progress,
+    )?;
+    identified
+        .findings
+        .extend(vibration_findings(measurement, &vibration));
+    Ok(identified)
 }
 
 /// What the configuration requests but the inputs do not contain.
@@ -369,6 +415,37 @@ fn not_available(robot: &Robot, inputs: &[IdentificationInput]) -> Vec<Finding> 
         notes.push(note(FindingCode::RotorsNotAvailable, key, text));
     }
     notes
+}
+
+/// A note for each sub-tree whose structural vibration was subtracted.
+fn vibration_findings(
+    measurement: &MeasurementModel<'_>,
+    vibration: &StructuralVibration,
+) -> Vec<Finding> {
+    let robot = measurement.robot();
+    let names = |sensors: &[usize]| -> String {
+        let names: Vec<String> = sensors
+            .iter()
+            .map(|s| channels::sensor_name(robot, *s))
+            .collect();
+        names.join(" and ")
+    };
+    let own = measurement.sensors_of_subtrees();
+    let parts = vibration.parts.iter();
+    parts
+        .map(|part| Finding {
+            severity: Severity::Note,
+            code: FindingCode::StructuralVibration,
+            subject: names(&own[part.subtree]),
+            text: format!(
+                "structural vibration that the encoders do not show: {:.0} % of the fast part of \
+                 the imbalance at {} is observed by {}, and is subtracted",
+                100.0 * part.explained,
+                names(&own[part.subtree]),
+                names(&part.sensors)
+            ),
+        })
+        .collect()
 }
 
 /// An estimate from which undeclared disturbances are excluded.
@@ -526,13 +603,15 @@ fn with_gains(
 }
 
 /// Cross-validates an estimate and fits all instants with the noise that this shows; the change
-/// from CAD is shrunk to the retained fraction.
+/// from CAD is shrunk to the retained fraction. `retention`: the cross-validation, if it was done
+/// already.
 fn cross_validated_fit(
     measurement: &MeasurementModel<'_>,
     training: &[&TrainingLog],
     inputs: Vec<IdentificationInput>,
     calibrated: Kind,
     estimate: NoiseAndMap,
+    retention: Option<Retention>,
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<Identified, IdentifyError> {
     let unknowns = measurement.unknowns().clone();
@@ -540,23 +619,21 @@ fn cross_validated_fit(
     let NoiseAndMap {
         prior,
         noise,
-        fit: Fit { tau, x, .. },
+        fit: Fit { tau, .. },
         change,
         ..
     } = estimate;
     progress("cross-validation".into(), 0.69);
     let sampled = sample(measurement, training);
-    let mut retention = cross_validation::held_out(measurement, &prior, &sampled, &noise, tau)?;
+    let mut retention = match retention {
+        Some(retention) => retention,
+        None => cross_validation::held_out(measurement, &prior, &sampled, &noise, tau)?,
+    };
     retention.findings.extend(unsettled(change));
     // The fit has absorbed a part of the noise of its own data, most of all noise that is as slow
     // as the motion.
     let walk_limits = walk_limits(measurement.robot(), &unknowns, OffsetDrift::AsStated);
-    let mut noise = retention.noise(measurement, &sampled, noise, &walk_limits);
-    // Of the seconds that were not sampled, too.
-    let left = map_segments(measurement, &segments, |measurement, _, segment| {
-        residuals(measurement, segment, &noise, std::slice::from_ref(&x))
-    });
-    noise.seconds = Seconds::of(&unknowns, &segments, &left, 0);
+    let noise = retention.noise(measurement, &sampled, noise, &walk_limits);
     let reduced = map_segments(measurement, &segments, |measurement, _, segment| {
         reduce(measurement, segment, &noise)
     });
@@ -606,6 +683,7 @@ mod tests {
             span: (instants[0].t, instants[instants.len() - 1].t),
             torque_rate: 0.0,
             instants: instants.to_vec(),
+            offset_jumps: Vec::new(),
             excluded: Vec::new(),
             findings: Vec::new(),
             refused: false,

@@ -1,7 +1,7 @@
 //! The logs of an identification: the observations that can be used, why others are excluded, and
 //! the segments in which they are processed.
 
-use crate::dataset::defects::Defect;
+use crate::dataset::defects::{Defect, OffsetJump};
 use crate::dataset::observation::{Annotated, Observation, UnitSet};
 use crate::dataset::{Dataset, Role};
 use crate::finding::{Finding, FindingCode, Severity};
@@ -18,7 +18,8 @@ use std::collections::BTreeMap;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Excluded {
     /// The reason, in a few words: `contact declared: hand (the links that it touches)`, `contact
-    /// suspected: the links at l_arm_ft_sensor`, `another load: l_hand`, `stale of knee`, or that they are too
+    /// suspected: the links at l_arm_ft_sensor`, `offset jump: the links at l_arm_ft_sensor`,
+    /// `another load: l_hand`, `outlier of r_leg_ft_sensor`, `stale of knee`, or that they are too
     /// close to an end or a gap for accelerations.
     pub reason: String,
     /// Number of observations.
@@ -51,6 +52,7 @@ pub(crate) struct TrainingLog {
     /// Sample rate of the fastest joint torque \[Hz\]; 0 if there is none.
     pub torque_rate: f64,
     pub instants: Vec<Annotated>,
+    pub offset_jumps: Vec<OffsetJump>,
     pub excluded: Vec<Excluded>,
     pub findings: Vec<Finding>,
     pub refused: bool,
@@ -85,6 +87,12 @@ impl TrainingLog {
             .iter()
             .any(|finding| finding.severity == Severity::Refusal);
         self.findings.extend(findings);
+    }
+
+    /// All findings of the log, offset jumps included.
+    pub(crate) fn all_findings(&self) -> Vec<Finding> {
+        let jumps = self.offset_jumps.iter().map(|b| finding(&b.jump));
+        self.findings.iter().cloned().chain(jumps).collect()
     }
 }
 
@@ -198,6 +206,7 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
         name: file,
         role,
         instants: all,
+        offset_jumps: breaks,
         defects,
         torque_rate,
         ..
@@ -241,11 +250,13 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
         }
         let mut excluded = Vec::new();
         for (channel, fault) in robot.channels.iter().zip(&instant.faults) {
-            if let ChannelRole::Sensor(sensor) = channel.role
-                && *fault != Reason::None
-            {
-                leave_out(format!("{} of {}", fault.word(), channel.name), t);
-                excluded.push(sensor);
+            if let ChannelRole::Sensor(sensor) = channel.role {
+                let outlier = instant.outliers.contains(sensor);
+                if *fault != Reason::None || outlier {
+                    let why = if outlier { "outlier" } else { fault.word() };
+                    leave_out(format!("{why} of {}", channel.name), t);
+                    excluded.push(sensor);
+                }
             }
         }
         for contact in instant.active.difference(&robot.always).iter() {
@@ -273,6 +284,7 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
         torque_rate,
         refused: refused || instants.len() < MIN_FOLD,
         instants,
+        offset_jumps: breaks,
         excluded: reasons.into_values().collect(),
         findings,
         disturbed: Vec::new(),
@@ -329,11 +341,10 @@ pub(crate) fn finding(defect: &Defect) -> Finding {
         Defect::Still { channel } => (FindingCode::JointStill, channel.clone()),
         Defect::Saturated { channel, .. } => (FindingCode::Saturated, channel.clone()),
         Defect::WrongUnits { channels, .. } => (FindingCode::WrongUnits, channels.join(", ")),
-        Defect::Derivative { joint, .. } | Defect::NoisyDerivative { joint, .. } => {
-            (FindingCode::Derivative, joint.clone())
-        }
+        Defect::Derivative { joint, .. } => (FindingCode::Derivative, joint.clone()),
         Defect::NoMotion { .. } => (FindingCode::NoMotion, String::new()),
         Defect::TooShort { .. } => (FindingCode::TooShort, String::new()),
+        Defect::Jump { channel, .. } => (FindingCode::OffsetJump, channel.clone()),
         Defect::Outliers { channel, .. } => (FindingCode::Outliers, channel.clone()),
         Defect::WrongSign { sensor } => (FindingCode::WrongSign, sensor.clone()),
         Defect::WrongFrame { sensor, .. } => (FindingCode::WrongFrame, sensor.clone()),
@@ -362,13 +373,13 @@ pub(crate) fn map_segments<'a, T: Send>(
 /// All instants of all logs, in segments of at most `most`.
 pub(crate) fn segments_of<'a>(training: &[&'a TrainingLog], most: usize) -> Vec<Segment<'a>> {
     let mut segments = Vec::new();
-    for (number, log) in training.iter().enumerate() {
+    for log in training {
         let count = log.instants.len().div_ceil(most).max(1);
-        for part in 0..count {
+        for number in 0..count {
             let at = |k: usize| log.instants.len() * k / count;
             segments.push(Segment {
-                instants: &log.instants[at(part)..at(part + 1)],
-                log: Some(number),
+                instants: &log.instants[at(number)..at(number + 1)],
+                offset_jumps: &log.offset_jumps,
             });
         }
     }

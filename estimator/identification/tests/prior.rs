@@ -1,12 +1,16 @@
-//! Tests of the prior against independent formulas: divergence by determinants and finite
-//! differences, minima by their optimality conditions, the weight on bodies drawn from the prior.
+//! Tests of the prior and of physical consistency against independent formulas: divergence by
+//! determinants and finite differences, minima by their optimality conditions, the weight on bodies
+//! drawn from the prior, base parameters of random robots, impossible bodies.
 
 #[path = "../../dynamics/tests/common/mod.rs"]
 mod common;
 
-use common::Random;
+use common::{Random, RandomRobot, gap, humanoid};
 use nalgebra::{DMatrix, DVector, Matrix4};
+use proprio_dynamics::model::Model;
+use proprio_dynamics::regressor::identifiable::{Identifiable, Measured, Offsets, Regime, Scope};
 use proprio_dynamics::spatial::{Mat3, Pose, RigidInertia, Vec3};
+use proprio_identification::prior::feasibility::{Consistent, Lacking, Verdict, nearest};
 use proprio_identification::prior::{
     Fit, GREATEST_TAU, LEAST_MASS, LEAST_RADIUS, Posterior, Prior, PriorError,
 };
@@ -581,4 +585,244 @@ fn data_without_information_leave_the_weakest_weight() {
         .maximise_evidence()
         .unwrap();
     assert!(fit.tau < 0.02, "{}", fit.tau);
+}
+
+// ----------------------------------------------------------------------------
+// Consistency
+// ----------------------------------------------------------------------------
+
+fn subspace(model: &Model) -> Identifiable {
+    Identifiable::new(
+        model,
+        Scope::Tree,
+        &Regime::free(model),
+        Measured::Wrench,
+        Offsets::Known,
+    )
+    .unwrap()
+}
+
+fn inertia(model: &Model) -> Vec<RigidInertia> {
+    model.inertias().to_vec()
+}
+
+/// The nearest bodies to base parameters `pi = B^T [phi | s]` of all links: `|R pi - z|^2`. Extra
+/// parameters (offsets) outside the basis are held at zero.
+fn nearest_to_base(
+    prior: &Prior,
+    cad: &[RigidInertia],
+    basis: &DMatrix<f64>,
+    data: &DMatrix<f64>,
+    right: &DVector<f64>,
+) -> Consistent {
+    let extra = basis.nrows() - 10 * cad.len();
+    let rows = data * basis.transpose();
+    let right = right - &rows * parameters(cad).insert_rows(10 * cad.len(), extra, 0.0);
+    let precision = (rows.amax() * 1e-9).powi(2);
+    nearest(
+        prior,
+        &all(cad.len()),
+        &rows,
+        &right,
+        &vec![precision; extra],
+    )
+    .unwrap()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig {
+        cases: 30,
+        failure_persistence: None,
+        ..ProptestConfig::default()
+    })]
+
+    /// All base parameters of a random robot without noise are fitted by physical bodies, the
+    /// nearest to CAD.
+    #[test]
+    fn base_parameters_are_recovered(seed in 0..u64::MAX) {
+        let random = &mut Random::new(seed);
+        let links = 2 + random.below(7);
+        let model = RandomRobot::new(links, random).model();
+        let cad = inertia(&model);
+        let prior = Prior::new(&cad).unwrap();
+        let basis = subspace(&model).basis().clone();
+        let truth: Vec<_> =
+            (0..cad.len()).map(|link| deformed(prior.reference(link), 0.2, random)).collect();
+        let wanted = basis.transpose() * parameters(&truth);
+        let data = normals(wanted.len(), wanted.len(), random).qr().r() * 1e4;
+        let right = &data * &wanted;
+        let found = nearest_to_base(&prior, &cad, &basis, &data, &right);
+        prop_assert_eq!(&found.verdict, &Verdict::Feasible);
+        prop_assert!(found.bodies.iter().all(is_body));
+        let phi = parameters(&found.bodies);
+        let got = basis.transpose() * &phi;
+        prop_assert!((&got - &wanted).amax() < 1e-7 * wanted.amax(), "{}", (got - wanted).amax());
+        prop_assert_eq!(found.rank, basis.ncols());
+        // Optimality in every direction that the data do not determine: the divergence's gradient
+        // has no component there.
+        let mut gradient = DVector::zeros(phi.len());
+        for (link, body) in found.bodies.iter().enumerate() {
+            let own = prior.gradient(link, &body.parameters());
+            gradient.rows_mut(10 * link, 10).copy_from_slice(&own);
+        }
+        let unseen = &gradient - &basis * (basis.transpose() * &gradient);
+        let (rest, size) = (unseen.amax(), gradient.amax());
+        prop_assert!(rest < 1e-4 * (1e-3 + size), "{rest} of {size}");
+    }
+}
+
+fn sentence(found: &Consistent) -> String {
+    found.describe(|link| ["base", "upper arm", "forearm", "hand"][link])
+}
+
+/// A negative mass, then a negative moment of inertia, of one link of four, with data about all
+/// parameters or about base parameters only.
+#[test]
+fn infeasible_links_are_reported() {
+    let random = &mut Random::new(21);
+    let cad = bodies(4, random);
+    let prior = Prior::new(&cad).unwrap();
+    let links = all(4);
+    for weight in [1e2, 1e4, 1e7] {
+        for culprit in 0..4 {
+            let data = unit_scale(4) * weight;
+            let mut required = DVector::zeros(40);
+            required[10 * culprit] = -0.5 - cad[culprit].mass;
+            required
+                .rows_mut(10 * culprit + 1, 3)
+                .copy_from(&-cad[culprit].first_moment);
+            let found = nearest(&prior, &links, &data, &(&data * &required), &[]).unwrap();
+            assert!(found.bodies.iter().all(is_body));
+            let Verdict::Infeasible(violations) = &found.verdict else {
+                panic!("{weight} {culprit} {:?}", found.verdict)
+            };
+            assert_eq!(violations[0].link, culprit, "{violations:?}");
+            assert_eq!(violations[0].lacking, Lacking::Mass);
+            assert!(
+                violations[0].required < 0.0 && violations[0].share > 0.5,
+                "{violations:?}"
+            );
+            // The nearest body has no mass: at most half a kilogram is missing.
+            assert!(
+                found.deviations() <= 0.5 * weight * 1.001 && found.deviations() > 0.3 * weight,
+                "{}",
+                found.deviations()
+            );
+            assert!(
+                sentence(&found)
+                    .contains(["'base'", "'upper arm'", "'forearm'", "'hand'"][culprit]),
+                "{}",
+                sentence(&found)
+            );
+        }
+    }
+
+    // A chain of revolute joints, base parameters only. Mass can move to a neighbour, the hand's
+    // moment of inertia about its joint's axis cannot.
+    let link = |name: &str| {
+        format!(
+            "<link name=\"{name}\"><inertial><origin xyz=\"0.02 0 0.1\"/><mass value=\"1\"/>\
+             <inertia ixx=\"0.006\" ixy=\"0\" ixz=\"0\" iyy=\"0.005\" iyz=\"0\" \
+             izz=\"0.004\"/></inertial></link>"
+        )
+    };
+    let joint = |name: &str, parent: &str, child: &str, axis: &str| {
+        format!(
+            "<joint name=\"{name}\" type=\"continuous\"><parent link=\"{parent}\"/><child \
+             link=\"{child}\"/><origin xyz=\"0 0 0.2\"/><axis xyz=\"{axis}\"/></joint>"
+        )
+    };
+    let urdf = ["base", "upper", "fore", "hand"].map(link).concat()
+        + &joint("a", "base", "upper", "0 1 0")
+        + &joint("b", "upper", "fore", "1 0 0")
+        + &joint("c", "fore", "hand", "0 0 1");
+    let model = Model::from_urdf(&format!("<robot name=\"arm\">{urdf}</robot>"), &[]).unwrap();
+    let cad = inertia(&model);
+    let hand = (0..4)
+        .find(|&link| model.link_name(link) == "hand")
+        .unwrap();
+    let prior = Prior::new(&cad).unwrap();
+    let basis = subspace(&model).basis().clone();
+    let mut phi = parameters(&cad);
+    phi[10 * hand + 9] = -0.002;
+    let data = DMatrix::identity(basis.ncols(), basis.ncols()) * 1e5;
+    let right = &data * (basis.transpose() * &phi);
+    let found = nearest_to_base(&prior, &cad, &basis, &data, &right);
+    let Verdict::Infeasible(violations) = &found.verdict else {
+        panic!("{:?}", found.verdict)
+    };
+    assert_eq!(violations[0].link, hand, "{violations:?}");
+    let Lacking::Extent(axis) = violations[0].lacking else {
+        panic!("{violations:?}")
+    };
+    assert!(axis.z.abs() < 0.3, "across the joint's axis: {axis}");
+    // With more noise the same data are feasible.
+    let data = DMatrix::identity(basis.ncols(), basis.ncols()) * 1e3;
+    let right = &data * (basis.transpose() * &phi);
+    let found = nearest_to_base(&prior, &cad, &basis, &data, &right);
+    assert_eq!(found.verdict, Verdict::Feasible, "{}", found.deviations());
+}
+
+/// Bodies inside and at the boundary of the feasible set (a flat one, a point), with the stated
+/// noise: no more false alarms than stated.
+#[test]
+fn feasible_bodies_give_no_false_alarms() {
+    let (mut alarms, mut most) = (0, 0.0_f64);
+    for seed in 0..50 {
+        let random = &mut Random::new(seed);
+        let cad = bodies(3, random);
+        let prior = Prior::new(&cad).unwrap();
+        let mut truth: Vec<_> = cad.iter().map(|body| deformed(body, 0.2, random)).collect();
+        if seed % 2 == 1 {
+            truth[1] = RigidInertia::from_centroidal(1.0, &random.vector(0.1), &Mat3::zeros());
+        }
+        let rows = 12 + random.below(20);
+        let data = normals(rows, 30, random) * unit_scale(3) * 10_f64.powf(1.5 + random.real(1.5));
+        let noise = DVector::from_fn(rows, |_, _| normal(random));
+        let right = &data * (parameters(&truth) - parameters(&cad)) + noise;
+        let found = nearest(&prior, &all(3), &data, &right, &[]).unwrap();
+        assert!(found.bodies.iter().all(is_body));
+        alarms += usize::from(found.verdict != Verdict::Feasible);
+        most = most.max(found.excess / found.limit);
+    }
+    assert!(alarms == 0, "{alarms} of 50 instead of one in a thousand");
+    assert!(
+        most > 0.01,
+        "bodies at the boundary should have an excess: {most}"
+    );
+}
+
+/// Offsets and other extra parameters, with a weak prior or none, and a robot of 39 links.
+#[test]
+fn nearest_bodies_are_found_beside_extra_parameters() {
+    let (urdf, _) = humanoid();
+    let model = Model::from_urdf(&urdf, &[]).unwrap();
+    let random = &mut Random::new(2);
+    let cad = inertia(&model);
+    let prior = Prior::new(&cad).unwrap();
+    let identifiable = Identifiable::new(
+        &model,
+        Scope::Tree,
+        &Regime::free(&model),
+        Measured::Wrench,
+        Offsets::Unknown,
+    )
+    .unwrap();
+    let basis = identifiable.basis().clone();
+    let truth: Vec<_> = cad.iter().map(|body| deformed(body, 0.1, random)).collect();
+    let mut values = parameters(&truth).insert_rows(10 * cad.len(), 6, 0.0);
+    values
+        .rows_mut(10 * cad.len(), 6)
+        .copy_from(&DVector::from_fn(6, |_, _| random.real(20.0)));
+    let wanted = basis.transpose() * &values;
+    let data = DMatrix::from_diagonal(&DVector::from_fn(wanted.len(), |_, _| {
+        10_f64.powf(4.0 + random.real(1.0))
+    }));
+    let found = nearest_to_base(&prior, &cad, &basis, &data, &(&data * &wanted));
+    assert_eq!(found.verdict, Verdict::Feasible);
+    let mut phi = parameters(&found.bodies).insert_rows(10 * cad.len(), 6, 0.0);
+    phi.rows_mut(10 * cad.len(), 6)
+        .copy_from(&found.x.rows(10 * cad.len(), 6));
+    let miss = gap((basis.transpose() * phi).as_slice(), wanted.as_slice());
+    assert!(miss < 1e-6 * wanted.amax(), "{miss}");
 }

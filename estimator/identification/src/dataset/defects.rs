@@ -20,6 +20,17 @@ pub enum Units {
     NotMetresPerSecondSquared,
 }
 
+/// An offset jump of an F/T sensor, judged by its readings.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OffsetJump {
+    /// The sensor.
+    pub sensor: usize,
+    /// Time of the jump.
+    pub t: Nanos,
+    /// Its evidence: a [`Defect::Jump`].
+    pub jump: Defect,
+}
+
 /// Something wrong with a log. [`fmt::Display`] states what, where, how much, and what to do.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
@@ -137,15 +148,6 @@ pub enum Defect {
         /// The ratio of the true derivative to the given one.
         factor: f64,
     },
-    /// A given derivative that is noisier than the one of the positions, and is not used.
-    NoisyDerivative {
-        /// The joint.
-        joint: String,
-        /// `velocity` or `acceleration`.
-        given: &'static str,
-        /// RMS of its difference from the derivative of the positions, SI.
-        off: f64,
-    },
     /// The robot does not move.
     NoMotion {
         /// The largest motion of any joint \[rad or m\].
@@ -159,6 +161,17 @@ pub enum Defect {
         rows: u64,
         /// Where its time begins to run backward, if most samples were excluded because of that.
         backward: Option<Nanos>,
+    },
+    /// A reading that changes suddenly and permanently, unexplained by motion.
+    Jump {
+        /// The channel.
+        channel: String,
+        /// The quantity that changes the most.
+        axis: &'static str,
+        /// Time of the jump.
+        t: Nanos,
+        /// Its size \[N or Nm\].
+        size: f64,
     },
     /// Samples far from their neighbours.
     Outliers {
@@ -340,16 +353,6 @@ impl fmt::Display for Defect {
                 "joint/{joint}: the logged {given} must be multiplied by {factor:.4} to match the \
                  derivative of the other column: check its unit and sign, or remove the column"
             ),
-            Self::NoisyDerivative { joint, given, off } => write!(
-                f,
-                "joint/{joint}: the logged {given} is not that of the positions: {off:.3} {} off, \
-                 most of it noise; it is not used",
-                if *given == "velocity" {
-                    "rad/s"
-                } else {
-                    "rad/s^2"
-                }
-            ),
             Self::NoMotion { most } => write!(
                 f,
                 "no joint moves by more than {most:.4} rad: without motion, weights are not \
@@ -375,6 +378,18 @@ impl fmt::Display for Defect {
             Self::TooShort { rows, .. } => write!(
                 f,
                 "the log of {rows} rows is too short: record at least {LEAST_ROWS}"
+            ),
+            Self::Jump {
+                channel,
+                axis,
+                t,
+                size,
+            } => write!(
+                f,
+                "{channel}: {axis} jumps by {size:.4} {} at {t} s and stays there, unexplained by \
+                 motion (a cable, internal stress, an undeclared contact): its offset is \
+                 re-initialised there",
+                unit(axis)
             ),
             Self::Outliers {
                 channel,

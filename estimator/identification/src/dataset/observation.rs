@@ -1,8 +1,8 @@
 //! Observations: the values of all channels at one time, and annotations by fits.
 
 use crate::robot::{Channel, ChannelRole};
-use proprio_dynamics::spatial::{Vec3, Wrench};
-use proprio_dynamics::{BitSet, ContactSet, FrameMotion};
+use proprio_dynamics::spatial::Wrench;
+use proprio_dynamics::{BitSet, ContactSet, FrameMotion, SensorSet};
 use proprio_topics::{Nanos, Reason};
 
 /// Parts of the robot whose equations hold or fail together: numbers of sub-trees, and
@@ -39,6 +39,9 @@ pub struct Observation {
     /// Per F/T sensor the temperature of its board \[degrees Celsius\], interpolated linearly; the
     /// first and the last sample are extrapolated as constants. NaN where none was recorded.
     pub temperatures: Vec<f64>,
+    /// F/T sensors whose reading is an outlier (a blow or a glitch): the motion does not explain
+    /// it, and no offset jump does.
+    pub outliers: SensorSet,
 }
 
 impl Observation {
@@ -81,13 +84,6 @@ impl Observation {
         self
     }
 
-    /// Adds a proper acceleration of the base.
-    #[must_use]
-    pub(crate) fn accelerated(mut self, by: &Vec3) -> Self {
-        self.base.proper_acceleration += by;
-        self
-    }
-
     /// Adds an offset to the position of a joint.
     #[must_use]
     pub(crate) fn moved(mut self, dof: usize, by: f64) -> Self {
@@ -107,6 +103,10 @@ pub(crate) struct Annotated {
     /// Units on which an undeclared disturbance (contact or load) was found to act: numbers of
     /// sub-trees, and [`Observation::TORQUES`] for measured joint torques.
     pub disturbed: UnitSet,
+    /// The wrenches that sub-trees need for structural vibration, which their encoders do not show,
+    /// where it is known: the sub-tree's number in the structure, and the wrench by all that it is
+    /// attached to, about its top link's origin and in that link's axes.
+    pub vibration: Vec<(usize, Wrench)>,
 }
 
 impl From<Observation> for Annotated {
@@ -116,6 +116,7 @@ impl From<Observation> for Annotated {
             observation,
             fitted: Vec::new(),
             disturbed: UnitSet::default(),
+            vibration: Vec::new(),
         }
     }
 }

@@ -1,7 +1,4 @@
-//! A load on any link that is picked up or put down within a log, or is there in one of several.
-//!
-//! Without it, .8 kg on the forearm in one of two logs raise the error on held-out torques from
-//! .7 % to several times that, and nothing names the cause.
+//! A load that is picked up or put down within a log.
 
 use crate::dataset::observation::{Annotated, Observation, UnitSet};
 use crate::hypothesis::needed;
@@ -10,7 +7,6 @@ use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::reduction::{Segment, reduce};
 use crate::measurement::unknowns::Unknowns;
-use crate::parallel;
 use crate::prior::Prior;
 use crate::training::{TrainingLog, map_segments};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
@@ -158,10 +154,10 @@ impl AddedBody {
 /// Looks for a load that changes within one of the logs, given the noise and the prior's scale
 /// `tau` of a fit to all of them.
 ///
-/// A log is divided into segments. For each boundary between two segments and each link: the gain
-/// is the reduction of the squared residuals by a body on that link in the segments after the
-/// boundary only, or in those before it only. The side that is excluded: with several logs, the one
-/// with the larger gain; with a single log, the shorter one.
+/// A log is divided into segments. For each boundary between two segments and each link at the end
+/// of a limb: the gain is the reduction of the squared residuals by a body on that link in the
+/// segments after the boundary only, or in those before it only. The side that is excluded: with
+/// several logs, the one with the larger gain; with a single log, the shorter one.
 pub(crate) fn find(
     measurement: &MeasurementModel<'_>,
     prior: &Prior,
@@ -170,12 +166,13 @@ pub(crate) fn find(
     tau: f64,
 ) -> Option<Load> {
     let unknowns = measurement.unknowns();
+    let model = &measurement.robot().model;
     let mut segments = Vec::new();
     let mut of_log: Vec<Range<usize>> = Vec::new();
     let segment_seconds = |log: &TrainingLog| {
         ((log.span.1 - log.span.0).seconds() / SEGMENTS as f64).max(SEGMENT_SECONDS)
     };
-    for (number, log) in training.iter().enumerate() {
+    for log in training {
         let first = segments.len();
         let seconds = segment_seconds(log);
         let mut start = 0;
@@ -187,7 +184,7 @@ pub(crate) fn find(
             if ends {
                 segments.push(Segment {
                     instants: &log.instants[start..i],
-                    log: Some(number),
+                    offset_jumps: &log.offset_jumps,
                 });
                 start = i;
             }
@@ -202,6 +199,14 @@ pub(crate) fn find(
     all.add_prior(prior, unknowns, tau);
     let factor = all.matrix.clone().cholesky()?;
     let x = factor.solve(&all.right);
+    let ends: Vec<usize> = (0..unknowns.links.len())
+        .filter(|&place| {
+            model
+                .joints()
+                .iter()
+                .all(|joint| joint.parent != unknowns.links[place])
+        })
+        .collect();
     // The threshold is that of a single test, because the noise still includes the load. The noise
     // of the fit without it decides.
     let least = needed(LINK_PARAMETERS, 1);
@@ -214,37 +219,27 @@ pub(crate) fn find(
         reduced[range.clone()]
             .iter()
             .for_each(|reduced| whole.add(reduced));
-        let mut test = |at: usize, before: &Normal, after: &Normal| {
-            // What one log has throughout more than the others is a load in it, not one that is
-            // missing.
-            let may_be = |added: &AddedBody| at > range.start || added.parameters[0] > 0.0;
-            let gains = parallel::map(unknowns.links.len(), |place| {
-                [after, before].map(|some| {
+        let mut before = Normal::new(unknowns.parameters());
+        for at in range.start + 1..range.end + 1 - LEAST_SEGMENTS {
+            before.add(&reduced[at - 1]);
+            if at < range.start + LEAST_SEGMENTS {
+                continue;
+            }
+            let after = Normal {
+                matrix: &whole.matrix - &before.matrix,
+                right: &whole.right - &before.right,
+            };
+            for &place in &ends {
+                let of = |some: &Normal| {
                     body(prior, unknowns, place, some, &factor, &x)
-                        .filter(|(added, _)| added.is_a_body() && may_be(added))
+                        .filter(|(added, _)| added.is_a_body())
                         .map_or(0.0, |(_, gain)| gain)
-                })
-            });
-            for (place, [later, earlier]) in gains.into_iter().enumerate() {
+                };
+                let (later, earlier) = (of(&after), of(&before));
                 let gain = later.max(earlier);
                 if gain > least && best.is_none_or(|best| gain > best.0.max(best.1)) {
                     best = Some((later, earlier, log, at, place));
                 }
-            }
-        };
-        let mut before = Normal::new(unknowns.parameters());
-        // With several logs, one of them may have the load throughout.
-        if training.len() > 1 {
-            test(range.start, &before, &whole);
-        }
-        for at in range.start + 1..range.end + 1 - LEAST_SEGMENTS {
-            before.add(&reduced[at - 1]);
-            if at >= range.start + LEAST_SEGMENTS {
-                let after = Normal {
-                    matrix: &whole.matrix - &before.matrix,
-                    right: &whole.right - &before.right,
-                };
-                test(at, &before, &after);
             }
         }
     }
@@ -275,9 +270,7 @@ pub(crate) fn find(
         }
     }
     // The change may be anywhere in the adjacent segment.
-    let (from, to) = if excluded == *range {
-        (excluded.start, excluded.end)
-    } else if is_after {
+    let (from, to) = if is_after {
         (excluded.start + 1, excluded.end)
     } else {
         (excluded.start, excluded.end - 1)
@@ -298,8 +291,7 @@ pub(crate) fn find(
 }
 
 /// The inertial parameters of a load, from the part of the log that was excluded for it and from
-/// all used data; and the place of the link that it is on, which shows better than when it was
-/// found, since the noise no longer contains it.
+/// all used data.
 pub(crate) fn added_body(
     measurement: &MeasurementModel<'_>,
     prior: &Prior,
@@ -308,7 +300,7 @@ pub(crate) fn added_body(
     noise: &NoiseModel,
     used: &Information,
     tau: f64,
-) -> Option<(usize, AddedBody)> {
+) -> Option<AddedBody> {
     let log = training.get(load.log)?;
     let is_clear = |instant: &&Annotated| load.clear.0 <= instant.t && instant.t <= load.clear.1;
     let first = log.instants.iter().position(|instant| is_clear(&instant))?;
@@ -317,7 +309,7 @@ pub(crate) fn added_body(
     measurement.include_disturbed(true);
     let segment = Segment {
         instants: &log.instants[first..first + count],
-        log: Some(load.log),
+        offset_jumps: &log.offset_jumps,
     };
     let reduced = reduce(&mut measurement, segment, noise);
     let unknowns = measurement.unknowns();
@@ -331,10 +323,5 @@ pub(crate) fn added_body(
     all.add_prior(prior, unknowns, tau);
     let factor = all.matrix.clone().cholesky()?;
     let x = factor.solve(&all.right);
-    let each = (0..unknowns.links.len()).filter_map(|place| {
-        let (added, gain) = body(prior, unknowns, place, &some, &factor, &x)?;
-        added.is_a_body().then_some((gain, place, added))
-    });
-    let (_, place, added) = each.max_by(|a, b| a.0.total_cmp(&b.0))?;
-    Some((place, added))
+    body(prior, unknowns, load.place, &some, &factor, &x).map(|(added, _)| added)
 }

@@ -1,6 +1,5 @@
 //! The noise of all channels: its white and slow parts, and the drift rates of the offsets.
 
-use crate::measurement::seconds::Seconds;
 use crate::measurement::unknowns::Unknowns;
 
 /// Upper limits of the drift rates of offsets (random walk).
@@ -26,8 +25,6 @@ pub(crate) struct NoiseModel {
     pub block: Vec<f64>,
     /// Per channel: lower limit of its variance.
     pub least: Vec<f64>,
-    /// Factors of the F/T channels' variances, per second of the training logs.
-    pub seconds: Seconds,
 }
 
 impl NoiseModel {
@@ -41,7 +38,6 @@ impl NoiseModel {
             drift: vec![0.0; channels],
             block: start,
             least,
-            seconds: Seconds::default(),
         }
     }
 
