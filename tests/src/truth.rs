@@ -495,7 +495,7 @@ mod tests {
             ..JointTorque::ABSENT
         };
         judge.on_estimate(t, &torques, &mut world);
-        judge.outcome("a robot".into(), None)
+        judge.outcome("a robot".into())
     }
 
     #[test]

@@ -205,7 +205,7 @@ impl Online {
         let solution = Solution {
             data: Nanos::MIN,
             components: components.iter().map(|c| c.unknown(cad, offsets)).collect(),
-            doubts: vec![Doubt::NONE; model.dof_count()],
+            doubts: vec![Doubt::COMPLETE; model.dof_count()],
         };
         let job = Box::new(Job {
             data: Nanos::MIN,

@@ -286,8 +286,7 @@ impl Bank {
             .components
             .iter_mut()
             .for_each(|own| own.leading = None);
-        // Before the first motion the torques are those of the setup as it is stated.
-        for unit in units.iter().filter(|unit| unit.fits[0].has_evidence()) {
+        for unit in units {
             let dofs = place.dofs(unit);
             let (leading, alternatives) = (unit.leading(), unit.alternatives());
             let of_component = &mut solution.components[unit.component].leading;
@@ -309,7 +308,10 @@ impl Bank {
                     }
                 }
                 for (&dof, deviation) in dofs.iter().zip(deviations) {
-                    let before = doubts[dof].unwrap_or(Doubt::NONE);
+                    let before = doubts[dof].unwrap_or(Doubt {
+                        deviation: 0.0,
+                        leading: None,
+                    });
                     doubts[dof] = Some(Doubt {
                         deviation: deviation.max(before.deviation),
                         leading: before.leading.or(leading),

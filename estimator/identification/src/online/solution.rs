@@ -248,9 +248,9 @@ pub struct Doubt {
 }
 
 impl Doubt {
-    /// Before anything has moved.
-    pub(crate) const NONE: Self = Self {
-        deviation: 0.0,
+    /// Before anything is known.
+    pub(crate) const COMPLETE: Self = Self {
+        deviation: f64::INFINITY,
         leading: None,
     };
 }

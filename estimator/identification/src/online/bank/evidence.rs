@@ -181,11 +181,6 @@ impl Fit {
         }
     }
 
-    /// Whether any tick has been learnt.
-    pub(super) fn has_evidence(&self) -> bool {
-        self.rows > 0.0
-    }
-
     pub(super) fn hypothesis(&self, branch: &Branch) -> Hypothesis {
         Hypothesis {
             view: self.view,
