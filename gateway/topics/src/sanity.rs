@@ -324,8 +324,8 @@ impl<const N: usize> Jumps<N> {
         }))
     }
 
-    /// The usual time between two readings \[s\]: one that comes early or late hardly changes it. Not
-    /// known before the second reading.
+    /// The usual time between two readings \[s\]: one that comes early or late hardly changes it.
+    /// Not known before the second reading.
     #[must_use]
     pub fn period(&self) -> f64 {
         self.0.first().map_or(0.0, |path| path.period)
