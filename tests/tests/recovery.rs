@@ -54,7 +54,8 @@ fn recovery(torques: &mut Reader<TorqueEstimate>, since: Nanos) -> (bool, String
     let recovered = until(PATIENCE, || {
         let turn = now();
         paused = paused.max(turn - std::mem::replace(&mut last, turn));
-        while let Some(estimate) = torques.try_take().expect("shared memory can be read") {
+        // A writer that is killed as it connects is an error that ends with the next attempt.
+        while let Ok(Some(estimate)) = torques.try_take() {
             if estimate.header.acquired <= since {
                 continue;
             }
