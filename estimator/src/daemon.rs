@@ -14,7 +14,7 @@ use crate::gateway_log::{ChannelStatus, GatewayLog};
 use crate::pipeline::{Job, Pipeline};
 use crate::setup::Setup;
 use anyhow::{Context, anyhow};
-use proprio_identification::online::{Online, Paused};
+use proprio_identification::online::{Hypothesis, Online, Paused};
 use proprio_identification::robot::Robot;
 use proprio_topics::ipc::{
     Domain, DomainConfig, DomainError, PortError, Reader, Topic, Watch, Writer, monotonic,
@@ -530,7 +530,9 @@ impl DataPlane {
                 groups: u32::try_from(identification.reported.len()).unwrap_or(0),
                 ..IdentificationHealth::default()
             };
-            for (component, (reported, changes)) in identification.reported.iter_mut().enumerate() {
+            for (component, (reported, changes, leading)) in
+                identification.reported.iter_mut().enumerate()
+            {
                 let Some((paused, counts)) = online.state(component) else {
                     continue;
                 };
@@ -559,6 +561,11 @@ impl DataPlane {
                 {
                     tracing::warn!(group, "{change}");
                 }
+                let likelier = online.solution().components.get(component);
+                let likelier = likelier.and_then(|own| own.leading);
+                if std::mem::replace(leading, likelier) != likelier {
+                    report_leading(group, likelier, &self.pipeline.setup().robot);
+                }
             }
             self.health.identification = sum;
         }
@@ -566,6 +573,19 @@ impl DataPlane {
         let _ = self.health_writer.send(&self.health, now);
         let _ = self.description_writer.update_connections();
         let _ = self.inertias.as_mut().map(Writer::update_connections);
+    }
+}
+
+/// Reports what is likelier than the configuration.
+fn report_leading(group: Option<&str>, likelier: Option<Hypothesis>, robot: &Robot) {
+    match likelier {
+        Some(hypothesis) => tracing::warn!(
+            group,
+            "the readings contradict the configuration: more likely, {}; torques that depend on \
+             it are withheld",
+            hypothesis.describe(robot)
+        ),
+        None => tracing::info!(group, "the readings agree with the configuration again"),
     }
 }
 
@@ -621,8 +641,9 @@ struct IdentificationThread {
     jobs: Option<mpsc::SyncSender<Job>>,
     done: mpsc::Receiver<Job>,
     thread: Option<std::thread::JoinHandle<()>>,
-    /// Per component, what was last reported: why it pauses, and its number of changes.
-    reported: Vec<(Paused, u64)>,
+    /// Per component, what was last reported: why it pauses, its number of changes, and what is
+    /// likelier than the configuration.
+    reported: Vec<(Paused, u64, Option<Hypothesis>)>,
     /// Per component, the names of its F/T sensors.
     groups: Vec<String>,
 }
@@ -690,7 +711,7 @@ impl IdentificationThread {
             jobs: Some(jobs),
             done,
             thread: Some(thread),
-            reported: vec![(Paused::No, 0); groups.len()],
+            reported: vec![(Paused::No, 0, None); groups.len()],
             groups,
         })
     }

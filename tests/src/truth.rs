@@ -72,6 +72,8 @@ pub struct Outcome {
     pub deviation: f64,
     /// Why torques were withheld, and how often.
     pub withheld: BTreeMap<String, usize>,
+    /// The channel that has the trouble.
+    pub channel: Option<String>,
 }
 
 impl Outcome {
@@ -80,6 +82,19 @@ impl Outcome {
     pub fn is_broken(&self) -> bool {
         let [all, _, bad] = self.torques;
         bad as f64 > FEW * all as f64
+    }
+
+    /// The share of withheld torques that name the channel that has the trouble; NaN if there is
+    /// none, or if no torque is withheld.
+    #[must_use]
+    pub fn named(&self) -> f64 {
+        let Some(channel) = &self.channel else {
+            return f64::NAN;
+        };
+        let own = self.withheld.iter();
+        let own = own.filter(|(why, _)| why.split_once(':').is_some_and(|(_, c)| c == channel));
+        let all: usize = self.withheld.values().sum();
+        own.map(|(_, count)| count).sum::<usize>() as f64 / all as f64
     }
 
     /// The share of late torques that are valid.
@@ -95,6 +110,7 @@ pub struct Run {
     setup: Setup,
     world: World,
     series: Vec<Series>,
+    channel: Option<String>,
 }
 
 impl Run {
@@ -135,10 +151,12 @@ impl Run {
         let setup = setup.unwrap_or_else(|e| panic!("{}: {e}\n{}", robot.name, robot.config));
         let mut world = World::new(&robot, &setup, trouble, seed);
         let mut series = readings(&setup, &mut world, &offsets, random);
+        let mut channel = None;
         if let Trouble::Channel(kind, defect) = trouble {
             let from = series.iter().position(|s| s.kind == kind)?;
             let count = series.iter().filter(|s| s.kind == kind).count();
             let bad = random.below(count);
+            channel = Some(series[from + bad].name.clone());
             defect.apply(&mut series[from..from + count], bad, random);
         }
         Some(Self {
@@ -146,6 +164,7 @@ impl Run {
             setup,
             world,
             series,
+            channel,
         })
     }
 
@@ -224,7 +243,7 @@ impl Run {
         }
         pipeline.finish();
         drain(&mut pipeline);
-        judge.outcome(self.robot.name)
+        judge.outcome(self.robot.name, self.channel)
     }
 }
 
@@ -267,6 +286,7 @@ impl Judge {
                 worst: None,
                 deviation: f64::NAN,
                 withheld: BTreeMap::new(),
+                channel: None,
             },
         }
     }
@@ -317,8 +337,8 @@ impl Judge {
         }
     }
 
-    fn outcome(mut self, robot: String) -> Outcome {
-        self.outcome.robot = robot;
+    fn outcome(mut self, robot: String, channel: Option<String>) -> Outcome {
+        (self.outcome.robot, self.outcome.channel) = (robot, channel);
         self.deviations.sort_by(f64::total_cmp);
         if let Some(median) = self.deviations.get(self.deviations.len() / 2) {
             self.outcome.deviation = *median;

@@ -6,6 +6,7 @@
 //!     rows of each component -> block of 0.1 s -> gate -> [R | z]
 //! Online::take_job -> Job::run    any thread
 //!     [R | z] + prior -> bodies, offsets, covariance, noise, changes
+//!     ticks           -> what else than stated may be the case
 //! Online::give_back, Online::apply
 //!     the solution is in use from the stamp (snapshot + 1 s) on
 //! ```
@@ -44,11 +45,19 @@
 //! outermost links explain them better, the load has changed. Otherwise it remains a contact, for
 //! any duration.
 //!
+//! # Hypotheses
+//! Identification fits whatever is wrong with the setup, too: a reversed encoder is absorbed by the
+//! bodies. So what may be other than stated is weighed beside it (`bank`), with ten instants a
+//! second. A torque covers every hypothesis that is not refuted, and is withheld while another one
+//! is likelier than what is stated ([`Doubt`]). If a disturbance begins before a contact since the
+//! start is refuted, it may be the end of that contact. Then everything is learnt anew.
+//!
 //! # The parameters in use
 //! Initially CAD. Then the parameters that predict later readings better (`selection`), with the
 //! offsets that fit them best. The most probable parameters are solved every second, and judge new
 //! rows.
 
+mod bank;
 mod channel;
 mod rows;
 mod selection;
@@ -59,9 +68,13 @@ mod job;
 mod parameters;
 mod solution;
 
+pub use bank::{Hypothesis, Sight, View};
 pub use job::Job;
-pub use solution::{Change, ComponentSolution, Counts, Observation, OnlineError, Paused, Solution};
+pub use solution::{
+    Change, ComponentSolution, Counts, Doubt, Observation, OnlineError, Paused, Solution,
+};
 
+use bank::{Bank, Share, TICK, Tick};
 use component::{Component, KEPT, LARGE};
 use job::Part;
 use proprio_dynamics::regressor::LINK_PARAMETERS;
@@ -74,6 +87,7 @@ use proprio_topics::Nanos;
 
 use crate::linear::information::{InformationError, Panel};
 use crate::prior::Prior;
+use crate::robot::BaseMotion;
 use proprio_dynamics::model::Model;
 use proprio_dynamics::regressor::{StackedRegressor, Weighting};
 use proprio_dynamics::spatial::{RigidInertia, Wrench};
@@ -94,6 +108,10 @@ pub struct Online {
     is_overdue: bool,
     late: u64,
     solution: Solution,
+    /// Those since the last job are the first `tick_count`.
+    ticks: Vec<Tick>,
+    tick_count: usize,
+    last_tick: Nanos,
 }
 
 impl Online {
@@ -113,6 +131,7 @@ impl Online {
         base: usize,
         period: Nanos,
         relative: f64,
+        base_motion: &BaseMotion,
     ) -> Result<Self, OnlineError> {
         let kinematics = Kinematics::new(model, base)?;
         let mut stacked = StackedRegressor::new(structure);
@@ -172,10 +191,21 @@ impl Online {
         {
             drop(std::hint::black_box(Vec::<u8>::with_capacity(KEPT)));
         }
+        let shares: Vec<Share<'_>> = (components.iter())
+            .map(|component| Share {
+                subtrees: &component.subtrees,
+                intermittent: component.intermittent,
+            })
+            .collect();
+        let base = (base, base_motion);
+        let bank = Bank::new(model, structure, base, cad, offsets, &shares, relative)?;
+        let tick = Tick::new(model.dof_count(), structure.sensors().len());
+        let ticks = vec![tick; usize::try_from(2 * SOLVE.0 / TICK.0).unwrap_or(0)];
         let prior = Arc::new(Prior::new(cad)?.with_relative_std(relative));
         let solution = Solution {
             data: Nanos::MIN,
             components: components.iter().map(|c| c.unknown(cad, offsets)).collect(),
+            doubts: vec![Doubt::COMPLETE; model.dof_count()],
         };
         let job = Box::new(Job {
             data: Nanos::MIN,
@@ -186,6 +216,9 @@ impl Online {
                 .collect(),
             prior,
             solution: solution.clone(),
+            bank,
+            ticks: ticks.clone(),
+            tick_count: 0,
         });
         Ok(Self {
             stacked,
@@ -198,6 +231,9 @@ impl Online {
             is_overdue: false,
             late: 0,
             solution,
+            ticks,
+            tick_count: 0,
+            last_tick: Nanos::MIN,
         })
     }
 
@@ -357,6 +393,21 @@ impl Online {
         for (component, known) in self.components.iter_mut().zip(&self.solution.components) {
             component.observe(observation, &self.stacked, known, slot);
         }
+        if t.saturating_sub(TICK) >= self.last_tick
+            && let Some(tick) = self.ticks.get_mut(self.tick_count)
+        {
+            self.last_tick = t;
+            self.tick_count += 1;
+            let motion = (
+                observation.state,
+                &observation.base_motion,
+                kinematics.base(),
+            );
+            tick.copy_from(slot, motion, readings, active);
+            let moving = (self.components.iter().enumerate())
+                .filter(|(_, component)| component.is_moved(observation));
+            tick.moving = moving.fold(0, |bits, (number, _)| bits | bank::bit(number));
+        }
         Ok(())
     }
 
@@ -371,6 +422,8 @@ impl Online {
         self.is_away = true;
         self.snapshot = Some(self.newest);
         job.data = self.newest;
+        std::mem::swap(&mut job.ticks, &mut self.ticks);
+        job.tick_count = std::mem::take(&mut self.tick_count);
         for (part, component) in job.parts.iter_mut().zip(&mut self.components) {
             component.join();
             // Both have the same unknowns.
@@ -440,6 +493,9 @@ impl Online {
                 match change {
                     Change::Offset => component.counts.offset_changes += 1,
                     Change::Load => component.counts.load_changes += 1,
+                    Change::Anew => {
+                        (component.motion, component.rows) = (0.0, 0);
+                    }
                 }
                 component.pending.clear();
                 component.gathered.clear();
@@ -537,6 +593,7 @@ mod tests {
             0,
             period,
             0.2,
+            &BaseMotion::Imu(Pose::identity()),
         )
         .unwrap()
     }
@@ -576,6 +633,8 @@ mod tests {
                     joints: &joints,
                     moved: &DofSet::default(),
                     is_base_moved: true,
+                    state,
+                    base_motion: motion,
                     sensors: &fine,
                 };
                 online.observe(&observation).unwrap();

@@ -124,6 +124,9 @@ const fn hint(reason: Reason) -> &'static str {
         Reason::Unexplained => {
             ": nothing in the configuration carries the robot; add a [[contact]] where it is held"
         }
+        Reason::Contradicted => {
+            ": something else than configured explains the readings better; the log names it"
+        }
         _ => "",
     }
 }

@@ -196,6 +196,7 @@ impl OnlineIdentification {
             setup.robot.base_link,
             period,
             setup.robot.urdf_relative_std,
+            &setup.robot.base,
         )?;
         if let Some(parameters) = setup.state.identified() {
             let links: Vec<(usize, RigidInertia)> = parameters
@@ -442,6 +443,8 @@ impl OnlineIdentification {
             joints: &self.joints,
             moved: &self.moved,
             is_base_moved,
+            state,
+            base_motion: base,
             sensors: &self.sensors,
         });
     }

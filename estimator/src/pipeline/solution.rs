@@ -150,6 +150,8 @@ impl Pipeline {
             residual.is_some_and(|residual| residual.is_unexplained)
         };
         let unexplained = |dof: usize| structure.moved_by(dof).iter().copied().any(is_unexplained);
+        let identification = self.identification.as_ref();
+        let doubts = identification.map(|own| &own.online.solution().doubts);
         let robot = &self.setup.robot;
         let results = (results.zip(&self.dependences.torques).enumerate())
             .filter(|(dof, _)| robot.is_published(*dof));
@@ -159,9 +161,25 @@ impl Pipeline {
         ) in self.estimate.torques.joints.iter_mut().zip(results)
         {
             let (mut reason, mut cause) = validity.reason_and_cause(dependence);
-            let deviation = noise.hypot(*model).hypot(*motion).hypot(*located);
+            let doubt = doubts.and_then(|doubts| doubts.get(dof));
+            let least = doubt.map_or(0.0, |doubt| doubt.deviation);
+            let deviation = noise
+                .hypot(*model)
+                .hypot(*motion)
+                .hypot(*located)
+                .max(least);
             if reason == Reason::None && *certainty == Certainty::Assumed {
                 reason = Reason::Undetermined;
+            }
+            if reason == Reason::None
+                && let Some(leading) = doubt.and_then(|doubt| doubt.leading)
+            {
+                let channel = robot
+                    .channels
+                    .iter()
+                    .position(|c| Some(c.role) == leading.role());
+                let number = channel.and_then(|channel| u32::try_from(channel).ok());
+                (reason, cause) = (Reason::Contradicted, number.unwrap_or(NO_CAUSE));
             }
             if reason == Reason::None && unexplained(dof) {
                 reason = Reason::Unexplained;
@@ -175,7 +193,10 @@ impl Pipeline {
             {
                 reason = Reason::Uncertain;
             }
-            if !is_solved || !torque.is_finite() || !deviation.is_finite() {
+            if reason == Reason::None && least.is_infinite() {
+                reason = Reason::Uncertain;
+            }
+            if !is_solved || !torque.is_finite() || deviation.is_nan() {
                 (reason, cause) = (Reason::NotFinite, NO_CAUSE);
             }
             let is_valid = reason == Reason::None;

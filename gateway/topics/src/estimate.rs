@@ -44,6 +44,9 @@ pub enum Reason {
     /// A reading it depends on contradicts the ones before it, and no later one has confirmed it
     /// ([`Quality::IMPLAUSIBLE`]).
     Implausible = 13,
+    /// The readings contradict what is configured: something else explains them better, such as an
+    /// encoder reversed, a sensor turned, or a contact that has been there since the start.
+    Contradicted = 14,
 }
 
 coded!(Reason {
@@ -61,6 +64,7 @@ coded!(Reason {
     Unexplained = "unexplained",
     Frozen = "frozen",
     Implausible = "implausible",
+    Contradicted = "contradicted",
 });
 
 impl Reason {

@@ -33,7 +33,8 @@ fn main() -> ExitCode {
     let seeds = first.parse().expect("a seed")..=last.parse().expect("a seed");
     let (mut runs, mut broken) = (0, 0);
     println!(
-        "| trouble | broken | valid late | deviation / range | worst |\n|---|---|---|---|---|"
+        "| trouble | broken | valid late | deviation / range | named | worst |\n\
+         |---|---|---|---|---|---|"
     );
     for (name, trouble) in named(names) {
         let outcomes = all(seeds.clone().collect(), trouble);
@@ -99,5 +100,15 @@ fn line(outcomes: &[(u64, Outcome)]) -> (String, usize) {
     });
     let share = valid as f64 / all.max(1) as f64;
     let deviation = deviation.map_or_else(String::new, |d| format!("{d:.3}"));
-    (format!("{share:.2} | {deviation} | {worst}"), broken)
+    let mut named: Vec<f64> = of().map(Outcome::named).collect();
+    named.retain(|named| named.is_finite());
+    let count = named.len();
+    let named = match count {
+        0 => String::new(),
+        _ => format!("{:.2}", named.iter().sum::<f64>() / count as f64),
+    };
+    (
+        format!("{share:.2} | {deviation} | {named} | {worst}"),
+        broken,
+    )
 }

@@ -56,6 +56,7 @@ impl Limb {
 /// Sub-trees that are linked by sensors, and the information about them.
 #[derive(Clone, Debug)]
 pub(crate) struct Component {
+    pub(crate) subtrees: Vec<usize>,
     pub(crate) links: Vec<usize>,
     pub(crate) sensors: Vec<usize>,
     /// Joints whose motion its rows depend on, by the link where kinematics start.
@@ -281,6 +282,7 @@ impl Component {
                 innovations: vec![0.0; most],
             },
             kinds,
+            subtrees,
             links,
             sensors,
         }
@@ -289,6 +291,7 @@ impl Component {
     /// The initial solution.
     pub(crate) fn unknown(&self, cad: &[RigidInertia], offsets: &[Wrench]) -> ComponentSolution {
         ComponentSolution {
+            leading: None,
             links: self.links.clone(),
             bodies: self.links.iter().map(|&link| cad[link]).collect(),
             sensors: self.sensors.clone(),
@@ -385,8 +388,13 @@ impl Component {
             }
         }
         self.gathered.push(slot, &self.current_rows);
-        self.gathered.has_moved |=
-            seen.is_base_moved || !seen.moved.intersection(&self.dofs[base]).is_empty();
+        self.gathered.has_moved |= self.is_moved(seen);
+    }
+
+    /// Whether something moves that its rows depend on.
+    pub(crate) fn is_moved(&self, seen: &Observation<'_>) -> bool {
+        let base = seen.kinematics.base();
+        seen.is_base_moved || !seen.moved.intersection(&self.dofs[base]).is_empty()
     }
 
     /// Ends a block: gate, drift of the offsets, then rows are absorbed or rejected.

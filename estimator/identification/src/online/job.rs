@@ -2,6 +2,7 @@
 //! use.
 
 use crate::linear::information::{Information, Panel};
+use crate::online::bank::{Bank, Tick};
 use crate::online::channel::{Channel, SecondMean};
 use crate::online::component::{Component, channels};
 use crate::online::parameters::Parameters;
@@ -166,11 +167,23 @@ impl Part {
         }
     }
 
-    pub(crate) fn run(&mut self, prior: &Prior, data: Nanos, solution: &mut ComponentSolution) {
+    pub(crate) fn run(
+        &mut self,
+        prior: &Prior,
+        data: Nanos,
+        solution: &mut ComponentSolution,
+        may_end: bool,
+    ) {
         // A new load is in the information by now, but not in the parameters in use.
         let is_replaced = std::mem::take(&mut self.is_replaced);
         self.change = None;
-        let weighed = self.test_change(prior);
+        let weighed = if may_end {
+            self.change = Some((Change::Anew, Information::new(self.information.unknowns())));
+            self.is_replaced = true;
+            Ok(())
+        } else {
+            self.test_change(prior)
+        };
         self.update_noise();
         self.judge_candidates();
         self.failure = weighed.and_then(|()| self.solve(prior)).err();
@@ -584,6 +597,10 @@ pub struct Job {
     pub(crate) data: Nanos,
     pub(crate) parts: Vec<Part>,
     pub(crate) solution: Solution,
+    pub(crate) bank: Bank,
+    /// The first `tick_count` are new.
+    pub(crate) ticks: Vec<Tick>,
+    pub(crate) tick_count: usize,
 }
 
 impl Job {
@@ -592,9 +609,40 @@ impl Job {
     /// unknowns, longer if bodies have changed much, and allocates.
     pub fn run(&mut self) {
         self.solution.data = self.data;
-        for (part, solution) in self.parts.iter_mut().zip(&mut self.solution.components) {
-            part.run(&self.prior, self.data, solution);
+        for (number, (part, solution)) in
+            (self.parts.iter_mut().zip(&mut self.solution.components)).enumerate()
+        {
+            let may_end = part.is_disturbed && self.bank.may_have_begun_in_contact(number);
+            part.run(&self.prior, self.data, solution, may_end);
         }
+        self.weigh_hypotheses();
+    }
+
+    /// Weighs what may be other than stated.
+    fn weigh_hypotheses(&mut self) {
+        let mut decided = Vec::new();
+        for part in &self.parts {
+            let mut slots: Vec<i64> = part
+                .learnt
+                .iter()
+                .flat_map(rows::OfKind::slots)
+                .copied()
+                .collect();
+            slots.sort_unstable();
+            slots.dedup();
+            decided.push((slots.last().copied().unwrap_or(i64::MIN), slots));
+        }
+        let ticks = &self.ticks[..self.tick_count];
+        self.bank.learn(ticks, &decided);
+        for (number, part) in self.parts.iter().enumerate() {
+            match part.change {
+                Some((Change::Offset, _)) => self.bank.forget_offsets(number),
+                Some((Change::Load, _)) => self.bank.forget_loads(number),
+                Some((Change::Anew, _)) => self.bank.begin_anew(number),
+                None => {}
+            }
+        }
+        self.bank.doubt(&mut self.solution);
     }
 
     /// The result.

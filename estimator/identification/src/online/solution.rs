@@ -1,11 +1,12 @@
 //! Input and output of on-line identification: observations, solutions, and counts.
 
 use crate::linear::information::InformationError;
+use crate::online::bank::Hypothesis;
 use crate::prior::PriorError;
 use crate::robot::{Channel, ChannelRole, Robot};
 use nalgebra::DMatrix;
 use proprio_dynamics::spatial::{RigidInertia, Wrench};
-use proprio_dynamics::{ContactSet, DofSet, DynamicsError, Kinematics};
+use proprio_dynamics::{ContactSet, DofSet, DynamicsError, FrameMotion, JointState, Kinematics};
 use proprio_topics::{Nanos, Reason};
 
 /// Length of a block of rows that the gate judges.
@@ -52,6 +53,10 @@ pub struct Observation<'a> {
     pub moved: &'a DofSet,
     /// Whether the base has moved.
     pub is_base_moved: bool,
+    /// The joints' motion that gave the kinematics.
+    pub state: JointState<'a>,
+    /// The base link's motion that did.
+    pub base_motion: FrameMotion,
     /// Fault of each sensor's reading.
     pub sensors: &'a [Reason],
 }
@@ -131,6 +136,8 @@ pub enum Change {
     Offset,
     /// The load of the outermost links has changed, and their parameters are re-initialised.
     Load,
+    /// A contact since the start may have ended: everything is learnt anew.
+    Anew,
 }
 
 impl std::fmt::Display for Change {
@@ -140,6 +147,7 @@ impl std::fmt::Display for Change {
             Self::Load => {
                 "the load has changed: the parameters of the outermost links are re-initialised"
             }
+            Self::Anew => "a contact since the start may have ended: everything is identified anew",
         })
     }
 }
@@ -211,6 +219,8 @@ pub struct ComponentSolution {
     /// Whether this solution uses the data up to [`Solution::data`]. Otherwise the job failed, and
     /// the earlier solution is kept.
     pub is_accepted: bool,
+    /// What is likelier than the stated setup.
+    pub leading: Option<Hypothesis>,
     /// The most probable unknowns, `[s | d]`, and a root of their covariance over `[d | s]`. The
     /// gate judges new readings by them.
     pub(crate) estimate: Vec<f64>,
@@ -224,6 +234,25 @@ pub struct Solution {
     pub data: Nanos,
     /// The solution of each component.
     pub components: Vec<ComponentSolution>,
+    /// Per degree of freedom.
+    pub doubts: Vec<Doubt>,
+}
+
+/// What else than stated may be the case, as far as a torque depends on it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Doubt {
+    /// The least deviation of the torque, because of hypotheses that are not refuted \[Nm or N\].
+    pub deviation: f64,
+    /// What is likelier than the stated setup.
+    pub leading: Option<Hypothesis>,
+}
+
+impl Doubt {
+    /// Before anything is known.
+    pub(crate) const COMPLETE: Self = Self {
+        deviation: f64::INFINITY,
+        leading: None,
+    };
 }
 
 /// Period of the solutions, and the delay of their use after their data.

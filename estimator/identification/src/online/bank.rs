@@ -1,0 +1,518 @@
+//! Hypotheses about what may be other than stated: an encoder reversed, a sensor turned, a contact
+//! that has been there since the start. Their evidence says which of them the readings refute.
+//!
+//! ```text
+//! ticks (ten a second) -> rows of each hypothesis -> Gram matrix -> evidence -> refuted?
+//!                                                               -> torques  -> spread
+//! ```
+//!
+//! # Evidence
+//! Each hypothesis takes the readings in its own way ([`Hypothesis`]). Then the six equations of a
+//! sub-tree are linear in its parameters and offsets, and, for a contact since the start, in its
+//! steady force along the axes of the base. So the evidence has a closed form (`evidence.rs`).
+//!
+//! Ticks count in which something moves, for at rest nothing separates the hypotheses, and whose
+//! rows are learnt. Residuals beyond the stated noise are a misfit, which lasts: a second of them
+//! counts as one tick.
+//!
+//! # What follows
+//! A hypothesis is refuted when its odds against the likeliest one are below a millionth. Until
+//! then its torques may be the true ones. So the deviation of a torque is at least that of the
+//! hypothesis, and covers the torque of the hypothesis within [`COVERED`] deviations. If another
+//! hypothesis than the stated one is the likeliest, no torque is valid that depends on the sub-tree
+//! or its sensors.
+
+mod evidence;
+mod hypothesis;
+mod unit;
+
+pub use hypothesis::{Hypothesis, Sight, View};
+
+use crate::online::solution::{Doubt, OnlineError, Solution};
+use crate::prior::cad_root;
+use crate::robot::BaseMotion;
+use evidence::{Columns, Posterior, Rows, dot};
+use hypothesis::Motion;
+use proprio_dynamics::model::Model;
+use proprio_dynamics::regressor::{EstimateRows, LINK_PARAMETERS, StackedRegressor, Weighting};
+use proprio_dynamics::spatial::{RigidInertia, Wrench};
+use proprio_dynamics::{ContactSet, FrameMotion, JointState, Kinematics, Solver, Structure};
+use proprio_topics::Nanos;
+use std::collections::VecDeque;
+use unit::Unit;
+
+/// Deviations within which the torque of a hypothesis lies that is not refuted. At four, the
+/// promise, almost half of the room remains for the uncertainty of that torque itself.
+const COVERED: f64 = 2.5;
+/// Postures in which torques are compared, one in [`APART`] ticks: those of 10 s.
+const POSTURES: usize = 20;
+const APART: usize = 5;
+/// Ticks that wait for the gate, at most: those of 3 s.
+const MOST_WAITING: usize = 30;
+/// Period of the ticks.
+pub(crate) const TICK: Nanos = Nanos::from_millis(100);
+
+/// The readings at one time.
+#[derive(Clone, Debug)]
+pub(crate) struct Tick {
+    /// Its slot in the time grid.
+    pub(crate) slot: i64,
+    motion: Motion,
+    base_link: usize,
+    readings: Vec<Wrench>,
+    active: ContactSet,
+    /// The components that move, a bit each.
+    pub(crate) moving: u64,
+    /// Those that have learnt it.
+    learnt: u64,
+}
+
+impl Tick {
+    pub(crate) fn new(dofs: usize, sensors: usize) -> Self {
+        Self {
+            slot: 0,
+            motion: Motion::new(dofs),
+            base_link: 0,
+            readings: vec![Wrench::zero(); sensors],
+            active: ContactSet::EMPTY,
+            moving: 0,
+            learnt: 0,
+        }
+    }
+
+    /// Does not allocate.
+    pub(crate) fn copy_from(
+        &mut self,
+        slot: i64,
+        (state, base, base_link): (JointState<'_>, &FrameMotion, usize),
+        readings: &[Wrench],
+        active: &ContactSet,
+    ) {
+        self.motion.copy_from(state, base);
+        self.readings.copy_from_slice(readings);
+        (self.slot, self.base_link, self.active) = (slot, base_link, *active);
+    }
+}
+
+/// The bit of a component in [`Tick`].
+pub(crate) fn bit(component: usize) -> u64 {
+    1 << component.min(63)
+}
+
+/// What a component contributes.
+pub(crate) struct Share<'a> {
+    /// The sub-trees that can be free of contacts.
+    pub(crate) subtrees: &'a [usize],
+    /// The contacts on them that come and go.
+    pub(crate) intermittent: ContactSet,
+}
+
+/// All hypotheses about a robot. See the [module](self).
+#[derive(Clone, Debug)]
+pub(crate) struct Bank {
+    place: Place,
+    units: Vec<Unit>,
+    /// The stated variances of each sensor's channels, [torque; force].
+    variances: Vec<[f64; 6]>,
+    waiting: Vec<Tick>,
+    /// The last [`POSTURES`], and the ticks since then.
+    recent: VecDeque<Tick>,
+    since_last: usize,
+}
+
+/// The equations of the robot at a tick, as seen by a hypothesis.
+#[derive(Clone, Debug)]
+struct Place {
+    model: Model,
+    structure: Structure,
+    kinematics: Kinematics,
+    stacked: StackedRegressor,
+    solver: Solver,
+    motion: Motion,
+}
+
+impl Bank {
+    /// `relative` is the relative deviation of CAD parameters.
+    pub(crate) fn new(
+        model: &Model,
+        structure: &Structure,
+        base: (usize, &BaseMotion),
+        cad: &[RigidInertia],
+        offsets: &[Wrench],
+        shares: &[Share<'_>],
+        relative: f64,
+    ) -> Result<Self, OnlineError> {
+        let stacked = StackedRegressor::new(structure);
+        let mut units = Vec::new();
+        for (component, share) in shares.iter().enumerate() {
+            for &subtree in share.subtrees {
+                let own = &stacked.subtrees()[subtree];
+                let (links, sensors) = (own.links().to_vec(), own.sensors().collect::<Vec<_>>());
+                let parameters = links.iter().flat_map(|&link| cad[link].parameters());
+                let offsets = sensors
+                    .iter()
+                    .flat_map(|&sensor| offsets[sensor].torque_first());
+                let columns = Columns {
+                    reference: parameters.chain(offsets).collect(),
+                    roots: links
+                        .iter()
+                        .map(|&link| cad_root(&cad[link], relative))
+                        .collect(),
+                    links,
+                    sensors,
+                };
+                let robot = (model, structure);
+                let number = (component, subtree);
+                units.push(Unit::new(number, columns, robot, base, &share.intermittent));
+            }
+        }
+        let stated = structure.sensors().iter().map(|cut| {
+            let noise = Wrench::from_parts(cut.noise().force, cut.noise().torque);
+            noise.torque_first().map(|sigma| sigma * sigma)
+        });
+        Ok(Self {
+            units,
+            variances: stated.collect(),
+            place: Place {
+                kinematics: Kinematics::new(model, base.0)?,
+                stacked,
+                solver: Solver::new(structure),
+                motion: Motion::new(model.dof_count()),
+                model: model.clone(),
+                structure: structure.clone(),
+            },
+            waiting: Vec::new(),
+            recent: VecDeque::with_capacity(POSTURES),
+            since_last: APART,
+        })
+    }
+
+    /// Adds ticks. `decided` is the newest slot that each component has decided on, and the slots
+    /// that it has learnt.
+    pub(crate) fn learn(&mut self, ticks: &[Tick], decided: &[(i64, Vec<i64>)]) {
+        let newest = decided
+            .iter()
+            .map(|(newest, _)| *newest)
+            .max()
+            .unwrap_or(i64::MIN);
+        let waiting = std::mem::take(&mut self.waiting).into_iter();
+        let (now, later): (Vec<Tick>, Vec<Tick>) = waiting
+            .chain(ticks.iter().cloned())
+            .partition(|tick| tick.slot <= newest);
+        // If nothing is learnt, no tick is decided.
+        let old = later.len().saturating_sub(MOST_WAITING);
+        self.waiting = later.into_iter().skip(old).collect();
+        let Self {
+            place,
+            units,
+            variances,
+            recent,
+            since_last,
+            ..
+        } = self;
+        for mut tick in now {
+            for (component, (_, slots)) in decided.iter().enumerate() {
+                if slots.binary_search(&tick.slot).is_ok() {
+                    tick.learnt |= bit(component);
+                }
+            }
+            let is_learnt = |component: usize| tick.learnt & tick.moving & bit(component) != 0;
+            let mut views: Vec<View> = Vec::new();
+            for unit in units.iter().filter(|unit| is_learnt(unit.component)) {
+                views.extend(unit.fits.iter().map(|fit| fit.view));
+            }
+            while let Some(view) = views.pop() {
+                views.retain(|other| *other != view);
+                if !place.update(&tick, view) {
+                    continue;
+                }
+                for unit in units.iter_mut().filter(|unit| is_learnt(unit.component)) {
+                    let rows = Rows {
+                        rows: &place.stacked.subtrees()[unit.subtree],
+                        structure: &place.structure,
+                        kinematics: &place.kinematics,
+                        readings: &tick.readings,
+                        variances,
+                    };
+                    for fit in unit.fits.iter_mut().filter(|fit| fit.view == view) {
+                        fit.add(&unit.columns, &rows);
+                    }
+                }
+            }
+            if tick.learnt != 0 {
+                *since_last += 1;
+            }
+            if tick.learnt != 0 && *since_last >= APART {
+                *since_last = 0;
+                if recent.len() == POSTURES {
+                    recent.pop_front();
+                }
+                recent.push_back(tick);
+            }
+        }
+        self.weigh();
+    }
+
+    /// Weighs all hypotheses. What is wrong with the robot, rather than with one sub-tree, must be
+    /// compatible with the others, too.
+    fn weigh(&mut self) {
+        self.units.iter_mut().for_each(Unit::weigh);
+        let before = self.units.clone();
+        for (number, unit) in self.units.iter_mut().enumerate() {
+            unit.decide(|view, sight| {
+                let others = before
+                    .iter()
+                    .enumerate()
+                    .filter(|(other, _)| *other != number);
+                others
+                    .filter_map(|(_, other)| other.evidence(view, sight))
+                    .sum()
+            });
+        }
+    }
+
+    /// Sets the doubts about the torques of a solution, which is in use. Torques that can not be
+    /// compared keep theirs.
+    pub(crate) fn doubt(&mut self, solution: &mut Solution) {
+        let Self {
+            place,
+            units,
+            recent,
+            ..
+        } = self;
+        let in_use = place.in_use(solution);
+        let mut doubts: Vec<Option<Doubt>> = vec![None; solution.doubts.len()];
+        solution
+            .components
+            .iter_mut()
+            .for_each(|own| own.leading = None);
+        for unit in units {
+            let dofs = place.dofs(unit);
+            let (leading, alternatives) = (unit.leading(), unit.alternatives());
+            let of_component = &mut solution.components[unit.component].leading;
+            *of_component = of_component.or(leading);
+            for tick in recent
+                .iter()
+                .filter(|tick| tick.learnt & bit(unit.component) != 0)
+            {
+                let published = place.torques(tick, &Hypothesis::AS_STATED, &in_use, &dofs);
+                let mut deviations = vec![0.0_f64; dofs.len()];
+                for other in &alternatives {
+                    let torques = place.alternative(tick, (&unit.columns, other), &in_use, &dofs);
+                    let both = published.iter().zip(torques);
+                    for (deviation, both) in deviations.iter_mut().zip(both) {
+                        if let (Some((published, _)), Some((torque, own))) = both {
+                            let apart = (torque - published).abs() / COVERED;
+                            *deviation = deviation.max(apart).max(own);
+                        }
+                    }
+                }
+                for (&dof, deviation) in dofs.iter().zip(deviations) {
+                    let before = doubts[dof].unwrap_or(Doubt {
+                        deviation: 0.0,
+                        leading: None,
+                    });
+                    doubts[dof] = Some(Doubt {
+                        deviation: deviation.max(before.deviation),
+                        leading: before.leading.or(leading),
+                    });
+                }
+            }
+        }
+        for (to, doubt) in solution.doubts.iter_mut().zip(doubts) {
+            *to = doubt.unwrap_or(*to);
+        }
+    }
+
+    /// Drops everything that was learnt about a component.
+    pub(crate) fn begin_anew(&mut self, component: usize) {
+        self.of(component).for_each(Unit::begin_anew);
+    }
+
+    /// Forgets the offsets of a component.
+    pub(crate) fn forget_offsets(&mut self, component: usize) {
+        self.of(component).for_each(Unit::forget_offsets);
+    }
+
+    /// Forgets the parameters of the links at the ends of the limbs of a component.
+    pub(crate) fn forget_loads(&mut self, component: usize) {
+        let model = self.place.model.clone();
+        self.of(component)
+            .for_each(|unit| unit.forget_loads(&model));
+    }
+
+    fn of(&mut self, component: usize) -> impl Iterator<Item = &mut Unit> {
+        self.units
+            .iter_mut()
+            .filter(move |unit| unit.component == component)
+    }
+
+    /// Whether a contact may have been there since the start.
+    pub(crate) fn may_have_begun_in_contact(&self, component: usize) -> bool {
+        let mut own = self.units.iter().filter(|unit| unit.component == component);
+        own.any(Unit::may_have_begun_in_contact)
+    }
+}
+
+impl Place {
+    /// Sets the regressor to a tick; false if it can not be computed.
+    fn update(&mut self, tick: &Tick, view: View) -> bool {
+        let is_updated = self.look(tick, view)
+            && self
+                .stacked
+                .update(&self.kinematics, &tick.readings, &tick.active, &[])
+                .is_ok();
+        if is_updated {
+            self.stacked.eliminate_contacts(Weighting::Noise);
+        }
+        is_updated
+    }
+
+    fn look(&mut self, tick: &Tick, view: View) -> bool {
+        self.motion
+            .copy_from(tick.motion.state(), &tick.motion.base);
+        self.motion.see(view);
+        self.kinematics
+            .set_base(&self.model, tick.base_link)
+            .is_ok()
+            && (self.kinematics)
+                .update(&self.model, self.motion.state(), &self.motion.base)
+                .is_ok()
+    }
+
+    /// The torques of `dofs` at a tick, with these parameters, and their sensitivities to them;
+    /// none where they do not follow from the readings.
+    fn torques(
+        &mut self,
+        tick: &Tick,
+        hypothesis: &Hypothesis,
+        parameters: &[f64],
+        dofs: &[usize],
+    ) -> Vec<Option<(f64, Vec<f64>)>> {
+        let nothing = vec![None; dofs.len()];
+        let mut active = tick.active;
+        hypothesis
+            .contact
+            .iter()
+            .for_each(|&contact| active.insert(contact));
+        let readings: Vec<Wrench> = (0..tick.readings.len())
+            .map(|sensor| hypothesis.sight.reading(sensor, &tick.readings))
+            .collect();
+        if !self.look(tick, hypothesis.view) {
+            return nothing;
+        }
+        let Self {
+            model,
+            structure,
+            kinematics,
+            solver,
+            ..
+        } = self;
+        if solver
+            .solve(model, structure, kinematics, &readings, &active, &[])
+            .is_err()
+        {
+            return nothing;
+        }
+        let Ok(rows) = EstimateRows::new(structure, solver, kinematics) else {
+            return nothing;
+        };
+        let torque = |&dof: &usize| {
+            let row = row(&rows, dof, parameters.len())?;
+            let measured = rows.torque_measured(dof, &readings, &[]).ok()?;
+            Some((measured + dot(&row, parameters), row))
+        };
+        dofs.iter().map(torque).collect()
+    }
+
+    /// The torques of `dofs` if another hypothesis about the sub-tree holds, and their deviations.
+    fn alternative(
+        &mut self,
+        tick: &Tick,
+        (columns, other): (&Columns, &Posterior),
+        in_use: &[f64],
+        dofs: &[usize],
+    ) -> Vec<Option<(f64, f64)>> {
+        // A contact that is known to be there makes the hypothesis the stated one.
+        if other
+            .hypothesis
+            .contact
+            .is_some_and(|contact| tick.active.contains(contact))
+        {
+            return vec![None; dofs.len()];
+        }
+        let places = self.columns(columns);
+        let mut parameters = in_use.to_vec();
+        for (&place, value) in places.iter().zip(&other.mean) {
+            parameters[place] = *value;
+        }
+        let torques = self.torques(tick, &other.hypothesis, &parameters, dofs);
+        let with_deviation = |(torque, row): (f64, Vec<f64>)| {
+            let sensitivity: Vec<f64> = places.iter().map(|&place| row[place]).collect();
+            (torque, other.deviation(columns, &sensitivity))
+        };
+        torques
+            .into_iter()
+            .map(|torque| torque.map(with_deviation))
+            .collect()
+    }
+
+    /// The degrees of freedom whose torques depend on a sub-tree or its sensors.
+    fn dofs(&self, unit: &Unit) -> Vec<usize> {
+        let sensors = &unit.columns.sensors;
+        let is_own = |subtree: usize| {
+            let mut of_subtree = self.structure.subtrees()[subtree].sensors.iter();
+            subtree == unit.subtree || of_subtree.any(|sensor| sensors.contains(&sensor))
+        };
+        let depends = |dof: &usize| {
+            let links = self.structure.moved_by(*dof).iter();
+            links
+                .filter_map(|&link| self.structure.subtree_of(link))
+                .any(is_own)
+        };
+        (0..self.model.dof_count()).filter(depends).collect()
+    }
+
+    /// The places of a sub-tree's columns among those of the robot, ten per link, six per sensor.
+    fn columns(&self, own: &Columns) -> Vec<usize> {
+        let first = LINK_PARAMETERS * self.structure.link_count();
+        let links = own.links.iter().map(|link| LINK_PARAMETERS * link);
+        let links = links.flat_map(|column| column..column + LINK_PARAMETERS);
+        let sensors = own.sensors.iter().map(|sensor| first + 6 * sensor);
+        links
+            .chain(sensors.flat_map(|column| column..column + 6))
+            .collect()
+    }
+
+    /// The parameters in use, in these columns.
+    fn in_use(&self, solution: &Solution) -> Vec<f64> {
+        let first = LINK_PARAMETERS * self.structure.link_count();
+        let mut all: Vec<f64> = self
+            .model
+            .inertias()
+            .iter()
+            .flat_map(RigidInertia::parameters)
+            .collect();
+        all.resize(first + 6 * self.structure.sensors().len(), 0.0);
+        for own in &solution.components {
+            for (&link, body) in own.links.iter().zip(&own.bodies) {
+                all[LINK_PARAMETERS * link..][..LINK_PARAMETERS]
+                    .copy_from_slice(&body.parameters());
+            }
+            for (&sensor, offset) in own.sensors.iter().zip(&own.offsets) {
+                all[first + 6 * sensor..][..6].copy_from_slice(&offset.torque_first());
+            }
+        }
+        all
+    }
+}
+
+/// The row of a torque over the columns of the robot.
+fn row(rows: &EstimateRows<'_>, dof: usize, columns: usize) -> Option<Vec<f64>> {
+    let subtree = rows.torque_subtree(dof)?;
+    let mut own = vec![0.0; rows.column_count(subtree)?];
+    rows.torque_row(dof, &mut own).ok()?;
+    let mut all = vec![0.0; columns];
+    rows.expand(subtree, &own, &mut all).ok()?;
+    Some(all)
+}

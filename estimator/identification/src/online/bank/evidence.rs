@@ -1,0 +1,579 @@
+//! The evidence of hypotheses about one sub-tree, and what its parameters are if they hold.
+//!
+//! ```text
+//! y = A x + v,   x ~ N(0, 1),   v ~ N(0, noise V)
+//! log p(y) = -1/2 (log det(1 + S / noise) + n log noise + (y'y - b'(noise + S)^-1 b) / noise)
+//! S = A'A,   b = A'y,   n rows
+//! ```
+//!
+//! with rows whitened by V, which is as stated, and columns by a root of their prior. S, b and y'y
+//! are the Gram matrix of `[A | y]`, in which ticks add up. The noise is the most likely one, but
+//! not below the stated one.
+
+use crate::online::bank::hypothesis::{Hypothesis, Sight, View};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SMatrix};
+use proprio_dynamics::calibration::UNKNOWN_OFFSET;
+use proprio_dynamics::regressor::{LINK_PARAMETERS, SubTreeRegressor};
+use proprio_dynamics::spatial::{Vec3, Wrench};
+use proprio_dynamics::{Kinematics, Structure};
+
+/// Standard deviation of each component of a steady force \[N\].
+pub(super) const FORCE: f64 = 25.0;
+
+/// The unknowns of a sub-tree, `[d | s]`: ten per link, six per sensor.
+#[derive(Clone, Debug)]
+pub(super) struct Columns {
+    pub(super) links: Vec<usize>,
+    pub(super) sensors: Vec<usize>,
+    /// Per link `U` of the prior's covariance `U'U`.
+    pub(super) roots: Vec<SMatrix<f64, LINK_PARAMETERS, LINK_PARAMETERS>>,
+    /// CAD and configured offsets.
+    pub(super) reference: Vec<f64>,
+}
+
+impl Columns {
+    pub(super) fn count(&self) -> usize {
+        self.reference.len()
+    }
+
+    fn first_offset(&self) -> usize {
+        LINK_PARAMETERS * self.links.len()
+    }
+
+    /// A row over the unknowns as one over unknowns of unit variance: `a P^(1/2)`.
+    fn scale(&self, row: &[f64], to: &mut [f64]) {
+        let (of_links, offsets) = row.split_at(self.first_offset());
+        let (to_links, to_offsets) = to.split_at_mut(self.first_offset());
+        let links = self
+            .roots
+            .iter()
+            .zip(of_links.chunks_exact(LINK_PARAMETERS));
+        for ((root, row), to) in links.zip(to_links.chunks_exact_mut(LINK_PARAMETERS)) {
+            for (i, to) in to.iter_mut().enumerate() {
+                *to = root.row(i).iter().zip(row).map(|(u, a)| u * a).sum();
+            }
+        }
+        let deviations = UNKNOWN_OFFSET.iter().cycle();
+        for ((to, value), deviation) in to_offsets.iter_mut().zip(offsets).zip(deviations) {
+            *to = value * deviation;
+        }
+    }
+
+    /// The unknowns of these unknowns of unit variance, `P^(1/2) w` beyond the reference.
+    fn unscale(&self, scaled: &[f64]) -> Vec<f64> {
+        let (of_links, offsets) = scaled.split_at(self.first_offset());
+        let links = self
+            .roots
+            .iter()
+            .zip(of_links.chunks_exact(LINK_PARAMETERS));
+        let links = links.flat_map(|(root, w)| {
+            (0..LINK_PARAMETERS).map(move |i| {
+                root.column(i)
+                    .iter()
+                    .zip(w)
+                    .map(|(u, w)| u * w)
+                    .sum::<f64>()
+            })
+        });
+        let offsets = offsets
+            .iter()
+            .zip(UNKNOWN_OFFSET.iter().cycle())
+            .map(|(w, std)| w * std);
+        links
+            .chain(offsets)
+            .zip(&self.reference)
+            .map(|(own, reference)| own + reference)
+            .collect()
+    }
+}
+
+/// A hypothesis in its [`Fit`].
+#[derive(Clone, Debug)]
+pub(super) struct Branch {
+    pub(super) sight: Sight,
+    /// What multiplies the columns of the links, and of each sensor.
+    of_links: f64,
+    of_sensors: Vec<f64>,
+    pub(super) log_prior: f64,
+    /// The most likely variance of the noise, in units of V.
+    pub(super) noise: f64,
+    pub(super) log_evidence: f64,
+    /// Against the likeliest hypothesis.
+    pub(super) log_odds: f64,
+    pub(super) is_refuted: bool,
+}
+
+impl Branch {
+    pub(super) fn new(sight: Sight, prior: f64, sensors: &[usize]) -> Self {
+        // Noise and offsets stay those of readings in the sensor's own unit. So of the first
+        // sensor, it is everything else that is taken in that unit.
+        let (of_links, of_sensors) = match sight {
+            Sight::Unit(number, factor) => {
+                let is_first = sensors.first() == Some(&number);
+                let other = if is_first { 1.0 / factor } else { 1.0 };
+                let own = if is_first { 1.0 } else { factor };
+                let of = |sensor: &usize| if *sensor == number { own } else { other };
+                (other, sensors.iter().map(of).collect())
+            }
+            _ => (1.0, vec![1.0; sensors.len()]),
+        };
+        Self {
+            sight,
+            of_links,
+            of_sensors,
+            log_prior: prior.ln(),
+            noise: 1.0,
+            log_evidence: 0.0,
+            log_odds: 0.0,
+            is_refuted: false,
+        }
+    }
+
+    /// What multiplies the columns: `[d | s]`, and those of a contact.
+    fn factors(&self, links: usize, unknowns: usize) -> Vec<f64> {
+        let of_links = std::iter::repeat_n(self.of_links, LINK_PARAMETERS * links);
+        let of_sensors = self.of_sensors.iter().flat_map(|factor| [*factor; 6]);
+        let mut all: Vec<f64> = of_links.chain(of_sensors).collect();
+        all.resize(unknowns, 1.0);
+        all
+    }
+}
+
+/// The rows of a sub-tree at one time.
+pub(super) struct Rows<'a> {
+    pub(super) rows: &'a SubTreeRegressor,
+    pub(super) structure: &'a Structure,
+    pub(super) kinematics: &'a Kinematics,
+    pub(super) readings: &'a [Wrench],
+    /// The stated variances of each sensor's channels, [torque; force].
+    pub(super) variances: &'a [[f64; 6]],
+}
+
+/// Hypotheses with the same A: they differ in how F/T readings are taken.
+#[derive(Clone, Debug)]
+pub(super) struct Fit {
+    pub(super) view: View,
+    pub(super) contact: Option<usize>,
+    unknowns: usize,
+    pub(super) branches: Vec<Branch>,
+    /// Of `[A | y of each branch]`; empty before the first tick.
+    gram: DMatrix<f64>,
+    rows: f64,
+    /// The log-evidence of unknowns that were forgotten.
+    forgotten: f64,
+}
+
+impl Fit {
+    pub(super) fn new(
+        view: View,
+        contact: Option<usize>,
+        columns: &Columns,
+        branches: Vec<Branch>,
+    ) -> Self {
+        Self {
+            view,
+            contact,
+            unknowns: columns.count() + if contact.is_some() { 3 } else { 0 },
+            branches,
+            gram: DMatrix::zeros(0, 0),
+            rows: 0.0,
+            forgotten: 0.0,
+        }
+    }
+
+    pub(super) fn hypothesis(&self, branch: &Branch) -> Hypothesis {
+        Hypothesis {
+            view: self.view,
+            sight: branch.sight,
+            contact: self.contact,
+        }
+    }
+
+    /// Adds the rows of a sub-tree at one time.
+    pub(super) fn add(&mut self, columns: &Columns, now: &Rows<'_>) {
+        let rows = now.rows;
+        let (count, width) = (rows.remaining(), self.unknowns + self.branches.len());
+        let mut all = DMatrix::zeros(count, width);
+        let mut covariance = DMatrix::zeros(count, count);
+        let mut scaled = vec![0.0; columns.count()];
+        for i in 0..count {
+            let (of_links, offsets) = rows.projected_row(i).split_at(rows.offset_column());
+            columns.scale(rows.projected_row(i), &mut scaled);
+            for (column, value) in scaled.iter().enumerate() {
+                all[(i, column)] = *value;
+            }
+            let right =
+                rows.projected_measured()[i] - dot(rows.projected_row(i), &columns.reference);
+            for (number, branch) in self.branches.iter().enumerate() {
+                let changes = (columns.sensors.iter().enumerate()).map(|(place, &sensor)| {
+                    let reading = now.readings[sensor];
+                    let change = match branch.sight {
+                        Sight::Unit(..) => {
+                            let configured = &columns.reference[columns.first_offset()..];
+                            let six = |axis| configured[6 * place + axis];
+                            let offset = Wrench::from_torque_first(std::array::from_fn(six));
+                            (reading - offset) * (branch.of_sensors[place] - 1.0)
+                        }
+                        sight => sight.reading(sensor, now.readings) - reading,
+                    };
+                    dot(&offsets[6 * place..6 * place + 6], &change.torque_first())
+                });
+                let bodies = (1.0 - branch.of_links) * dot(of_links, &columns.reference);
+                all[(i, self.unknowns + number)] = right + changes.sum::<f64>() + bodies;
+            }
+            let channels = || {
+                columns
+                    .sensors
+                    .iter()
+                    .flat_map(|&sensor| now.variances[sensor])
+            };
+            for j in 0..=i {
+                let others = &rows.projected_row(j)[rows.offset_column()..];
+                let terms = offsets.iter().zip(others).zip(channels());
+                let sum: f64 = terms.map(|((a, b), variance)| a * b * variance).sum();
+                (covariance[(i, j)], covariance[(j, i)]) = (sum, sum);
+            }
+        }
+        if let Some(contact) = self.contact {
+            let Some(wrenches) = unit_forces(contact, now) else {
+                return;
+            };
+            for (axis, wrench) in wrenches.iter().enumerate() {
+                for i in 0..count {
+                    all[(i, columns.count() + axis)] = -FORCE * dot(rows.projection(i), wrench);
+                }
+            }
+        }
+        let Some(factor) = Cholesky::new(covariance) else {
+            return;
+        };
+        factor.l_dirty().solve_lower_triangular_mut(&mut all);
+        if count > 0 && all.iter().all(|x| x.is_finite()) {
+            if self.gram.is_empty() {
+                self.gram = DMatrix::zeros(width, width);
+            }
+            self.gram.gemm_tr(1.0, &all, &all, 1.0);
+            self.rows += count as f64;
+        }
+    }
+
+    /// Forgets these unknowns: they have other values from now on.
+    pub(super) fn forget(&mut self, columns: &[usize]) {
+        if self.gram.is_empty() || columns.is_empty() {
+            return;
+        }
+        let likeliest = self
+            .branches
+            .iter()
+            .max_by(|a, b| a.log_odds.total_cmp(&b.log_odds));
+        let noise = likeliest.map_or(1.0, |branch| branch.noise);
+        let own = DMatrix::from_fn(columns.len(), columns.len(), |i, j| {
+            self.gram[(columns[i], columns[j])] + if i == j { noise } else { 0.0 }
+        });
+        let Some(factor) = Cholesky::new(own) else {
+            return;
+        };
+        let mut across = DMatrix::from_fn(columns.len(), self.gram.ncols(), |i, j| {
+            self.gram[(columns[i], j)]
+        });
+        factor.l_dirty().solve_lower_triangular_mut(&mut across);
+        self.gram.gemm_tr(-1.0, &across, &across, 1.0);
+        for &column in columns {
+            self.gram.row_mut(column).fill(0.0);
+            self.gram.column_mut(column).fill(0.0);
+        }
+        self.forgotten -= 0.5 * log_det(&factor, noise);
+    }
+
+    /// Finds each branch's most likely noise, and its evidence.
+    pub(super) fn weigh(&mut self, columns: &Columns) {
+        if self.gram.is_empty() {
+            return;
+        }
+        for number in 0..self.branches.len() {
+            // Two iterations a second: the noise converges while ticks come in.
+            for _ in 0..if self.branches[number].is_refuted {
+                0
+            } else {
+                2
+            } {
+                let Some((factor, mut right)) = self.system(columns, number) else {
+                    return;
+                };
+                factor.l_dirty().solve_lower_triangular_mut(&mut right);
+                let column = self.unknowns + number;
+                let square = self.gram[(column, column)] - right.norm_squared();
+                let branch = &mut self.branches[number];
+                let log_determinant = log_det(&factor, branch.noise);
+                branch.noise = (square / self.rows).max(1.0);
+                branch.log_evidence = self.forgotten
+                    - 0.5
+                        * (log_determinant + self.rows * branch.noise.ln() + square / branch.noise);
+            }
+        }
+    }
+
+    /// The root mean square of the force of the contact, its largest component \[N\].
+    pub(super) fn force(&self, columns: &Columns) -> f64 {
+        let Some((factor, right)) = self.system(columns, 0) else {
+            return f64::INFINITY;
+        };
+        let mean = factor.solve(&right);
+        let axes = (columns.count()..self.unknowns).map(|axis| {
+            let mut unit = DVector::zeros(self.unknowns);
+            unit[axis] = 1.0;
+            let _ = factor.l_dirty().solve_lower_triangular_mut(&mut unit);
+            mean[axis].hypot(unit.norm() * self.branches[0].noise.sqrt())
+        });
+        FORCE * axes.fold(0.0, f64::max)
+    }
+
+    /// What the parameters are if a branch holds.
+    pub(super) fn posterior(&self, columns: &Columns, number: usize) -> Option<Posterior> {
+        let (factor, right) = self.system(columns, number)?;
+        let branch = &self.branches[number];
+        let mean = columns.unscale(&factor.solve(&right).as_slice()[..columns.count()]);
+        let mut all = Posterior {
+            hypothesis: self.hypothesis(branch),
+            mean,
+            // The offset is in the sensor's own unit.
+            offset_factors: (columns.sensors.iter())
+                .map(|&sensor| match branch.sight {
+                    Sight::Unit(number, factor) if number == sensor => factor,
+                    _ => 1.0,
+                })
+                .collect(),
+            factor,
+            noise: branch.noise,
+        };
+        all.scale_offsets(columns);
+        Some(all)
+    }
+
+    /// The factor of `noise + S` and b of a branch.
+    fn system(&self, columns: &Columns, number: usize) -> Option<System> {
+        let (unknowns, branch) = (self.unknowns, &self.branches[number]);
+        if self.gram.is_empty() {
+            let root = DMatrix::from_diagonal_element(unknowns, unknowns, branch.noise.sqrt());
+            return Some((Cholesky::pack_dirty(root), DVector::zeros(unknowns)));
+        }
+        let factors = branch.factors(columns.links.len(), unknowns);
+        let precision = DMatrix::from_fn(unknowns, unknowns, |i, j| {
+            self.gram[(i, j)] * factors[i] * factors[j] + if i == j { branch.noise } else { 0.0 }
+        });
+        let right = DVector::from_fn(unknowns, |i, _| {
+            self.gram[(i, unknowns + number)] * factors[i]
+        });
+        Some((Cholesky::new(precision)?, right))
+    }
+}
+
+type System = (Cholesky<f64, Dyn>, DVector<f64>);
+
+/// The parameters of a sub-tree if a hypothesis holds.
+#[derive(Clone, Debug)]
+pub(super) struct Posterior {
+    pub(super) hypothesis: Hypothesis,
+    /// `[d | s]`, in SI units.
+    pub(super) mean: Vec<f64>,
+    offset_factors: Vec<f64>,
+    factor: Cholesky<f64, Dyn>,
+    noise: f64,
+}
+
+impl Posterior {
+    fn scale_offsets(&mut self, columns: &Columns) {
+        let offsets = self.mean[columns.first_offset()..].chunks_exact_mut(6);
+        for (six, factor) in offsets.zip(&self.offset_factors) {
+            six.iter_mut().for_each(|offset| *offset *= factor);
+        }
+    }
+
+    /// The standard deviation of a number with this sensitivity to `[d | s]`.
+    pub(super) fn deviation(&self, columns: &Columns, sensitivity: &[f64]) -> f64 {
+        let mut scaled = DVector::zeros(self.factor.l_dirty().nrows());
+        columns.scale(sensitivity, &mut scaled.as_mut_slice()[..columns.count()]);
+        let offsets = scaled.as_mut_slice()[columns.first_offset()..columns.count()].chunks_mut(6);
+        for (six, factor) in offsets.zip(&self.offset_factors) {
+            six.iter_mut().for_each(|value| *value *= factor);
+        }
+        let _ = self
+            .factor
+            .l_dirty()
+            .solve_lower_triangular_mut(&mut scaled);
+        scaled.norm() * self.noise.sqrt()
+    }
+}
+
+/// The wrenches of forces of 1 N at a contact along the axes of the base, at and in the axes of the
+/// sub-tree's top link.
+fn unit_forces(contact: usize, now: &Rows<'_>) -> Option<[[f64; 6]; 3]> {
+    let spec = now.structure.contacts().get(contact)?;
+    let frame = *now.kinematics.pose(spec.frame.link) * spec.frame.pose;
+    let point = frame.point(&spec.position);
+    let to_top = now.kinematics.pose(now.rows.top()).inverse();
+    Some([0, 1, 2].map(|axis| {
+        let force = Vec3::ith(axis, 1.0);
+        let torque = point.cross(&force);
+        to_top.wrench(&Wrench { torque, force }).torque_first()
+    }))
+}
+
+/// `log det(1 + S / noise)`, from the factor of `noise + S`.
+fn log_det(factor: &Cholesky<f64, Dyn>, noise: f64) -> f64 {
+    let own = factor.l_dirty();
+    (0..own.nrows())
+        .map(|i| 2.0 * own[(i, i)].ln() - noise.ln())
+        .sum()
+}
+
+pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::arithmetic::normals;
+
+    const UNKNOWNS: usize = LINK_PARAMETERS + 6;
+
+    fn columns() -> Columns {
+        Columns {
+            links: vec![1],
+            sensors: vec![0],
+            roots: vec![SMatrix::identity()],
+            reference: vec![0.0; UNKNOWNS],
+        }
+    }
+
+    /// Random rows, and right sides with noise of this deviation.
+    fn rows(seed: u64, count: usize, deviation: f64) -> (DMatrix<f64>, DVector<f64>) {
+        let a = DMatrix::from_vec(count, UNKNOWNS, normals(seed, count * UNKNOWNS));
+        let x = DVector::from_vec(normals(seed + 1, UNKNOWNS));
+        let v = DVector::from_vec(normals(seed + 2, count));
+        let y = &a * x + v * deviation;
+        (a, y)
+    }
+
+    fn fit(sight: Sight) -> Fit {
+        let branches = vec![Branch::new(sight, 1.0, &[0])];
+        Fit::new(View::AsStated, None, &columns(), branches)
+    }
+
+    fn add(fit: &mut Fit, a: &DMatrix<f64>, y: &DVector<f64>) {
+        let all = DMatrix::from_fn(y.len(), UNKNOWNS + 1, |i, j| {
+            if j < UNKNOWNS { a[(i, j)] } else { y[i] }
+        });
+        if fit.gram.is_empty() {
+            fit.gram = DMatrix::zeros(UNKNOWNS + 1, UNKNOWNS + 1);
+        }
+        fit.gram += all.tr_mul(&all);
+        fit.rows += y.len() as f64;
+    }
+
+    /// Until the noise has converged.
+    fn weighed(fit: &mut Fit) -> (f64, f64) {
+        (0..100).for_each(|_| fit.weigh(&columns()));
+        (fit.branches[0].log_evidence, fit.branches[0].noise)
+    }
+
+    /// `log p(y)` but for a constant, by its definition.
+    fn log_density(a: &DMatrix<f64>, y: &DVector<f64>, noise: f64) -> f64 {
+        let covariance = a * a.transpose() + DMatrix::identity(y.len(), y.len()) * noise;
+        let factor = Cholesky::new(covariance).unwrap();
+        let log_det: f64 = factor.l().diagonal().iter().map(|d| 2.0 * d.ln()).sum();
+        -0.5 * (log_det + y.dot(&factor.solve(y)))
+    }
+
+    #[test]
+    fn the_evidence_is_the_density_of_the_readings_with_their_likeliest_noise() {
+        for (deviation, least) in [(3.0, 4.0), (0.1, 1.0)] {
+            let (a, y) = rows(7, 60, deviation);
+            let mut fit = fit(Sight::AsStated);
+            add(&mut fit, &a, &y);
+            let (evidence, noise) = weighed(&mut fit);
+            assert!(
+                (evidence - log_density(&a, &y, noise)).abs() < 1e-6,
+                "{evidence}"
+            );
+            assert!(noise >= least && noise < 3.0 * least, "{noise}");
+            // The stated noise is the least one.
+            if noise > 1.0 {
+                for other in [0.8 * noise, 1.2 * noise] {
+                    let of_other = log_density(&a, &y, other);
+                    assert!(of_other < evidence + 0.5, "{other}: {of_other}, {evidence}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_forgotten_may_have_another_value_afterwards() {
+        let ((a, y), (b, z)) = (rows(11, 40, 0.3), rows(21, 40, 0.3));
+        let offsets: Vec<usize> = (LINK_PARAMETERS..UNKNOWNS).collect();
+        let mut fit = fit(Sight::AsStated);
+        add(&mut fit, &a, &y);
+        fit.forget(&offsets);
+        add(&mut fit, &b, &z);
+        // The offsets of the later rows have columns of their own.
+        let all = DMatrix::from_fn(80, UNKNOWNS + 6, |i, j| match (i < 40, j) {
+            (true, 0..UNKNOWNS) => a[(i, j)],
+            (false, 0..LINK_PARAMETERS) => b[(i - 40, j)],
+            (false, UNKNOWNS..) => b[(i - 40, j - 6)],
+            _ => 0.0,
+        });
+        let right = DVector::from_iterator(80, y.iter().chain(z.iter()).copied());
+        let (evidence, noise) = weighed(&mut fit);
+        // Both halves have their own bodies in this data, so the noise is not the stated one.
+        let expected = log_density(&all, &right, noise);
+        let of_forgotten = log_density(&all, &right, 1.0);
+        assert!(noise > 1.0 && of_forgotten < expected, "{noise}");
+        assert!((evidence - expected).abs() < 0.1 * (expected - of_forgotten).abs());
+    }
+
+    #[test]
+    fn readings_in_another_unit_are_those_of_bodies_in_that_unit() {
+        let (mut a, y) = rows(31, 60, 0.3);
+        let mut fit = fit(Sight::Unit(0, 4.0));
+        add(&mut fit, &a, &y);
+        let (evidence, noise) = weighed(&mut fit);
+        a.columns_mut(0, LINK_PARAMETERS).scale_mut(0.25);
+        assert!(
+            (evidence - log_density(&a, &y, noise)).abs() < 1e-6,
+            "{evidence}"
+        );
+    }
+
+    #[test]
+    fn the_deviation_of_a_number_is_that_of_its_posterior() {
+        let (a, y) = rows(41, 60, 0.3);
+        let mut fit = fit(Sight::AsStated);
+        let columns = columns();
+        let sensitivity = normals(51, UNKNOWNS);
+        let mut expected = DVector::from_column_slice(&sensitivity);
+        for (number, deviation) in UNKNOWN_OFFSET.iter().enumerate() {
+            expected[LINK_PARAMETERS + number] *= deviation;
+        }
+        let before = fit
+            .posterior(&columns, 0)
+            .unwrap()
+            .deviation(&columns, &sensitivity);
+        assert!((before - expected.norm()).abs() < 1e-9, "{before}");
+        add(&mut fit, &a, &y);
+        let (_, noise) = weighed(&mut fit);
+        let covariance = (a.tr_mul(&a) / noise + DMatrix::identity(UNKNOWNS, UNKNOWNS))
+            .try_inverse()
+            .unwrap();
+        let after = fit.posterior(&columns, 0).unwrap();
+        let deviation = expected.dot(&(&covariance * &expected)).sqrt();
+        assert!((after.deviation(&columns, &sensitivity) - deviation).abs() < 1e-9);
+        let mean = covariance * a.tr_mul(&y) / noise;
+        for (number, value) in after.mean.iter().enumerate() {
+            let scale = number
+                .checked_sub(LINK_PARAMETERS)
+                .map_or(1.0, |i| UNKNOWN_OFFSET[i]);
+            assert!((value - scale * mean[number]).abs() < 1e-9, "{number}");
+        }
+    }
+}

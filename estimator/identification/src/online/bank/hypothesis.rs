@@ -1,0 +1,280 @@
+//! What may be other than stated, and how the readings are to be taken then.
+
+use crate::robot::{ChannelRole, Robot};
+use nalgebra::Rotation3;
+use proprio_dynamics::spatial::{Mat3, Vec3, Wrench};
+use proprio_dynamics::{FrameMotion, JointState};
+use std::f64::consts::PI;
+use std::fmt;
+
+/// Standard gravity \[m/s^2\].
+const GRAVITY: f64 = 9.80665;
+
+/// How the readings of joints and base are to be taken.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum View {
+    /// As stated.
+    AsStated,
+    /// This encoder counts in the other direction.
+    Reversed(usize),
+    /// This encoder's readings are in degrees, not in radians.
+    Degrees(usize),
+    /// These encoders have each other's readings.
+    Swapped(usize, usize),
+    /// The proper acceleration of the base that stands still is along this axis of the base link.
+    Upright(Vec3),
+    /// The IMU is mounted in another direction: this turns its readings, in axes of the base link.
+    ImuTurned(Mat3),
+    /// The IMU's accelerations are in g.
+    ImuInG,
+}
+
+/// How the readings of the F/T sensors are to be taken.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Sight {
+    /// As stated.
+    AsStated,
+    /// This sensor's axes are others: forces and torques are turned, mirrored or negated by this.
+    Axes(usize, Mat3),
+    /// This sensor's readings are to be multiplied.
+    Unit(usize, f64),
+    /// These sensors have each other's readings.
+    Swapped(usize, usize),
+}
+
+/// What may be the case, as far as it is other than stated.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Hypothesis {
+    /// Joints and base.
+    pub view: View,
+    /// F/T sensors.
+    pub sight: Sight,
+    /// The contact that has acted on the robot since the start, as a steady force.
+    pub contact: Option<usize>,
+}
+
+impl Hypothesis {
+    /// Everything is as stated, and no contact acts.
+    pub(crate) const AS_STATED: Self = Self {
+        view: View::AsStated,
+        sight: Sight::AsStated,
+        contact: None,
+    };
+
+    /// The channel whose readings are other than stated; none for a contact.
+    #[must_use]
+    pub const fn role(&self) -> Option<ChannelRole> {
+        match (self.view, self.sight) {
+            (View::Reversed(dof) | View::Degrees(dof) | View::Swapped(dof, _), _) => {
+                Some(ChannelRole::Joint(dof))
+            }
+            (View::Upright(_) | View::ImuTurned(_) | View::ImuInG, _) => Some(ChannelRole::Base),
+            (View::AsStated, Sight::AsStated) => None,
+            (_, Sight::Axes(sensor, _) | Sight::Unit(sensor, _) | Sight::Swapped(sensor, _)) => {
+                Some(ChannelRole::Sensor(sensor))
+            }
+        }
+    }
+
+    /// For a person.
+    #[must_use]
+    pub const fn describe<'r>(&self, robot: &'r Robot) -> impl fmt::Display + use<'r> {
+        Described {
+            hypothesis: *self,
+            robot,
+        }
+    }
+}
+
+/// A hypothesis about `robot`.
+struct Described<'r> {
+    hypothesis: Hypothesis,
+    robot: &'r Robot,
+}
+
+impl fmt::Display for Described<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let robot = self.robot;
+        let joint = |dof: usize| robot.model.dof_name(dof);
+        let sensor = |number: usize| {
+            let cut = robot.structure.sensors().get(number);
+            cut.map_or("?", |cut| robot.model.joint_name(cut.joint()))
+        };
+        match self.hypothesis.view {
+            View::AsStated => {}
+            View::Reversed(dof) => return write!(f, "the encoder of {} is reversed", joint(dof)),
+            View::Degrees(dof) => {
+                return write!(f, "the encoder of {} reads degrees", joint(dof));
+            }
+            View::Swapped(a, b) => {
+                return write!(
+                    f,
+                    "the encoders of {} and {} are swapped",
+                    joint(a),
+                    joint(b)
+                );
+            }
+            View::Upright(_) => return f.write_str("gravity has another direction than stated"),
+            View::ImuTurned(_) => return f.write_str("the IMU is mounted in another direction"),
+            View::ImuInG => return f.write_str("the IMU reads accelerations in g"),
+        }
+        match self.hypothesis.sight {
+            Sight::AsStated => {}
+            Sight::Axes(number, axes) if axes == -Mat3::identity() => {
+                return write!(f, "the F/T sensor {} has the other sign", sensor(number));
+            }
+            Sight::Axes(number, _) => {
+                return write!(f, "the F/T sensor {} has other axes", sensor(number));
+            }
+            Sight::Unit(number, _) => {
+                return write!(f, "the F/T sensor {} reads in another unit", sensor(number));
+            }
+            Sight::Swapped(a, b) => {
+                let (a, b) = (sensor(a), sensor(b));
+                return write!(f, "the F/T sensors {a} and {b} are swapped");
+            }
+        }
+        match self
+            .hypothesis
+            .contact
+            .and_then(|number| robot.contacts.get(number))
+        {
+            Some(contact) => write!(
+                f,
+                "the contact {} has been present since the start",
+                contact.name
+            ),
+            None => f.write_str("everything is as stated"),
+        }
+    }
+}
+
+/// The readings of joints and base at one time, as they are to be taken.
+#[derive(Clone, Debug)]
+pub(crate) struct Motion {
+    pub(crate) position: Vec<f64>,
+    pub(crate) velocity: Vec<f64>,
+    pub(crate) acceleration: Vec<f64>,
+    /// Of the base link.
+    pub(crate) base: FrameMotion,
+}
+
+impl Motion {
+    pub(crate) fn new(dofs: usize) -> Self {
+        Self {
+            position: vec![0.0; dofs],
+            velocity: vec![0.0; dofs],
+            acceleration: vec![0.0; dofs],
+            base: FrameMotion::standing(&Vec3::zeros()),
+        }
+    }
+
+    pub(crate) fn copy_from(&mut self, state: JointState<'_>, base: &FrameMotion) {
+        self.position.copy_from_slice(state.position);
+        self.velocity.copy_from_slice(state.velocity);
+        self.acceleration.copy_from_slice(state.acceleration);
+        self.base = *base;
+    }
+
+    pub(crate) fn state(&self) -> JointState<'_> {
+        JointState {
+            position: &self.position,
+            velocity: &self.velocity,
+            acceleration: &self.acceleration,
+        }
+    }
+
+    /// Takes these readings as `view` says.
+    pub(crate) fn see(&mut self, view: View) {
+        let each = [
+            &mut self.position,
+            &mut self.velocity,
+            &mut self.acceleration,
+        ];
+        match view {
+            View::AsStated => {}
+            View::Reversed(dof) => each.into_iter().for_each(|values| values[dof] *= -1.0),
+            View::Degrees(dof) => each
+                .into_iter()
+                .for_each(|values| values[dof] *= PI / 180.0),
+            View::Swapped(a, b) => each.into_iter().for_each(|values| values.swap(a, b)),
+            View::Upright(axis) => self.base.proper_acceleration = axis * GRAVITY,
+            View::ImuTurned(turn) => {
+                self.base.proper_acceleration = turn * self.base.proper_acceleration;
+                self.base.angular_velocity = turn * self.base.angular_velocity;
+                self.base.angular_acceleration = turn * self.base.angular_acceleration;
+            }
+            View::ImuInG => self.base.proper_acceleration *= GRAVITY,
+        }
+    }
+}
+
+impl Sight {
+    /// The reading of `sensor`, as it is to be taken.
+    pub(crate) fn reading(self, sensor: usize, readings: &[Wrench]) -> Wrench {
+        let own = readings[sensor];
+        match self {
+            Self::Axes(number, axes) if number == sensor => Wrench {
+                force: axes * own.force,
+                torque: axes * own.torque,
+            },
+            Self::Unit(number, factor) if number == sensor => own * factor,
+            Self::Swapped(a, b) if a == sensor => readings[b],
+            Self::Swapped(a, b) if b == sensor => readings[a],
+            _ => own,
+        }
+    }
+}
+
+/// All rotations by quarter turns about the axes but the identity.
+pub(crate) fn quarter_turns() -> Vec<Mat3> {
+    let about = |axis: Vec3, count: u8| {
+        Rotation3::new(axis * (0.5 * PI * f64::from(count)))
+            .into_inner()
+            .map(f64::round)
+    };
+    // A first turn brings z to each of six directions; a second one is about it.
+    let first = [
+        about(Vec3::x(), 0),
+        about(Vec3::x(), 1),
+        about(Vec3::x(), 2),
+        about(Vec3::x(), 3),
+        about(Vec3::y(), 1),
+        about(Vec3::y(), 3),
+    ];
+    let all = first
+        .iter()
+        .flat_map(|first| (0..4).map(move |k| first * about(Vec3::z(), k)));
+    all.filter(|turn| *turn != Mat3::identity()).collect()
+}
+
+/// How an F/T sensor may be read: other axes, mirrored or not; other units.
+pub(crate) fn sights(sensor: usize) -> Vec<Sight> {
+    /// Millinewtons, kilogram-force and pound-force, taken for newtons and the other way round.
+    const FACTORS: [f64; 3] = [1e3, GRAVITY, 4.448_222];
+    let mut all = vec![Sight::Axes(sensor, -Mat3::identity())];
+    for turn in quarter_turns() {
+        all.extend([Sight::Axes(sensor, turn), Sight::Axes(sensor, -turn)]);
+    }
+    let units = FACTORS
+        .into_iter()
+        .flat_map(|factor| [factor, 1.0 / factor]);
+    all.extend(units.map(|factor| Sight::Unit(sensor, factor)));
+    all
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_quarter_turns_are_twenty_three_rotations() {
+        let all = quarter_turns();
+        assert_eq!(all.len(), 23);
+        for (number, turn) in all.iter().enumerate() {
+            assert!((turn.determinant() - 1.0).abs() < 1e-12);
+            assert_eq!(turn * turn.transpose(), Mat3::identity());
+            assert!(!all[..number].contains(turn));
+        }
+    }
+}

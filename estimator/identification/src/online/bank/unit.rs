@@ -1,0 +1,270 @@
+//! One sub-tree that can be free of contacts, and all hypotheses about it.
+
+use crate::online::bank::evidence::{Branch, Columns, FORCE, Fit, Posterior};
+use crate::online::bank::hypothesis::{Hypothesis, Sight, View, quarter_turns, sights};
+use crate::robot::BaseMotion;
+use proprio_dynamics::model::{JointKind, Model};
+use proprio_dynamics::regressor::LINK_PARAMETERS;
+use proprio_dynamics::spatial::Vec3;
+use proprio_dynamics::{ContactSet, Structure};
+
+/// Prior odds of a contact since the start.
+const CONTACT: f64 = 0.1;
+/// Prior odds of each other hypothesis.
+const STRUCTURAL: f64 = 1e-3;
+/// Odds below which a hypothesis is refuted. With a hundred hypotheses about a robot, one of ten
+/// thousand robots has a true one refuted.
+const REFUTED: f64 = 1e-6;
+/// Force of a contact since the start that does not matter \[N\]: a tenth of the expected one.
+const LITTLE: f64 = 0.1 * FORCE;
+/// Ticks in which a misfit lasts: a second. In them it counts as one.
+const LASTING: f64 = 10.0;
+
+/// See the [module](self).
+#[derive(Clone, Debug)]
+pub(super) struct Unit {
+    pub(super) component: usize,
+    pub(super) subtree: usize,
+    pub(super) columns: Columns,
+    /// The first branch of the first one is that everything is as stated.
+    pub(super) fits: Vec<Fit>,
+    at_start: Vec<Fit>,
+}
+
+impl Unit {
+    /// `contacts` are those that come and go.
+    pub(super) fn new(
+        (component, subtree): (usize, usize),
+        columns: Columns,
+        (model, structure): (&Model, &Structure),
+        base: (usize, &BaseMotion),
+        contacts: &ContactSet,
+    ) -> Self {
+        let here = structure.subtrees()[subtree]
+            .contacts
+            .intersection(contacts);
+        let at_start = hypotheses(&columns, model, structure.sensors().len(), base, &here);
+        Self {
+            component,
+            subtree,
+            columns,
+            fits: at_start.clone(),
+            at_start,
+        }
+    }
+
+    /// Drops everything that was learnt.
+    pub(super) fn begin_anew(&mut self) {
+        self.fits.clone_from(&self.at_start);
+    }
+
+    pub(super) fn forget_offsets(&mut self) {
+        let first = LINK_PARAMETERS * self.columns.links.len();
+        self.forget(&(first..self.columns.count()).collect::<Vec<_>>());
+    }
+
+    /// Forgets the parameters of links without children.
+    pub(super) fn forget_loads(&mut self, model: &Model) {
+        let has_child = |link: usize| model.joints().iter().any(|joint| joint.parent == link);
+        let ends = self
+            .columns
+            .links
+            .iter()
+            .enumerate()
+            .filter(|(_, link)| !has_child(**link));
+        let columns =
+            ends.flat_map(|(place, _)| LINK_PARAMETERS * place..LINK_PARAMETERS * (place + 1));
+        self.forget(&columns.collect::<Vec<_>>());
+    }
+
+    fn forget(&mut self, columns: &[usize]) {
+        self.fits.iter_mut().for_each(|fit| fit.forget(columns));
+    }
+
+    /// Finds the evidence of all hypotheses from the ticks so far.
+    pub(super) fn weigh(&mut self) {
+        let Self { columns, fits, .. } = self;
+        fits.iter_mut().for_each(|fit| fit.weigh(columns));
+    }
+
+    /// How much likelier the readings are if this is the case than as stated, with or without a
+    /// contact; none if this is refuted, or does not matter here.
+    pub(super) fn evidence(&self, view: View, sight: Sight) -> Option<f64> {
+        let fit = self
+            .fits
+            .iter()
+            .find(|fit| fit.view == view && fit.contact.is_none())?;
+        let branch = fit.branches.iter().find(|branch| branch.sight == sight)?;
+        let as_stated = (self.fits.iter())
+            .filter(|fit| fit.view == View::AsStated)
+            .map(|fit| fit.branches[0].log_evidence)
+            .fold(f64::NEG_INFINITY, f64::max);
+        (!branch.is_refuted).then_some(branch.log_evidence - as_stated)
+    }
+
+    /// Sets the odds, with the evidence of other sub-trees for what matters to them too, and drops
+    /// what is refuted.
+    pub(super) fn decide(&mut self, elsewhere: impl Fn(View, Sight) -> f64) {
+        let of_all = self
+            .fits
+            .iter()
+            .flat_map(|fit| &fit.branches)
+            .filter(|b| !b.is_refuted);
+        let likeliest = of_all.max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence));
+        let noise = likeliest.map_or(1.0, |branch| branch.noise);
+        // What exceeds the stated noise is a misfit, which lasts.
+        let share = 1.0 / (1.0 + (LASTING - 1.0) * (1.0 - 1.0 / noise));
+        let mut best = f64::NEG_INFINITY;
+        for fit in &mut self.fits {
+            for branch in fit.branches.iter_mut().filter(|branch| !branch.is_refuted) {
+                let other = match (fit.view, branch.sight) {
+                    (View::AsStated, Sight::AsStated) => 0.0,
+                    (view, sight) => elsewhere(view, sight),
+                };
+                branch.log_odds = branch.log_prior + share * (branch.log_evidence + other);
+                best = best.max(branch.log_odds);
+            }
+        }
+        for (number, fit) in self.fits.iter_mut().enumerate() {
+            for (place, branch) in fit.branches.iter_mut().enumerate() {
+                branch.log_odds -= best;
+                // What is stated may become likely again.
+                branch.is_refuted |= branch.log_odds < REFUTED.ln() && (number, place) != (0, 0);
+            }
+        }
+        let mut number = 0;
+        self.fits.retain(|fit| {
+            number += 1;
+            number == 1 || fit.branches.iter().any(|branch| !branch.is_refuted)
+        });
+    }
+
+    /// The likeliest hypothesis, if it is not the stated one.
+    pub(super) fn leading(&self) -> Option<Hypothesis> {
+        let all = self
+            .fits
+            .iter()
+            .flat_map(|fit| fit.branches.iter().map(move |b| (fit, b)));
+        let best = all
+            .filter(|(_, branch)| !branch.is_refuted)
+            .max_by(|a, b| a.1.log_odds.total_cmp(&b.1.log_odds));
+        let hypothesis = best.map(|(fit, branch)| fit.hypothesis(branch));
+        hypothesis.filter(|hypothesis| *hypothesis != Hypothesis::AS_STATED)
+    }
+
+    /// Whether there may have been a contact since the start, with a force that matters. One with
+    /// next to no force is never refuted, and does no harm.
+    pub(super) fn may_have_begun_in_contact(&self) -> bool {
+        self.fits
+            .iter()
+            .any(|fit| fit.contact.is_some() && fit.force(&self.columns) > LITTLE)
+    }
+
+    /// All hypotheses that are not refuted, but the stated one.
+    pub(super) fn alternatives(&self) -> Vec<Posterior> {
+        let all = self.fits.iter().flat_map(|fit| {
+            fit.branches
+                .iter()
+                .enumerate()
+                .map(move |(number, branch)| (fit, number, branch))
+        });
+        all.filter(|(fit, _, branch)| {
+            !branch.is_refuted && fit.hypothesis(branch) != Hypothesis::AS_STATED
+        })
+        .filter_map(|(fit, number, _)| fit.posterior(&self.columns, number))
+        .collect()
+    }
+}
+
+/// All hypotheses about a sub-tree with these columns and contacts.
+fn hypotheses(
+    columns: &Columns,
+    model: &Model,
+    sensor_count: usize,
+    (base_link, base): (usize, &BaseMotion),
+    contacts: &ContactSet,
+) -> Vec<Fit> {
+    let branch = |sight, prior| Branch::new(sight, prior, &columns.sensors);
+    let mut first = vec![branch(Sight::AsStated, 1.0)];
+    for &sensor in &columns.sensors {
+        first.extend(
+            sights(sensor)
+                .into_iter()
+                .map(|sight| branch(sight, STRUCTURAL)),
+        );
+        let others = (0..sensor_count).filter(|other| *other != sensor);
+        first.extend(others.map(|other| {
+            branch(
+                Sight::Swapped(sensor.min(other), sensor.max(other)),
+                STRUCTURAL,
+            )
+        }));
+    }
+    let mut fits = vec![Fit::new(View::AsStated, None, columns, first)];
+    let count = contacts.iter().count() as f64;
+    fits.extend(contacts.iter().map(|contact| {
+        let branches = vec![branch(Sight::AsStated, CONTACT / count)];
+        Fit::new(View::AsStated, Some(contact), columns, branches)
+    }));
+    let dofs = path(model, base_link, &columns.links);
+    let is_turning = |dof: &usize| {
+        let joint = model
+            .dof_joint(*dof)
+            .and_then(|joint| model.joints().get(joint));
+        joint.is_some_and(|joint| matches!(joint.kind, JointKind::Revolute(_)))
+    };
+    let mut views: Vec<View> = dofs.iter().copied().map(View::Reversed).collect();
+    views.extend(dofs.iter().copied().filter(is_turning).map(View::Degrees));
+    views.extend(dofs.windows(2).map(|pair| View::Swapped(pair[0], pair[1])));
+    match base {
+        BaseMotion::Imu(pose) => {
+            let to_base = |turn| pose.rotation * turn * pose.rotation.transpose();
+            views.extend(
+                quarter_turns()
+                    .into_iter()
+                    .map(|turn| View::ImuTurned(to_base(turn))),
+            );
+            views.push(View::ImuInG);
+        }
+        BaseMotion::Standing(motion) => {
+            let axes = [Vec3::x(), Vec3::y(), Vec3::z()];
+            let axes = axes.into_iter().flat_map(|axis| [axis, -axis]);
+            let stated = motion.proper_acceleration.normalize();
+            // The nearest one is as good as stated.
+            views.extend(
+                axes.filter(|axis| axis.dot(&stated) < 0.9)
+                    .map(View::Upright),
+            );
+        }
+        BaseMotion::Stance(_) => {}
+    }
+    fits.extend(views.into_iter().map(|view| {
+        Fit::new(
+            view,
+            None,
+            columns,
+            vec![branch(Sight::AsStated, STRUCTURAL)],
+        )
+    }));
+    fits
+}
+
+/// The degrees of freedom that move one of these links against the base.
+fn path(model: &Model, base: usize, links: &[usize]) -> Vec<usize> {
+    let above = |mut link: usize| {
+        let mut dofs = Vec::new();
+        while link > 0 {
+            let joint = &model.joints()[link - 1];
+            dofs.extend(joint.dof);
+            link = joint.parent;
+        }
+        dofs
+    };
+    let of_base = above(base);
+    let of_links: Vec<Vec<usize>> = links.iter().map(|&link| above(link)).collect();
+    let is_between = |dof: &usize| {
+        let is_above = |dofs: &Vec<usize>| dofs.contains(dof) != of_base.contains(dof);
+        of_links.iter().any(is_above)
+    };
+    (0..model.dof_count()).filter(is_between).collect()
+}
