@@ -168,9 +168,9 @@ impl Run {
         })
     }
 
-    /// The log, as `proprio estimate` reads it, and the configuration.
+    /// The log, as `proprio estimate` reads it, the configuration and the URDF.
     #[must_use]
-    pub fn files(&self) -> [String; 2] {
+    pub fn files(&self) -> [String; 3] {
         let mut rows: Vec<(f64, usize, usize)> = Vec::new();
         let mut header = String::from("t");
         let mut width = 0;
@@ -199,7 +199,7 @@ impl Run {
             log.push_str(&",".repeat(width - before - values.len()));
             log.push('\n');
         }
-        [log, self.robot.config.to_string()]
+        [log, self.robot.config.to_string(), self.robot.urdf.clone()]
     }
 
     /// Estimates, and compares with the truth.
@@ -495,7 +495,7 @@ mod tests {
             ..JointTorque::ABSENT
         };
         judge.on_estimate(t, &torques, &mut world);
-        judge.outcome("a robot".into())
+        judge.outcome("a robot".into(), None)
     }
 
     #[test]

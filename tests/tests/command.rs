@@ -2656,11 +2656,11 @@ fn reasons(place: &Place) -> BTreeMap<String, usize> {
 #[test]
 fn a_demonstration_ends_well_and_leaves_nothing_behind() {
     let place = Place::new();
-    let summary = demo(&place, 3.0, &["--seed", "4"]);
+    let summary = demo(&place, 6.0, &["--seed", "4"]);
     assert_eq!(summary["lost"], 0, "{summary}");
     assert_eq!(summary["seed"], 4);
     browse(&place.path("d/report.html"));
-    // With a wrong URDF and no time for identification the torques are uncertain and withheld.
+    // Until motion has confirmed the setup, torques are uncertain and withheld.
     assert!(summary["valid_share"].as_f64().unwrap() > 0.2, "{summary}");
     // Their figures rest on the valid ones alone.
     for (joint, error) in summary["torque_rms_error_nm"].as_object().unwrap() {
@@ -2682,7 +2682,7 @@ fn a_demonstration_ends_well_and_leaves_nothing_behind() {
         "{summary}"
     );
     assert!(
-        identification["moving_since_s"].as_f64().unwrap() < 0.75,
+        identification["moving_since_s"].as_f64().unwrap() < 1.5,
         "{summary}"
     );
     assert_eq!(
@@ -2710,7 +2710,7 @@ fn a_demonstration_of_other_boards_ends_well() {
     for (robot, joints, limit) in [("six_axis_arm", 6, 0.8), ("moteus_leg", 3, 0.03)] {
         let place = Place::new();
         let more = ["--robot", robot, "--seed", "4", "--cad-error", "0"];
-        let summary = demo_of(joints, &place, 4.0, &more);
+        let summary = demo_of(joints, &place, 6.0, &more);
         assert_eq!(summary["lost"], 0, "{summary}");
         assert!(summary["valid_share"].as_f64().unwrap() > 0.3, "{summary}");
         let log = place.read("d/gateway.log");
@@ -2805,13 +2805,8 @@ fn a_demonstration_learns_what_its_urdf_has_wrong() {
         "{summary}"
     );
     let share = |phase: &str, key: &str| identification[phase][key].as_f64().unwrap();
-    // At rest nothing is identified: the torques are those of the CAD, and said to be as uncertain.
-    assert!(share("before", "within_2_sigma") > 0.9, "{summary}");
-    for joint in ["l_elbow", "l_wrist_yaw"] {
-        let errors = ["identified", "cad"].map(|whose| &identification["before"][whose][joint]);
-        let [identified, cad] = errors.map(|error| error.as_f64().unwrap());
-        assert!((identified / cad - 1.0).abs() < 0.1, "{joint}: {summary}");
-    }
+    // At rest nothing is identified, and nothing shows that the setup is as stated.
+    assert_eq!(share("before", "valid_share"), 0.0, "{summary}");
     assert!(
         summary["valid_share"].as_f64().unwrap() >= 0.95,
         "{summary}"
@@ -2905,13 +2900,13 @@ fn a_demonstration_with_faults_says_so() {
     );
     // A motor board is silent for a second: the torques beyond it are withheld, with the board as
     // the cause.
-    let summary = demo(&place, 3.0, &["--fault", "silent:l_elbow_motor@1..2"]);
+    let summary = demo(&place, 8.0, &["--fault", "silent:l_elbow_motor@6..7"]);
     let share = summary["valid_share"].as_f64().unwrap();
     assert!(share > 0.2 && share < 0.95, "{summary}");
     let found = reasons(&place);
     assert!(found["stale:l_elbow"] > 100, "{found:?}");
     // A saturated force/torque sensor: its frozen values are not used as measurements.
-    let summary = demo(&place, 3.0, &["--fault", "saturate:l_arm_ft_sensor@1..2"]);
+    let summary = demo(&place, 8.0, &["--fault", "saturate:l_arm_ft_sensor@6..7"]);
     let share = summary["valid_share"].as_f64().unwrap();
     assert!(share > 0.2 && share < 0.95, "{summary}");
     let found = reasons(&place);

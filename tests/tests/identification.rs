@@ -672,7 +672,7 @@ fn a_run_that_learns_is_assessed_as_it_went() {
     );
     let elbow = figure(&learnt.torques, "l_elbow");
     assert!(
-        elbow.covered > 0.9 && elbow.rms < 0.1 && elbow.count > 800,
+        elbow.covered > 0.9 && elbow.rms < 0.1 && elbow.count > 650,
         "{elbow:?}"
     );
     // The CAD alone has the CAD's error; its torques are not the robot's.
@@ -1064,11 +1064,11 @@ fn identification_begins_where_the_session_before_ended() {
         .set_identified(&inertias, &[offset], &known.root)
         .unwrap();
     setup.apply(&parameters).unwrap();
-    // The first five seconds of motion: without what was known, the arm is hardly better than CAD
-    // then.
+    // From 2.5 s of motion on no contact since the start is possible any more. Without what was
+    // known, the arm is hardly better than CAD then.
     let log = sessions.log("validate");
     let (begin, _) = sessions.moving("validate");
-    let early = |t: f64| t > begin + 2.0 && t < begin + 6.0;
+    let early = |t: f64| t > begin + 2.5 && t < begin + 6.0;
     let resumed = scores(&sessions, "validate", &log, setup, early);
     let cad = scores(
         &sessions,
@@ -1143,7 +1143,7 @@ fn a_state_is_resumed_and_one_that_does_not_fit_is_refused() {
         .filter_map(|row| {
             let t = truth.column("t")[row];
             let at = told.iter().find(|e| (e.t.seconds() - t).abs() < 1e-6)?;
-            let is_early = t > begin + 0.5 && t < begin + 4.0;
+            let is_early = t > begin + 2.5 && t < begin + 5.0;
             is_early.then(|| {
                 at.torques.joints()[3].torque - truth.column(&format!("joint/{joint}/torque"))[row]
             })
@@ -1166,7 +1166,7 @@ fn a_state_is_resumed_and_one_that_does_not_fit_is_refused() {
     assert!(
         refused(&format!("{}{other}{}", &text[..at], &text[at + 1..])).contains("wrong checksum")
     );
-    assert!(refused(&text.replacen("state 3", "state 4", 1)).contains("schema 4"));
+    assert!(refused(&text.replacen("state 4", "state 5", 1)).contains("schema 5"));
     let mut config = Config::load(&sessions.folder.join("estimator.toml")).unwrap();
     config.identification.enabled = true;
     config.contact.last_mut().unwrap().presence = Presence::Possible;
@@ -1572,17 +1572,29 @@ fn standing(log: &str, until: f64, times: usize) -> String {
 fn standing_still_teaches_nothing() {
     let sessions = arm();
     let log = standing(&sessions.log("train"), 4.8, 12);
-    let (estimates, _, counts, changes) = told(learning(&sessions), &log, 0);
+    let mut end = None;
+    let (estimates, _, counts, changes) = told_by(learning(&sessions), &log, 0, &mut end);
     assert!(
         changes.is_empty() && counts.learnt > 2000,
         "{counts:?} {changes:?}"
     );
-    let elbow = |at: &Estimate| at.torques.joints()[3];
-    let (early, late) = (elbow(&estimates[150]), elbow(estimates.last().unwrap()));
-    println!("{early:?} {late:?}");
-    // Parameters without information stay uncertain, and the torque stays that of the CAD.
-    assert!(late.standard_deviation > 0.5 * early.standard_deviation);
-    assert!((late.torque - early.torque).abs() < late.standard_deviation);
+    // At rest nothing shows that the setup is as stated, and parameters without information stay
+    // those of the CAD, as uncertain as before.
+    let elbow = estimates.last().unwrap().torques.joints()[3];
+    assert_eq!(
+        (elbow.valid, elbow.reason.get()),
+        (0, Some(Reason::Uncertain))
+    );
+    let end = end.unwrap();
+    let (model, known) = (&end.setup().robot.model, end.identification().unwrap());
+    let known = &known.solution().components[0];
+    for (place, (&link, body)) in known.links.iter().zip(&known.bodies).enumerate() {
+        let deviation = known.root.column(10 * place).norm();
+        let cad = model.inertias()[link].mass;
+        let of_cad = end.setup().robot.urdf_relative_std * cad;
+        assert!(deviation > 0.5 * of_cad, "{link}: {deviation} {of_cad}");
+        assert!((body.mass - cad).abs() < deviation, "{link}: {}", body.mass);
+    }
 }
 
 /// Identifies from logs given as text, with the URDF that is 20 % wrong.

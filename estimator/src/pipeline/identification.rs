@@ -116,6 +116,7 @@ fn measurement_setup(setup: &Setup) -> SensorFingerprint {
 fn covariance(setup: &Setup, solution: &Solution) -> Covariance {
     let blocks = solution.components.iter().map(|component| PosteriorBlock {
         links: &component.links,
+        bodies: &component.bodies,
         sensors: &component.sensors,
         root: (component.root.nrows() > 0).then_some(&component.root),
         offsets: &component.offsets,

@@ -19,6 +19,10 @@
 //! wrench at any contact. It stays present until `q` is plausible without it. If no contact
 //! explains the residual, all torques of the sub-tree are withheld, because the place where the
 //! wrench acts is unknown.
+//!
+//! A contact that is detected from the start on may as well be a wrong offset, a wrong mounting, or
+//! another direction of gravity. So it counts only once the residual of its sub-tree has been
+//! plausible without it for [`FREE`].
 
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::spatial::{Vec3, Wrench};
@@ -40,6 +44,8 @@ const TIME_CONSTANT: Nanos = Nanos::from_millis(50);
 /// Distance from a contact's position to the force of a detected contact, one standard deviation
 /// \[m\]: 99 % within 17 cm, the size of a hand or a foot.
 const CONTACT_RADIUS: f64 = 0.05;
+/// Time in which a plausible residual confirms the model: twenty means that are independent.
+const FREE: f64 = 1.0;
 /// Rounding error of the variances computed in single precision, relative.
 const ROUNDING_SHARE: f64 = 1e-6;
 
@@ -55,6 +61,8 @@ pub(super) struct SubtreeResidual {
     pub(super) contact: Option<usize>,
     /// Whether the residual is significant and no contact explains it.
     pub(super) is_unexplained: bool,
+    /// Whether a contact explains it, but the model has not been confirmed without one.
+    pub(super) is_unconfirmed: bool,
 }
 
 impl SubtreeResidual {
@@ -66,6 +74,7 @@ impl SubtreeResidual {
         significance: f64::NAN,
         contact: None,
         is_unexplained: false,
+        is_unconfirmed: false,
     };
 }
 
@@ -78,6 +87,10 @@ pub(super) struct ResidualMonitor {
 struct SubtreeState {
     residual: SubtreeResidual,
     mean: Option<Mean>,
+    /// When it was last tested, and for how long the residual was plausible without a contact
+    /// \[s\].
+    tested: Nanos,
+    free: f64,
 }
 
 /// Exponential mean of the imbalance `b`.
@@ -104,6 +117,8 @@ impl ResidualMonitor {
         let nothing = || SubtreeState {
             residual: SubtreeResidual::NOTHING,
             mean: None,
+            tested: Nanos::MIN,
+            free: 0.0,
         };
         Self {
             subtrees: structure.subtrees().iter().map(|_| nothing()).collect(),
@@ -171,6 +186,13 @@ impl ResidualMonitor {
             };
             state.mean = Some(test.mean);
             state.residual = test.run(least, before);
+            let since = solved
+                .t
+                .saturating_sub(std::mem::replace(&mut state.tested, solved.t));
+            if state.residual.significance <= PLAUSIBLE {
+                state.free += since.min(TIME_CONSTANT).seconds();
+            }
+            state.residual.is_unconfirmed = state.residual.contact.is_some() && state.free < FREE;
         }
     }
 

@@ -143,13 +143,16 @@ impl Pipeline {
             .zip(self.motion.torque_std())
             .zip(self.place_errors.torque_std());
         let structure = &self.setup.robot.structure;
-        let is_unexplained = |link: usize| {
-            let residual = structure
-                .subtree_of(link)
-                .and_then(|number| self.residuals.subtrees().nth(number));
-            residual.is_some_and(|residual| residual.is_unexplained)
+        let doubted = |link: usize| {
+            let number = structure.subtree_of(link)?;
+            let residual = self.residuals.subtrees().nth(number)?;
+            match residual {
+                _ if residual.is_unexplained => Some(Reason::Unexplained),
+                _ if residual.is_unconfirmed => Some(Reason::Contradicted),
+                _ => None,
+            }
         };
-        let unexplained = |dof: usize| structure.moved_by(dof).iter().copied().any(is_unexplained);
+        let moved = |dof: usize| structure.moved_by(dof).iter().copied();
         let identification = self.identification.as_ref();
         let doubts = identification.map(|own| &own.online.solution().doubts);
         let robot = &self.setup.robot;
@@ -181,8 +184,8 @@ impl Pipeline {
                 let number = channel.and_then(|channel| u32::try_from(channel).ok());
                 (reason, cause) = (Reason::Contradicted, number.unwrap_or(NO_CAUSE));
             }
-            if reason == Reason::None && unexplained(dof) {
-                reason = Reason::Unexplained;
+            if reason == Reason::None {
+                reason = moved(dof).find_map(doubted).unwrap_or_default();
             }
             if reason == Reason::None
                 && self
@@ -235,8 +238,8 @@ impl Pipeline {
         {
             let (mut reason, mut cause) = validity.reason_and_cause(dependence);
             let link = structure.contacts().get(number).map(|spec| spec.frame.link);
-            if reason == Reason::None && link.is_some_and(is_unexplained) {
-                reason = Reason::Unexplained;
+            if reason == Reason::None {
+                reason = link.and_then(doubted).unwrap_or_default();
             }
             match result.certainty {
                 Certainty::Absent => (reason, cause) = (Reason::Absent, NO_CAUSE),

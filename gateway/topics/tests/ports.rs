@@ -647,7 +647,7 @@ fn every_payload_is_checked() {
         reserved: 0,
         joints: [JointTorque::ABSENT; MAX_JOINTS],
     };
-    torques.joints[1].reason = Code::of_number(14);
+    torques.joints[1].reason = Code::of_number(15);
     assert!(torques.is_valid(), "what is not counted is not looked at");
     torques.count = 2;
     assert!(!torques.is_valid());

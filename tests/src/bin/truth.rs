@@ -3,7 +3,7 @@
 //!
 //! ```text
 //! truth [FIRST LAST [TROUBLE..]]     seeds, and parts of troubles' names; default: 1 12, all
-//! truth --keep FOLDER SEED TROUBLE   writes one run's log and configuration
+//! truth --keep FOLDER SEED TROUBLE   writes one run's log, configuration and URDF
 //! ```
 
 use proprio_tests::truth::{Outcome, Run, TROUBLES, Trouble};
@@ -20,9 +20,10 @@ fn main() -> ExitCode {
             panic!("{name:?} names no trouble, or several");
         };
         let run = Run::new(seed, trouble).expect("the robot has no such channel");
-        let [log, config] = run.files();
-        std::fs::write(format!("{folder}/log.csv"), log).expect("a file");
-        std::fs::write(format!("{folder}/estimator.toml"), config).expect("a file");
+        let names = ["log.csv", "estimator.toml", "model.urdf"];
+        for (name, text) in names.iter().zip(run.files()) {
+            std::fs::write(format!("{folder}/{name}"), text).expect("a file");
+        }
         println!("{:#?}", run.judged());
         return ExitCode::SUCCESS;
     }

@@ -16,6 +16,7 @@ pub(super) struct Robot {
     pub(super) name: String,
     /// estimator.toml, with unknown offsets; `model` names no file.
     pub(super) config: Table,
+    pub(super) urdf: String,
     /// The URDF.
     pub(super) cad: Model,
     /// The links that may be touched.
@@ -172,6 +173,7 @@ impl Robot {
         Self {
             name,
             config,
+            urdf: urdf.into(),
             cad,
             tips,
         }

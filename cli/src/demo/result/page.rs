@@ -47,10 +47,12 @@ fn facts(evaluation: &Evaluation<'_>) -> Vec<(&'static str, String)> {
             format!("{} valid", percent(before.valid_share)),
         ));
     }
-    facts.push((
-        "errors within 2σ",
-        format!("{} {since}", percent(judged.within_2_sigma)),
-    ));
+    if judged.valid_share > 0.0 {
+        facts.push((
+            "errors within 2σ",
+            format!("{} {since}", percent(judged.within_2_sigma)),
+        ));
+    }
     facts.push((
         "latency from frame to torque",
         format!(

@@ -16,11 +16,16 @@
 //! counts as one tick.
 //!
 //! # What follows
-//! A hypothesis is refuted when its odds against the likeliest one are below a millionth. Until
-//! then its torques may be the true ones. So the deviation of a torque is at least that of the
-//! hypothesis, and covers the torque of the hypothesis within [`COVERED`] deviations. If another
-//! hypothesis than the stated one is the likeliest, no torque is valid that depends on the sub-tree
-//! or its sensors.
+//! Unless a hypothesis is less likely than an error beyond the promised four deviations, its torques
+//! may be the true ones. So the deviation of a torque is at least that of the hypothesis, and covers
+//! the torque of the hypothesis within [`COVERED`] deviations. If another hypothesis than the stated
+//! one is the likeliest, no torque is valid that depends on the sub-tree or its sensors; it is named
+//! once the stated one is that unlikely. A hypothesis with odds below a millionth is refuted, and
+//! dropped.
+//!
+//! Before the first two seconds of motion nothing is known about a new setup, and its torques are
+//! unknown. A setup that an earlier run has confirmed is taken as stated until something contradicts
+//! it.
 
 mod evidence;
 mod hypothesis;
@@ -47,6 +52,8 @@ const COVERED: f64 = 2.5;
 /// Postures in which torques are compared, one in [`APART`] ticks: those of 10 s.
 const POSTURES: usize = 20;
 const APART: usize = 5;
+/// Ticks in motion from which on torques are compared: those of 2 s.
+const SHOWN: usize = 20;
 /// Ticks that wait for the gate, at most: those of 3 s.
 const MOST_WAITING: usize = 30;
 /// Period of the ticks.
@@ -272,8 +279,9 @@ impl Bank {
     }
 
     /// Sets the doubts about the torques of a solution, which is in use. Torques that can not be
-    /// compared keep theirs.
-    pub(crate) fn doubt(&mut self, solution: &mut Solution) {
+    /// compared keep theirs. `disturbed` are the components whose rows are rejected, a bit each: what
+    /// was learnt does not explain their readings.
+    pub(crate) fn doubt(&mut self, solution: &mut Solution, disturbed: u64) {
         let Self {
             place,
             units,
@@ -286,37 +294,38 @@ impl Bank {
             .components
             .iter_mut()
             .for_each(|own| own.leading = None);
-        for unit in units {
-            let dofs = place.dofs(unit);
+        for unit in units.iter() {
+            let dofs = place.dofs(&unit.columns.sensors, Some(unit.subtree));
             let (leading, alternatives) = (unit.leading(), unit.alternatives());
             let of_component = &mut solution.components[unit.component].leading;
             *of_component = of_component.or(leading);
-            for tick in recent
-                .iter()
-                .filter(|tick| tick.learnt & bit(unit.component) != 0)
-            {
+            let mut add = |dof: usize, deviation: f64| {
+                let doubt = doubts[dof].get_or_insert(Doubt::NONE);
+                doubt.deviation = doubt.deviation.max(deviation);
+                doubt.leading = doubt.leading.or(leading);
+            };
+            // The first postures of a motion do not show yet how far apart the torques will be.
+            let is_shown = unit.fits[0].ticks() >= SHOWN && disturbed & bit(unit.component) == 0;
+            if unit.is_doubtful() || !unit.is_settled() {
+                let beyond = place.dofs(&measured_with(unit, units), None);
+                beyond.iter().for_each(|&dof| add(dof, f64::INFINITY));
+            }
+            if unit.is_doubtful() || !unit.is_settled() && !is_shown {
+                dofs.iter().for_each(|&dof| add(dof, f64::INFINITY));
+                continue;
+            }
+            let learnt = |tick: &&Tick| tick.learnt & bit(unit.component) != 0;
+            for tick in recent.iter().filter(learnt) {
                 let published = place.torques(tick, &Hypothesis::AS_STATED, &in_use, &dofs);
-                let mut deviations = vec![0.0_f64; dofs.len()];
                 for other in &alternatives {
                     let torques = place.alternative(tick, (&unit.columns, other), &in_use, &dofs);
-                    let both = published.iter().zip(torques);
-                    for (deviation, both) in deviations.iter_mut().zip(both) {
+                    for (&dof, both) in dofs.iter().zip(published.iter().zip(torques)) {
                         if let (Some((published, _)), Some((torque, own))) = both {
-                            let apart = (torque - published).abs() / COVERED;
-                            *deviation = deviation.max(apart).max(own);
+                            add(dof, ((torque - published).abs() / COVERED).max(own));
                         }
                     }
                 }
-                for (&dof, deviation) in dofs.iter().zip(deviations) {
-                    let before = doubts[dof].unwrap_or(Doubt {
-                        deviation: 0.0,
-                        leading: None,
-                    });
-                    doubts[dof] = Some(Doubt {
-                        deviation: deviation.max(before.deviation),
-                        leading: before.leading.or(leading),
-                    });
-                }
+                dofs.iter().for_each(|&dof| add(dof, 0.0));
             }
         }
         for (to, doubt) in solution.doubts.iter_mut().zip(doubts) {
@@ -339,6 +348,17 @@ impl Bank {
         let model = self.place.model.clone();
         self.of(component)
             .for_each(|unit| unit.forget_loads(&model));
+    }
+
+    /// From now on the setup of a component is taken as one that was confirmed before.
+    pub(crate) fn confirm(&mut self, component: usize) {
+        self.of(component).for_each(Unit::confirm);
+    }
+
+    /// Whether the setup of a component is as stated, as far as is known.
+    pub(crate) fn is_confirmed(&self, component: usize) -> bool {
+        let mut own = self.units.iter().filter(|unit| unit.component == component);
+        own.all(Unit::is_confirmed)
     }
 
     fn of(&mut self, component: usize) -> impl Iterator<Item = &mut Unit> {
@@ -457,12 +477,11 @@ impl Place {
             .collect()
     }
 
-    /// The degrees of freedom whose torques depend on a sub-tree or its sensors.
-    fn dofs(&self, unit: &Unit) -> Vec<usize> {
-        let sensors = &unit.columns.sensors;
+    /// The degrees of freedom whose torques depend on one of these sensors, or on this sub-tree.
+    fn dofs(&self, sensors: &[usize], own: Option<usize>) -> Vec<usize> {
         let is_own = |subtree: usize| {
             let mut of_subtree = self.structure.subtrees()[subtree].sensors.iter();
-            subtree == unit.subtree || of_subtree.any(|sensor| sensors.contains(&sensor))
+            Some(subtree) == own || of_subtree.any(|sensor| sensors.contains(&sensor))
         };
         let depends = |dof: &usize| {
             let links = self.structure.moved_by(*dof).iter();
@@ -505,6 +524,18 @@ impl Place {
         }
         all
     }
+}
+
+/// The sensors whose offsets follow from those of a unit: no other sub-tree weighs them alone.
+fn measured_with(unit: &Unit, units: &[Unit]) -> Vec<usize> {
+    let sensors = |unit: &Unit| unit.columns.sensors.clone();
+    let is_alone = |sensor: &usize| units.iter().any(|other| sensors(other) == [*sensor]);
+    let shares = |other: &&Unit| {
+        let mut own = other.columns.sensors.iter();
+        own.any(|sensor| unit.columns.sensors.contains(sensor))
+    };
+    let found = units.iter().filter(shares).flat_map(sensors);
+    found.filter(|sensor| !is_alone(sensor)).collect()
 }
 
 /// The row of a torque over the columns of the robot.

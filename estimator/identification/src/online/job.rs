@@ -2,7 +2,7 @@
 //! use.
 
 use crate::linear::information::{Information, Panel};
-use crate::online::bank::{Bank, Tick};
+use crate::online::bank::{Bank, Tick, bit};
 use crate::online::channel::{Channel, SecondMean};
 use crate::online::component::{Component, channels};
 use crate::online::parameters::Parameters;
@@ -642,7 +642,9 @@ impl Job {
                 None => {}
             }
         }
-        self.bank.doubt(&mut self.solution);
+        let disturbed = (self.parts.iter().enumerate()).filter(|(_, part)| part.is_disturbed);
+        let disturbed = disturbed.fold(0, |bits, (number, _)| bits | bit(number));
+        self.bank.doubt(&mut self.solution, disturbed);
     }
 
     /// The result.

@@ -253,6 +253,10 @@ impl Doubt {
         deviation: f64::INFINITY,
         leading: None,
     };
+    pub(crate) const NONE: Self = Self {
+        deviation: 0.0,
+        leading: None,
+    };
 }
 
 /// Period of the solutions, and the delay of their use after their data.

@@ -124,7 +124,7 @@ impl Branch {
             log_prior: prior.ln(),
             noise: 1.0,
             log_evidence: 0.0,
-            log_odds: 0.0,
+            log_odds: prior.ln(),
             is_refuted: false,
         }
     }
@@ -159,6 +159,7 @@ pub(super) struct Fit {
     /// Of `[A | y of each branch]`; empty before the first tick.
     gram: DMatrix<f64>,
     rows: f64,
+    ticks: usize,
     /// The log-evidence of unknowns that were forgotten.
     forgotten: f64,
 }
@@ -177,8 +178,14 @@ impl Fit {
             branches,
             gram: DMatrix::zeros(0, 0),
             rows: 0.0,
+            ticks: 0,
             forgotten: 0.0,
         }
+    }
+
+    /// Number of ticks that were added.
+    pub(super) fn ticks(&self) -> usize {
+        self.ticks
     }
 
     pub(super) fn hypothesis(&self, branch: &Branch) -> Hypothesis {
@@ -254,6 +261,7 @@ impl Fit {
             }
             self.gram.gemm_tr(1.0, &all, &all, 1.0);
             self.rows += count as f64;
+            self.ticks += 1;
         }
     }
 

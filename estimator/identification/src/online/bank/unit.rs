@@ -10,8 +10,13 @@ use proprio_dynamics::{ContactSet, Structure};
 
 /// Prior odds of a contact since the start.
 const CONTACT: f64 = 0.1;
-/// Prior odds of each other hypothesis.
+/// Prior odds of each other hypothesis about a setup that is new, and about one that was confirmed
+/// before: one start in a hundred thousand is the first one after somebody has changed it.
 const STRUCTURAL: f64 = 1e-3;
+const CHANGED: f64 = 1e-5;
+/// Odds below which a hypothesis needs no cover: it is no likelier than an error of more than four
+/// deviations.
+const UNLIKELY: f64 = 6.3e-5;
 /// Odds below which a hypothesis is refuted. With a hundred hypotheses about a robot, one of ten
 /// thousand robots has a true one refuted.
 const REFUTED: f64 = 1e-6;
@@ -56,6 +61,28 @@ impl Unit {
     /// Drops everything that was learnt.
     pub(super) fn begin_anew(&mut self) {
         self.fits.clone_from(&self.at_start);
+    }
+
+    /// From now on the setup is taken as one that was confirmed before.
+    pub(super) fn confirm(&mut self) {
+        let fits = self.fits.iter_mut().chain(&mut self.at_start);
+        for fit in fits {
+            let view = fit.view;
+            for branch in &mut fit.branches {
+                if is_structural(view, branch.sight) {
+                    branch.log_prior = CHANGED.ln();
+                }
+            }
+        }
+    }
+
+    /// Whether everything but a contact is as stated, as far as is known.
+    pub(super) fn is_confirmed(&self) -> bool {
+        let mut structural = self.fits.iter().flat_map(|fit| {
+            let of_fit = fit.branches.iter();
+            of_fit.filter(|branch| is_structural(fit.view, branch.sight))
+        });
+        !structural.any(Branch::needs_cover)
     }
 
     pub(super) fn forget_offsets(&mut self) {
@@ -139,8 +166,25 @@ impl Unit {
         });
     }
 
-    /// The likeliest hypothesis, if it is not the stated one.
+    /// The odds of what is stated, or differs from it by a contact with next to no force.
+    fn stated(&self) -> f64 {
+        let contacts = self.fits.iter().filter(|fit| fit.contact.is_some());
+        let harmless = contacts.filter(|fit| fit.force(&self.columns) <= LITTLE);
+        harmless
+            .map(|fit| fit.branches[0].log_odds)
+            .fold(self.fits[0].branches[0].log_odds, f64::max)
+    }
+
+    /// Whether another hypothesis is likelier than what is stated.
+    pub(super) fn is_doubtful(&self) -> bool {
+        self.stated() < 0.0
+    }
+
+    /// The likeliest hypothesis, if what is stated is refuted beside it.
     pub(super) fn leading(&self) -> Option<Hypothesis> {
+        if self.stated() > UNLIKELY.ln() {
+            return None;
+        }
         let all = self
             .fits
             .iter()
@@ -148,8 +192,12 @@ impl Unit {
         let best = all
             .filter(|(_, branch)| !branch.is_refuted)
             .max_by(|a, b| a.1.log_odds.total_cmp(&b.1.log_odds));
-        let hypothesis = best.map(|(fit, branch)| fit.hypothesis(branch));
-        hypothesis.filter(|hypothesis| *hypothesis != Hypothesis::AS_STATED)
+        best.map(|(fit, branch)| fit.hypothesis(branch))
+    }
+
+    /// Whether everything is as stated, as far as is known.
+    pub(super) fn is_settled(&self) -> bool {
+        self.is_confirmed() && !self.may_have_begun_in_contact()
     }
 
     /// Whether there may have been a contact since the start, with a force that matters. One with
@@ -160,7 +208,7 @@ impl Unit {
             .any(|fit| fit.contact.is_some() && fit.force(&self.columns) > LITTLE)
     }
 
-    /// All hypotheses that are not refuted, but the stated one.
+    /// All hypotheses that need cover, but the stated one.
     pub(super) fn alternatives(&self) -> Vec<Posterior> {
         let all = self.fits.iter().flat_map(|fit| {
             fit.branches
@@ -169,10 +217,22 @@ impl Unit {
                 .map(move |(number, branch)| (fit, number, branch))
         });
         all.filter(|(fit, _, branch)| {
-            !branch.is_refuted && fit.hypothesis(branch) != Hypothesis::AS_STATED
+            branch.needs_cover() && fit.hypothesis(branch) != Hypothesis::AS_STATED
         })
         .filter_map(|(fit, number, _)| fit.posterior(&self.columns, number))
         .collect()
+    }
+}
+
+/// Whether a hypothesis is about the setup.
+fn is_structural(view: View, sight: Sight) -> bool {
+    view != View::AsStated || sight != Sight::AsStated
+}
+
+impl Branch {
+    /// Whether torques must cover it.
+    fn needs_cover(&self) -> bool {
+        !self.is_refuted && self.log_odds > UNLIKELY.ln()
     }
 }
 
@@ -215,7 +275,13 @@ fn hypotheses(
     };
     let mut views: Vec<View> = dofs.iter().copied().map(View::Reversed).collect();
     views.extend(dofs.iter().copied().filter(is_turning).map(View::Degrees));
-    views.extend(dofs.windows(2).map(|pair| View::Swapped(pair[0], pair[1])));
+    // Of a limb's encoders any two may be swapped.
+    for b in 0..model.dof_count() {
+        let link = model.dof_joint(b).map_or(0, |joint| joint + 1);
+        let limb = above(model, link).into_iter().filter(|a| *a != b);
+        let concerned = limb.filter(|a| dofs.contains(a) || dofs.contains(&b));
+        views.extend(concerned.map(|a| View::Swapped(a.min(b), a.max(b))));
+    }
     match base {
         BaseMotion::Imu(pose) => {
             let to_base = |turn| pose.rotation * turn * pose.rotation.transpose();
@@ -249,19 +315,21 @@ fn hypotheses(
     fits
 }
 
+/// The degrees of freedom that move a link against the root.
+fn above(model: &Model, mut link: usize) -> Vec<usize> {
+    let mut dofs = Vec::new();
+    while link > 0 {
+        let joint = &model.joints()[link - 1];
+        dofs.extend(joint.dof);
+        link = joint.parent;
+    }
+    dofs
+}
+
 /// The degrees of freedom that move one of these links against the base.
 fn path(model: &Model, base: usize, links: &[usize]) -> Vec<usize> {
-    let above = |mut link: usize| {
-        let mut dofs = Vec::new();
-        while link > 0 {
-            let joint = &model.joints()[link - 1];
-            dofs.extend(joint.dof);
-            link = joint.parent;
-        }
-        dofs
-    };
-    let of_base = above(base);
-    let of_links: Vec<Vec<usize>> = links.iter().map(|&link| above(link)).collect();
+    let of_base = above(model, base);
+    let of_links: Vec<Vec<usize>> = links.iter().map(|&link| above(model, link)).collect();
     let is_between = |dof: &usize| {
         let is_above = |dofs: &Vec<usize>| dofs.contains(dof) != of_base.contains(dof);
         of_links.iter().any(is_above)
