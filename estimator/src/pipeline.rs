@@ -68,6 +68,7 @@ mod motion;
 mod prediction;
 mod residuals;
 mod solution;
+mod steps;
 mod validity;
 
 pub use estimate::{Counts, Estimate};
@@ -95,6 +96,7 @@ use proprio_identification::robot::{BaseMotion, ChannelRole};
 use proprio_topics::{InertiaEstimate, Nanos, Quality, Reason};
 use residuals::ResidualMonitor;
 use std::collections::VecDeque;
+use steps::StepCover;
 use validity::Dependences;
 
 /// The estimator's core: no input, no output, no clock.
@@ -129,6 +131,8 @@ pub struct Pipeline {
     place_errors: PlaceErrors,
     /// Tests the F/T residual of each sub-tree.
     residuals: ResidualMonitor,
+    /// What else the residuals may be.
+    steps: StepCover,
     position: Vec<f64>,
     velocity: Vec<f64>,
     acceleration: Vec<f64>,
@@ -235,6 +239,7 @@ impl Pipeline {
             motion: Box::new(motion.expect("the base is a link of the model")),
             place_errors: PlaceErrors::new(&setup.robot.structure),
             residuals: ResidualMonitor::new(&setup.robot.structure),
+            steps: StepCover::new(&setup.robot.structure, dofs),
             position: setup.robot.position_without_samples(),
             velocity: vec![0.0; dofs],
             acceleration: vec![0.0; dofs],

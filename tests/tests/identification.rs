@@ -1583,7 +1583,7 @@ fn standing_still_teaches_nothing() {
     let elbow = estimates.last().unwrap().torques.joints()[3];
     assert_eq!(
         (elbow.valid, elbow.reason.get()),
-        (0, Some(Reason::Uncertain))
+        (0, Some(proprio_topics::Reason::Uncertain))
     );
     let end = end.unwrap();
     let (model, known) = (&end.setup().robot.model, end.identification().unwrap());

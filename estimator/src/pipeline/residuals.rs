@@ -24,6 +24,7 @@
 //! another direction of gravity. So it counts only once the residual of its sub-tree has been
 //! plausible without it for [`FREE`].
 
+use super::steps::Step;
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{
@@ -33,7 +34,7 @@ use proprio_identification::statistics::deviate;
 use proprio_topics::Nanos;
 
 /// The deviate above which a residual is significant: by chance, 3 of 10 million instants.
-const SIGNIFICANT: f64 = 5.0;
+pub(super) const SIGNIFICANT: f64 = 5.0;
 /// The deviate up to which a residual is plausible: 99 % of instants without an unknown wrench.
 const PLAUSIBLE: f64 = 2.326;
 /// Advantage of the contact that was detected before, a deviate: of two that fit about equally well
@@ -41,6 +42,8 @@ const PLAUSIBLE: f64 = 2.326;
 const PREVIOUS: f64 = 1.0;
 /// Time constant of the mean imbalance.
 const TIME_CONSTANT: Nanos = Nanos::from_millis(50);
+/// Time after which the mean shows a change whole, but for a thousandth.
+pub(super) const SETTLED: Nanos = Nanos::from_millis(350);
 /// Distance from a contact's position to the force of a detected contact, one standard deviation
 /// \[m\]: 99 % within 17 cm, the size of a hand or a foot.
 const CONTACT_RADIUS: f64 = 0.05;
@@ -87,6 +90,8 @@ pub(super) struct ResidualMonitor {
 struct SubtreeState {
     residual: SubtreeResidual,
     mean: Option<Mean>,
+    /// What the residual may be instead of a contact.
+    steps: Vec<Step>,
     /// When it was last tested, and for how long the residual was plausible without a contact
     /// \[s\].
     tested: Nanos,
@@ -114,14 +119,15 @@ pub(super) struct Solved<'a> {
 
 impl ResidualMonitor {
     pub(super) fn new(structure: &Structure) -> Self {
-        let nothing = || SubtreeState {
+        let nothing = |number: usize| SubtreeState {
             residual: SubtreeResidual::NOTHING,
             mean: None,
+            steps: Step::of_subtree(structure, number),
             tested: Nanos::MIN,
             free: 0.0,
         };
         Self {
-            subtrees: structure.subtrees().iter().map(|_| nothing()).collect(),
+            subtrees: (0..structure.subtrees().len()).map(nothing).collect(),
             least: LeastSquares::with_capacity(6 * structure.contacts().len()),
         }
     }
@@ -129,6 +135,12 @@ impl ResidualMonitor {
     /// The residual of each sub-tree.
     pub(super) fn subtrees(&self) -> impl Iterator<Item = &SubtreeResidual> {
         self.subtrees.iter().map(|subtree| &subtree.residual)
+    }
+
+    /// Each sub-tree's number, and what its residual may be instead of a contact.
+    pub(super) fn steps(&self) -> impl Iterator<Item = (usize, &Step)> {
+        let all = self.subtrees.iter().enumerate();
+        all.flat_map(|(number, state)| state.steps.iter().map(move |step| (number, step)))
     }
 
     /// The detected contacts.
@@ -162,6 +174,7 @@ impl ResidualMonitor {
             };
             let Some(model_covariance) = model_covariance else {
                 state.mean = None;
+                state.steps.iter_mut().for_each(Step::end);
                 continue;
             };
             let b = Vector6::from(
@@ -186,6 +199,13 @@ impl ResidualMonitor {
             };
             state.mean = Some(test.mean);
             state.residual = test.run(least, before);
+            let is_disturbed = state.residual.contact.is_some() || state.residual.is_unexplained;
+            let covariance = test.noise * test.mean.variance_ratio + test.model;
+            for step in &mut state.steps {
+                let pose = solved.solver.sensor_pose(step.sensor);
+                let residual = is_disturbed.then_some((&test.mean.value, &covariance));
+                step.follow(solved.t, residual, pose);
+            }
             let since = solved
                 .t
                 .saturating_sub(std::mem::replace(&mut state.tested, solved.t));
@@ -207,6 +227,7 @@ impl ResidualMonitor {
     pub(super) fn reset(&mut self) {
         for subtree in &mut self.subtrees {
             (subtree.residual, subtree.mean) = (SubtreeResidual::NOTHING, None);
+            subtree.steps.iter_mut().for_each(Step::end);
         }
     }
 }

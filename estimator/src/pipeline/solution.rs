@@ -28,6 +28,9 @@ impl Pipeline {
                 &active.union(&self.residuals.detected()),
             );
         }
+        if solved {
+            self.cover_steps(&active);
+        }
         self.write_estimate(t, solved);
     }
 
@@ -141,7 +144,8 @@ impl Pipeline {
             .zip(self.propagation.torque_std())
             .zip(self.solver.torque_certainty())
             .zip(self.motion.torque_std())
-            .zip(self.place_errors.torque_std());
+            .zip(self.place_errors.torque_std())
+            .zip(self.steps.torque());
         let structure = &self.setup.robot.structure;
         let doubted = |link: usize| {
             let number = structure.subtree_of(link)?;
@@ -160,7 +164,7 @@ impl Pipeline {
             .filter(|(dof, _)| robot.is_published(*dof));
         for (
             place,
-            (dof, ((((((torque, noise), model), certainty), motion), located), dependence)),
+            (dof, (((((((torque, noise), model), certainty), motion), located), step), dependence)),
         ) in self.estimate.torques.joints.iter_mut().zip(results)
         {
             let (mut reason, mut cause) = validity.reason_and_cause(dependence);
@@ -170,7 +174,8 @@ impl Pipeline {
                 .hypot(*model)
                 .hypot(*motion)
                 .hypot(*located)
-                .max(least);
+                .max(least)
+                .max(*step);
             if reason == Reason::None && *certainty == Certainty::Assumed {
                 reason = Reason::Undetermined;
             }
@@ -252,6 +257,7 @@ impl Pipeline {
                     .hypot(model[i])
                     .hypot(motion)
                     .hypot(located[i])
+                    .max(self.steps.contact(number, result.wrench.force_first()[i]))
             });
             let is_finite = result.wrench.is_finite() && deviation.iter().all(|x| x.is_finite());
             if !is_solved || !is_finite {

@@ -29,7 +29,8 @@
 //!
 //! # Jumps
 //! A value that is far from where those before it lead is doubtful until the next one confirms it:
-//! one wrong reading is no motion and no load. See [`Jumps`].
+//! one wrong reading is no motion and no load. A value that stops at once, in the midst of a motion,
+//! is not confirmed by its repeats. See [`Jumps`].
 
 use crate::{Nanos, Quality};
 
@@ -194,6 +195,8 @@ const GAP: f64 = 5.0;
 const MEMORY: f64 = 32.0;
 /// So many readings are taken as they come, to see how they are.
 const FIRST: u32 = 16;
+/// No brake stops a joint in less time \[s\].
+const BRAKING: f64 = 0.02;
 /// How much larger the expected distance becomes by one reading, at most: two wrong readings that
 /// confirm each other by chance shall not make the third a usual one.
 const GROWTH: f64 = 2.0;
@@ -257,6 +260,14 @@ impl Path {
         }
         if self.resumes {
             return self.accept(t, value, 0.0);
+        }
+        // The last good value again and again, without time to brake: it is stuck.
+        if let Some((then, before, _)) = self.doubtful
+            && value == before
+            && value == self.value
+            && (then - self.t).seconds() < BRAKING
+        {
+            return true;
         }
         let most = self.most.max(self.step).max(self.least);
         let usual = FAR * most;

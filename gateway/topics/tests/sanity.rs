@@ -365,3 +365,38 @@ fn after_a_gap_it_may_be_anywhere_near() {
     channel.t -= 100;
     assert!(!channel.read(-1e6));
 }
+
+#[test]
+fn an_encoder_that_stops_at_once_is_stuck_and_one_that_brakes_is_not() {
+    let mut noise = Noise(11);
+    let mut read = |value: f64| value + 1e-4 * noise.next();
+    let (mut channel, period) = (Channel::default(), 0.01);
+    let mut position = 0.0;
+    let mut run = |channel: &mut Channel, speed: f64, count: usize| {
+        let mut doubtful = 0;
+        for _ in 0..count {
+            position += speed * period;
+            doubtful += usize::from(channel.read(read(position)));
+        }
+        (doubtful, read(position))
+    };
+    assert_eq!(run(&mut channel, 0.5, 100).0, 0);
+    // Stuck for ten seconds; then it goes on from elsewhere.
+    let (_, last) = run(&mut channel, 0.5, 1);
+    let last = last + 0.0;
+    channel.read(last);
+    assert!((0..1000).all(|_| channel.read(last)));
+    assert!(run(&mut channel, 0.5, 100).0 <= 2);
+    // In steps of a milliradian, it brakes within 50 ms, and stands.
+    let mut channel = Channel::default();
+    let (mut position, mut speed) = (0.0_f64, 0.5_f64);
+    let mut doubtful = 0;
+    for k in 0..1000 {
+        if k > 500 {
+            speed = (speed - 0.1).max(0.0);
+        }
+        position += speed * period;
+        doubtful += usize::from(channel.read((1e3 * position).round() * 1e-3));
+    }
+    assert!(doubtful <= 2, "{doubtful}");
+}

@@ -1,0 +1,203 @@
+//! Steps of F/T offsets: what a residual may be instead of a contact.
+//!
+//! A blow, a cable that slips or a restart of the sensor's board changes its offset at once, and
+//! any change of the six readings may as well be a wrench at a contact, or elsewhere. So from the
+//! first significant residual of a sub-tree on, each of its sensors may have a step that makes the
+//! residual zero, and the deviations of torques cover those that follow from it. A step stays the
+//! same in the axes of the sensor, while a contact rarely does. So it is refuted as soon as the
+//! residual has changed there significantly since it settled.
+
+use super::Pipeline;
+use super::residuals::{SETTLED, SIGNIFICANT};
+use nalgebra::{Matrix6, Vector6};
+use proprio_dynamics::model::Model;
+use proprio_dynamics::spatial::{Pose, Wrench};
+use proprio_dynamics::{ContactSet, Kinematics, Solver, Structure};
+use proprio_identification::statistics::deviate;
+use proprio_topics::Nanos;
+
+/// Deviations within which a torque lies that may be the true one. At four, the promise, almost
+/// half of the room remains for its own uncertainty.
+const COVERED: f64 = 2.5;
+
+/// A step of one sensor, as far as it may explain the residual of a sub-tree.
+#[derive(Debug, Clone)]
+pub(super) struct Step {
+    pub(super) sensor: usize,
+    /// The change of its reading that makes the residual zero, per unit of the residual in its
+    /// axes: 1 or -1.
+    sign: f64,
+    state: State,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum State {
+    /// There is no residual.
+    None,
+    /// The residual began at this time, and is this in the axes of the sensor.
+    Began(Nanos, Vector6<f64>),
+    /// It settled at the first value, with this covariance, and is the second one now.
+    Settled(Vector6<f64>, Matrix6<f64>, Vector6<f64>),
+    Refuted,
+}
+
+impl Step {
+    /// Those of the sensors of a sub-tree.
+    pub(super) fn of_subtree(structure: &Structure, number: usize) -> Vec<Self> {
+        let sensors = structure.subtrees()[number].sensors.iter();
+        let step = |sensor: usize| {
+            let cut = &structure.sensors()[sensor];
+            let is_child = structure.subtree_of(cut.joint() + 1) == Some(number);
+            Self {
+                sensor,
+                sign: if is_child { cut.sign() } else { -cut.sign() },
+                state: State::None,
+            }
+        };
+        sensors.map(step).collect()
+    }
+
+    /// There is no residual, or it is not known.
+    pub(super) fn end(&mut self) {
+        self.state = State::None;
+    }
+
+    /// Takes the mean residual of the sub-tree at `t` and its covariance, in base coordinates, if
+    /// it is significant; `pose` is that of the sensor.
+    pub(super) fn follow(
+        &mut self,
+        t: Nanos,
+        residual: Option<(&Vector6<f64>, &Matrix6<f64>)>,
+        pose: &Pose,
+    ) {
+        let Some((residual, covariance)) = residual else {
+            return self.end();
+        };
+        let back = |column: &[f64; 6]| {
+            Vector6::from(
+                pose.wrench_back(&Wrench::from_torque_first(*column))
+                    .torque_first(),
+            )
+        };
+        let now = back(&(*residual).into());
+        let in_sensor = || {
+            let columns: [Vector6<f64>; 6] = std::array::from_fn(|axis| {
+                back(&std::array::from_fn(|i| f64::from(u8::from(i == axis))))
+            });
+            let turn = Matrix6::from_columns(&columns);
+            turn * covariance * turn.transpose()
+        };
+        self.state = match self.state {
+            State::None => State::Began(t, now),
+            State::Began(began, _) if t - began < SETTLED => State::Began(began, now),
+            State::Began(..) => State::Settled(now, in_sensor(), now),
+            State::Settled(first, of_first, _) => {
+                let change = now - first;
+                let inverse = (of_first + in_sensor()).cholesky();
+                let square = inverse.map_or(0.0, |inverse| change.dot(&inverse.solve(&change)));
+                match deviate(square, 6) > SIGNIFICANT {
+                    true => State::Refuted,
+                    false => State::Settled(first, of_first, now),
+                }
+            }
+            State::Refuted => State::Refuted,
+        };
+    }
+
+    /// What the reading changed by; none if it is no step.
+    fn change(&self) -> Option<Wrench> {
+        let (State::Began(_, now) | State::Settled(_, _, now)) = &self.state else {
+            return None;
+        };
+        Some(Wrench::from_torque_first((self.sign * now).into()))
+    }
+}
+
+/// How far the torques may be from those that steps of F/T offsets make likely.
+pub(super) struct StepCover {
+    solver: Solver,
+    readings: Vec<Wrench>,
+    torque: Vec<f64>,
+    /// Per contact, whether there may be a step instead of it.
+    contacts: ContactSet,
+}
+
+impl StepCover {
+    pub(super) fn new(structure: &Structure, dofs: usize) -> Self {
+        Self {
+            solver: Solver::new(structure),
+            readings: vec![Wrench::zero(); structure.sensors().len()],
+            torque: vec![0.0; dofs],
+            contacts: ContactSet::EMPTY,
+        }
+    }
+
+    /// The least deviation of each torque.
+    pub(super) fn torque(&self) -> &[f64] {
+        &self.torque
+    }
+
+    /// The least deviation of a component of a contact's wrench.
+    pub(super) fn contact(&self, contact: usize, value: f64) -> f64 {
+        match self.contacts.contains(contact) {
+            true => value.abs() / COVERED,
+            false => 0.0,
+        }
+    }
+
+    /// Compares the torques of `solver` with those of all steps that are not refuted. `declared`
+    /// are the contacts that are known to be present, `detected` those that residuals show.
+    #[allow(clippy::too_many_arguments, reason = "each of another kind")]
+    fn update<'a>(
+        &mut self,
+        model: &Model,
+        structure: &Structure,
+        kinematics: &Kinematics,
+        solver: &Solver,
+        readings: &[Wrench],
+        (declared, detected): (&ContactSet, &ContactSet),
+        steps: impl Iterator<Item = (usize, &'a Step)>,
+    ) {
+        self.torque.fill(0.0);
+        self.contacts = ContactSet::EMPTY;
+        for (number, step) in steps {
+            let Some(change) = step.change() else {
+                continue;
+            };
+            let own = structure.subtrees()[number].contacts.intersection(detected);
+            self.contacts = self.contacts.union(&own);
+            self.readings.copy_from_slice(readings);
+            let Some(reading) = self.readings.get_mut(step.sensor) else {
+                continue;
+            };
+            *reading = *reading + change;
+            let active = declared.union(&detected.difference(&own));
+            let solved =
+                self.solver
+                    .solve(model, structure, kinematics, &self.readings, &active, &[]);
+            if solved.is_err() {
+                continue;
+            }
+            let both = solver.torque().iter().zip(self.solver.torque());
+            for (deviation, (torque, other)) in self.torque.iter_mut().zip(both) {
+                *deviation = deviation.max((torque - other).abs() / COVERED);
+            }
+        }
+    }
+}
+
+impl Pipeline {
+    /// Compares the torques with those that steps of F/T offsets make likely. Does not allocate.
+    pub(super) fn cover_steps(&mut self, active: &ContactSet) {
+        let detected = self.residuals.detected();
+        self.steps.update(
+            &self.setup.state.model,
+            &self.setup.robot.structure,
+            &self.kinematics,
+            &self.solver,
+            &self.readings,
+            (active, &detected),
+            self.residuals.steps(),
+        );
+    }
+}
