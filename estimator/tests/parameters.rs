@@ -1007,6 +1007,7 @@ fn an_uncertain_calibration_stays_uncertain_during_on_line_identification() {
     };
     let group = PosteriorBlock {
         links: &[],
+        bodies: &[],
         sensors: &[0],
         root: Some(&root),
         offsets: &offset,
@@ -1031,6 +1032,7 @@ fn an_uncertain_calibration_stays_uncertain_during_on_line_identification() {
     let got = |group: PosteriorBlock<'_>| {
         let others = PosteriorBlock {
             links: &links,
+            bodies: setup.robot.model.inertias(),
             sensors: &[],
             root: Some(&exact),
             offsets: &[],
@@ -1064,6 +1066,79 @@ fn an_uncertain_calibration_stays_uncertain_during_on_line_identification() {
             );
         }
     }
+}
+
+/// A sensor that reads 2 % too much, and bodies behind it that are as much heavier: the residual does
+/// not show it, and all torques behind the sensor are off by 2 %.
+#[test]
+fn the_gain_of_a_sensor_is_as_uncertain_as_usual() {
+    let setup = arm_with(|config| config.identification.enabled = true);
+    let (model, structure) = (&setup.robot.model, &setup.robot.structure);
+    let mut kinematics = Kinematics::new(model, setup.robot.base_link).unwrap();
+    let dofs = model.dof_count();
+    let position: Vec<f64> = (0..dofs).map(|dof| 0.3 - 0.1 * dof as f64).collect();
+    let zeros = vec![0.0; dofs];
+    let state = proprio_dynamics::JointState {
+        position: &position,
+        velocity: &zeros,
+        acceleration: &zeros,
+    };
+    let gravity = FrameMotion::standing(&Vec3::new(0.0, 0.0, 9.81));
+    kinematics.update(model, state, &gravity).unwrap();
+    let mut solver = Solver::new(structure);
+    let mut solve = |reading: Wrench| {
+        let always = &setup.robot.always;
+        solver
+            .solve(model, structure, &kinematics, &[reading], always, &[])
+            .unwrap();
+        solver.clone()
+    };
+    // The reading that makes the residual behind the sensor zero.
+    let cut = &structure.sensors()[0];
+    let behind = structure.subtree_of(cut.joint() + 1).unwrap();
+    let residual = solve(Wrench::zero()).imbalance(structure, behind);
+    let load = *solver.sensor_pose(0);
+    let load = load.wrench_back(&residual) * cut.sign();
+    let solver = solve(load);
+    let links: Vec<usize> = (0..model.inertias().len())
+        .filter(|&link| structure.subtree_of(link) == Some(behind))
+        .collect();
+    let bodies: Vec<_> = links.iter().map(|&link| model.inertias()[link]).collect();
+    let exact = DMatrix::zeros(1, 10 * links.len() + 6);
+    let offset = [Wrench::from_parts([20.0, -10.0, 5.0], [0.3, 0.2, 0.1])];
+    let group = PosteriorBlock {
+        links: &links,
+        bodies: &bodies,
+        sensors: &[0],
+        root: Some(&exact),
+        offsets: &offset,
+        drift: &[[0.0; 6]],
+        known: Nanos::ZERO,
+    };
+    let covariance = (setup.state).covariance_with(&setup.robot, std::iter::once(group));
+    let mut propagation = Propagation::new(structure, &covariance).unwrap();
+    propagation.set_calibration_point(0, &(load + offset[0]), 0.0);
+    propagation
+        .update(structure, &solver, &kinematics, Nanos::ZERO)
+        .unwrap();
+    let moves_all_behind = |dof: usize| structure.moved_by(dof).iter().all(|l| links.contains(l));
+    let all = solver.torque().iter().zip(propagation.torque_std());
+    let mut compared = 0;
+    for (dof, (torque, deviation)) in all.enumerate().filter(|(dof, _)| moves_all_behind(*dof)) {
+        let expected = 0.02 * torque.abs();
+        assert!(
+            (deviation - expected).abs() < 1e-4 * expected,
+            "{dof}: {deviation} {expected}"
+        );
+        compared += 1;
+    }
+    assert!(compared >= 3);
+    let imbalance = propagation.imbalance_covariances()[behind];
+    let of_load = 0.02 * load.force.norm();
+    assert!(
+        imbalance.trace().sqrt() < 1e-3 * of_load,
+        "{imbalance} {of_load}"
+    );
 }
 
 #[test]

@@ -31,28 +31,37 @@ impl ChannelBuffer {
 /// Judges the readings of one channel by those before it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sanity {
-    /// `None`: a healthy sensor may repeat itself.
-    repeats: Option<Repeats<6>>,
+    repeats: Repeats<6>,
     jumps: Jumps<6>,
+    is_encoder: bool,
+    /// An encoder's readings repeat themselves as its noise makes impossible.
+    is_still: bool,
 }
 
 impl Sanity {
     /// For an encoder whose error is stated to be at most `peak`. The jitter of a joint that moves
-    /// ends when it stands, at one count: no repeat tells a stuck encoder from a joint that stands.
-    /// That a joint should move is told by the F/T residuals alone.
+    /// ends when it stands, at one count: no repeat alone tells a stuck encoder from a joint that
+    /// stands. So it counts only where F/T residuals tell that something is wrong.
     pub(super) fn of_encoder(peak: f64) -> Self {
         Self {
-            repeats: None,
-            jumps: Jumps::new([peak; 6]),
+            is_encoder: true,
+            ..Self::of_noisy([peak; 6])
         }
     }
 
     /// For axes with noise of their own, whose error is stated to be at most `peaks`.
     pub(super) fn of_noisy(peaks: [f64; 6]) -> Self {
         Self {
-            repeats: Some(Repeats::default()),
+            repeats: Repeats::default(),
             jumps: Jumps::new(peaks),
+            is_encoder: false,
+            is_still: false,
         }
+    }
+
+    /// Whether this is an encoder that stands or is stuck.
+    pub(super) const fn is_still(&self) -> bool {
+        self.is_still
     }
 
     /// The flags of a reading at `t`, NaN where it has fewer than six values, with `quality` as its
@@ -69,9 +78,10 @@ impl Sanity {
         let period = Nanos::from_seconds(self.jumps.period()).0.max(1);
         let least = u32::try_from(max_silence.0 / period).unwrap_or(LONGEST);
         let least = least.clamp(2, LONGEST);
-        let frozen = (self.repeats.as_mut()).map_or(0, |r| r.look(values, quality, least));
+        let is_repeated = self.repeats.look(values, quality, least) != 0;
+        self.is_still = is_repeated && self.is_encoder;
         let mut flags = quality;
-        if frozen != 0 {
+        if is_repeated && !self.is_encoder {
             flags |= Quality::FROZEN;
         }
         if jumps {

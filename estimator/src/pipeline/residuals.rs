@@ -16,8 +16,8 @@
 //! smallest deviate is taken as present, provided that this deviate is at most [`PLAUSIBLE`]; the
 //! one detected before is given an advantage of [`PREVIOUS`]. A detected contact is a force within
 //! [`CONTACT_RADIUS`] of the contact's `position_m`: without that bound, any six numbers could be a
-//! wrench at any contact. It stays present until `q` is plausible without it. If no contact
-//! explains the residual, all torques of the sub-tree are withheld, because the place where the
+//! wrench at any contact. It stays present until `q` has been plausible without it for [`GONE`]: in
+//! some postures a load hardly shows. If no contact explains the residual, all torques of the sub-tree are withheld, because the place where the
 //! wrench acts is unknown.
 //!
 //! A contact that is detected from the start on may as well be a wrong offset, a wrong mounting, or
@@ -41,14 +41,14 @@ const PLAUSIBLE: f64 = 2.326;
 /// it is preferred.
 const PREVIOUS: f64 = 1.0;
 /// Time constant of the mean imbalance.
-const TIME_CONSTANT: Nanos = Nanos::from_millis(50);
-/// Time after which the mean shows a change whole, but for a thousandth.
-pub(super) const SETTLED: Nanos = Nanos::from_millis(350);
+pub(super) const TIME_CONSTANT: Nanos = Nanos::from_millis(50);
 /// Distance from a contact's position to the force of a detected contact, one standard deviation
 /// \[m\]: 99 % within 17 cm, the size of a hand or a foot.
 const CONTACT_RADIUS: f64 = 0.05;
 /// Time in which a plausible residual confirms the model: twenty means that are independent.
 const FREE: f64 = 1.0;
+/// Time in which a plausible residual shows that a contact has ended.
+const GONE: f64 = 2.0;
 /// Rounding error of the variances computed in single precision, relative.
 const ROUNDING_SHARE: f64 = 1e-6;
 
@@ -64,7 +64,7 @@ pub(super) struct SubtreeResidual {
     pub(super) contact: Option<usize>,
     /// Whether the residual is significant and no contact explains it.
     pub(super) is_unexplained: bool,
-    /// Whether a contact explains it, but the model has not been confirmed without one.
+    /// Whether it is significant, but the model has not been confirmed without a contact.
     pub(super) is_unconfirmed: bool,
 }
 
@@ -96,6 +96,8 @@ struct SubtreeState {
     /// \[s\].
     tested: Nanos,
     free: f64,
+    /// For how long it has been so without a break.
+    lately: f64,
 }
 
 /// Exponential mean of the imbalance `b`.
@@ -125,6 +127,7 @@ impl ResidualMonitor {
             steps: Step::of_subtree(structure, number),
             tested: Nanos::MIN,
             free: 0.0,
+            lately: 0.0,
         };
         Self {
             subtrees: (0..structure.subtrees().len()).map(nothing).collect(),
@@ -200,19 +203,29 @@ impl ResidualMonitor {
             state.mean = Some(test.mean);
             state.residual = test.run(least, before);
             let is_disturbed = state.residual.contact.is_some() || state.residual.is_unexplained;
-            let covariance = test.noise * test.mean.variance_ratio + test.model;
+            let covariance = test.noise + test.model;
             for step in &mut state.steps {
                 let pose = solved.solver.sensor_pose(step.sensor);
-                let residual = is_disturbed.then_some((&test.mean.value, &covariance));
+                let residual = is_disturbed.then_some((&b, &covariance));
                 step.follow(solved.t, residual, pose);
             }
             let since = solved
                 .t
                 .saturating_sub(std::mem::replace(&mut state.tested, solved.t));
             if state.residual.significance <= PLAUSIBLE {
-                state.free += since.min(TIME_CONSTANT).seconds();
+                let since = since.min(TIME_CONSTANT).seconds();
+                (state.free, state.lately) = (state.free + since, state.lately + since);
+            } else {
+                state.lately = 0.0;
             }
-            state.residual.is_unconfirmed = state.residual.contact.is_some() && state.free < FREE;
+            if state.residual.contact.is_none()
+                && !state.residual.is_unexplained
+                && state.lately < GONE
+            {
+                state.residual.contact = before.filter(|contact| !declared.contains(*contact));
+            }
+            let is_disturbed = state.residual.contact.is_some() || state.residual.is_unexplained;
+            state.residual.is_unconfirmed = is_disturbed && state.free < FREE;
         }
     }
 

@@ -2,11 +2,13 @@
 //! with their validity.
 
 use super::Pipeline;
+use super::buffers::Sanity;
 use super::motion::OperatingPoint;
 use super::residuals;
 use crate::pipeline::validity::ValidityCheck;
 use proprio_dynamics::spatial::Pose;
 use proprio_dynamics::{Certainty, ContactSet, FrameMotion, JointState};
+use proprio_identification::robot::{Channel, ChannelRole};
 use proprio_topics::{ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Nanos, Reason, Residual};
 
 impl Pipeline {
@@ -147,14 +149,46 @@ impl Pipeline {
             .zip(self.place_errors.torque_std())
             .zip(self.steps.torque());
         let structure = &self.setup.robot.structure;
+        let residual = |number: usize| self.residuals.subtrees().nth(number);
+        // What a wrong offset does to one sub-tree, it does to the other one at that sensor.
+        let is_unconfirmed = |number: usize| {
+            let shares = |other: &usize| {
+                let [a, b] = [number, *other].map(|k| structure.subtrees()[k].sensors);
+                *other == number || a.iter().any(|sensor| b.iter().any(|s| s == sensor))
+            };
+            let mut near = (0..structure.subtrees().len()).filter(shares);
+            near.any(|other| residual(other).is_some_and(|own| own.is_unconfirmed))
+        };
         let doubted = |link: usize| {
             let number = structure.subtree_of(link)?;
-            let residual = self.residuals.subtrees().nth(number)?;
-            match residual {
-                _ if residual.is_unexplained => Some(Reason::Unexplained),
-                _ if residual.is_unconfirmed => Some(Reason::Contradicted),
+            match residual(number)? {
+                own if own.is_unexplained => Some(Reason::Unexplained),
+                _ if is_unconfirmed(number) => Some(Reason::Contradicted),
                 _ => None,
             }
+        };
+        let disturbed = |link: &usize| {
+            let own = structure.subtree_of(*link).and_then(residual);
+            own.is_some_and(|own| own.contact.is_some() || own.is_unexplained)
+        };
+        // An encoder that stands beside a residual may be stuck: then no contact explains it.
+        let is_stuck = |channel: usize| match self.setup.robot.channels.get(channel) {
+            Some(Channel {
+                role: ChannelRole::Joint(dof),
+                ..
+            }) if self.sanity.get(channel).is_some_and(Sanity::is_still) => {
+                let moved = structure.moved_by(*dof);
+                moved.iter().any(disturbed).then_some(moved)
+            }
+            _ => None,
+        };
+        let stuck = |dof: usize| {
+            let own = structure.moved_by(dof);
+            let shares = |channel: &usize| {
+                let other = is_stuck(*channel).unwrap_or_default();
+                other.iter().any(|link| own.contains(link))
+            };
+            (0..self.setup.robot.channels.len()).find(shares)
         };
         let moved = |dof: usize| structure.moved_by(dof).iter().copied();
         let identification = self.identification.as_ref();
@@ -191,6 +225,12 @@ impl Pipeline {
             }
             if reason == Reason::None {
                 reason = moved(dof).find_map(doubted).unwrap_or_default();
+            }
+            if reason == Reason::None
+                && let Some(channel) = stuck(dof)
+            {
+                let number = u32::try_from(channel).unwrap_or(NO_CAUSE);
+                (reason, cause) = (Reason::Frozen, number);
             }
             if reason == Reason::None
                 && self

@@ -8,7 +8,7 @@
 //! residual has changed there significantly since it settled.
 
 use super::Pipeline;
-use super::residuals::{SETTLED, SIGNIFICANT};
+use super::residuals::{SIGNIFICANT, TIME_CONSTANT};
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::{Pose, Wrench};
@@ -19,6 +19,9 @@ use proprio_topics::Nanos;
 /// Deviations within which a torque lies that may be the true one. At four, the promise, almost
 /// half of the room remains for its own uncertainty.
 const COVERED: f64 = 2.5;
+
+/// Time after which a mean shows a step whole, but for a thousandth.
+const SETTLED: Nanos = Nanos::from_millis(350);
 
 /// A step of one sensor, as far as it may explain the residual of a sub-tree.
 #[derive(Debug, Clone)]
@@ -31,13 +34,18 @@ pub(super) struct Step {
 }
 
 #[derive(Debug, Clone, Copy)]
+#[allow(
+    clippy::large_enum_variant,
+    reason = "the real-time loop does not allocate"
+)]
 enum State {
     /// There is no residual.
     None,
-    /// The residual began at this time, and is this in the axes of the sensor.
-    Began(Nanos, Vector6<f64>),
-    /// It settled at the first value, with this covariance, and is the second one now.
-    Settled(Vector6<f64>, Matrix6<f64>, Vector6<f64>),
+    /// The residual began at this time; then its mean in the axes of the sensor, and the time of
+    /// that.
+    Began(Nanos, Vector6<f64>, Nanos),
+    /// The mean and its covariance when it had settled; then the mean, and the time of that.
+    Settled(Vector6<f64>, Matrix6<f64>, Vector6<f64>, Nanos),
     Refuted,
 }
 
@@ -62,8 +70,8 @@ impl Step {
         self.state = State::None;
     }
 
-    /// Takes the mean residual of the sub-tree at `t` and its covariance, in base coordinates, if
-    /// it is significant; `pose` is that of the sensor.
+    /// Takes the residual of the sub-tree at `t` and its covariance, in base coordinates, if it is
+    /// significant; `pose` is that of the sensor.
     pub(super) fn follow(
         &mut self,
         t: Nanos,
@@ -80,6 +88,10 @@ impl Step {
             )
         };
         let now = back(&(*residual).into());
+        let next = |mean: Vector6<f64>, before: Nanos| {
+            let keep = (-(t - before).seconds() / TIME_CONSTANT.seconds()).exp();
+            mean * keep + now * (1.0 - keep)
+        };
         let in_sensor = || {
             let columns: [Vector6<f64>; 6] = std::array::from_fn(|axis| {
                 back(&std::array::from_fn(|i| f64::from(u8::from(i == axis))))
@@ -88,16 +100,22 @@ impl Step {
             turn * covariance * turn.transpose()
         };
         self.state = match self.state {
-            State::None => State::Began(t, now),
-            State::Began(began, _) if t - began < SETTLED => State::Began(began, now),
-            State::Began(..) => State::Settled(now, in_sensor(), now),
-            State::Settled(first, of_first, _) => {
-                let change = now - first;
+            State::None => State::Began(t, now, t),
+            State::Began(began, mean, before) => {
+                let mean = next(mean, before);
+                match t - began < SETTLED {
+                    true => State::Began(began, mean, t),
+                    false => State::Settled(mean, in_sensor(), mean, t),
+                }
+            }
+            State::Settled(first, of_first, mean, before) => {
+                let mean = next(mean, before);
+                let change = mean - first;
                 let inverse = (of_first + in_sensor()).cholesky();
                 let square = inverse.map_or(0.0, |inverse| change.dot(&inverse.solve(&change)));
                 match deviate(square, 6) > SIGNIFICANT {
                     true => State::Refuted,
-                    false => State::Settled(first, of_first, now),
+                    false => State::Settled(first, of_first, mean, t),
                 }
             }
             State::Refuted => State::Refuted,
@@ -106,10 +124,10 @@ impl Step {
 
     /// What the reading changed by; none if it is no step.
     fn change(&self) -> Option<Wrench> {
-        let (State::Began(_, now) | State::Settled(_, _, now)) = &self.state else {
+        let (State::Began(_, mean, _) | State::Settled(_, _, mean, _)) = self.state else {
             return None;
         };
-        Some(Wrench::from_torque_first((self.sign * now).into()))
+        Some(Wrench::from_torque_first((self.sign * mean).into()))
     }
 }
 
@@ -170,7 +188,7 @@ impl StepCover {
             let Some(reading) = self.readings.get_mut(step.sensor) else {
                 continue;
             };
-            *reading = *reading + change;
+            *reading += change;
             let active = declared.union(&detected.difference(&own));
             let solved =
                 self.solver
