@@ -1085,20 +1085,20 @@ fn the_gain_of_a_sensor_is_as_uncertain_as_usual() {
     };
     let gravity = FrameMotion::standing(&Vec3::new(0.0, 0.0, 9.81));
     kinematics.update(model, state, &gravity).unwrap();
-    let mut solver = Solver::new(structure);
-    let mut solve = |reading: Wrench| {
+    let solve = |reading: Wrench| {
+        let mut solver = Solver::new(structure);
         let always = &setup.robot.always;
         solver
             .solve(model, structure, &kinematics, &[reading], always, &[])
             .unwrap();
-        solver.clone()
+        solver
     };
     // The reading that makes the residual behind the sensor zero.
     let cut = &structure.sensors()[0];
     let behind = structure.subtree_of(cut.joint() + 1).unwrap();
-    let residual = solve(Wrench::zero()).imbalance(structure, behind);
-    let load = *solver.sensor_pose(0);
-    let load = load.wrench_back(&residual) * cut.sign();
+    let unloaded = solve(Wrench::zero());
+    let residual = unloaded.imbalance(structure, behind);
+    let load = unloaded.sensor_pose(0).wrench_back(&residual) * cut.sign();
     let solver = solve(load);
     let links: Vec<usize> = (0..model.inertias().len())
         .filter(|&link| structure.subtree_of(link) == Some(behind))
