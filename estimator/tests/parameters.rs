@@ -1068,8 +1068,8 @@ fn an_uncertain_calibration_stays_uncertain_during_on_line_identification() {
     }
 }
 
-/// A sensor that reads 2 % too much, and bodies behind it that are as much heavier: the residual does
-/// not show it, and all torques behind the sensor are off by 2 %.
+/// A sensor that reads 2 % too much, and bodies behind it that are as much heavier: the residual
+/// does not show it, and all torques behind the sensor are off by 2 %.
 #[test]
 fn the_gain_of_a_sensor_is_as_uncertain_as_usual() {
     let setup = arm_with(|config| config.identification.enabled = true);

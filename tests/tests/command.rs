@@ -2656,7 +2656,7 @@ fn reasons(place: &Place) -> BTreeMap<String, usize> {
 #[test]
 fn a_demonstration_ends_well_and_leaves_nothing_behind() {
     let place = Place::new();
-    let summary = demo(&place, 6.0, &["--seed", "4"]);
+    let summary = demo(&place, 9.0, &["--seed", "4"]);
     assert_eq!(summary["lost"], 0, "{summary}");
     assert_eq!(summary["seed"], 4);
     browse(&place.path("d/report.html"));
@@ -2682,7 +2682,7 @@ fn a_demonstration_ends_well_and_leaves_nothing_behind() {
         "{summary}"
     );
     assert!(
-        identification["moving_since_s"].as_f64().unwrap() < 1.5,
+        identification["moving_since_s"].as_f64().unwrap() < 2.3,
         "{summary}"
     );
     assert_eq!(
@@ -2710,7 +2710,7 @@ fn a_demonstration_of_other_boards_ends_well() {
     for (robot, joints, limit) in [("six_axis_arm", 6, 0.8), ("moteus_leg", 3, 0.03)] {
         let place = Place::new();
         let more = ["--robot", robot, "--seed", "4", "--cad-error", "0"];
-        let summary = demo_of(joints, &place, 6.0, &more);
+        let summary = demo_of(joints, &place, 9.0, &more);
         assert_eq!(summary["lost"], 0, "{summary}");
         assert!(summary["valid_share"].as_f64().unwrap() > 0.3, "{summary}");
         let log = place.read("d/gateway.log");
@@ -2785,12 +2785,10 @@ fn an_arm_that_stands_still_learns_nothing_of_its_masses() {
             .unwrap();
         estimates[column][row]
     };
+    // Nothing shows that the setup is as configured, so there is no torque, however uncertain.
     for joint in ["l_elbow", "l_wrist_pitch", "l_shoulder_roll"] {
-        let (torque, deviation) = (format!("torque/{joint}"), format!("torque_std/{joint}"));
-        let (early, late) = (at(&deviation, 3.0), at(&deviation, 9.5));
-        assert!(late > 0.8 * early, "{joint}: {early} {late}");
-        let change = at(&torque, 9.5) - at(&torque, 3.0);
-        assert!(change.abs() < 0.1 * late, "{joint}: {change}");
+        let deviation = at(&format!("torque_std/{joint}"), 9.5);
+        assert!(deviation.is_infinite(), "{joint}: {deviation}");
     }
 }
 
@@ -2875,12 +2873,11 @@ fn a_demonstration_learns_what_its_urdf_has_wrong() {
         place.run(&[program, "--config", &config, "--check"]).good()
     });
     // The torques that were withheld before the motion, and why.
-    let why = "l_shoulder_yaw (+- ";
+    let why = "l_shoulder_yaw, ";
     let line = told.out.lines().find(|line| line.contains(why));
     let line = line.unwrap_or_else(|| panic!("{}", told.out));
     assert!(
-        line.contains("until on-line identification has found the offset of l_arm_ft_sensor")
-            && !line.contains("l_elbow"),
+        line.contains("until a few seconds of motion have shown"),
         "{line}"
     );
 }
@@ -2900,19 +2897,19 @@ fn a_demonstration_with_faults_says_so() {
     );
     // A motor board is silent for a second: the torques beyond it are withheld, with the board as
     // the cause.
-    let summary = demo(&place, 8.0, &["--fault", "silent:l_elbow_motor@6..7"]);
+    let summary = demo(&place, 12.0, &["--fault", "silent:l_elbow_motor@9..10"]);
     let share = summary["valid_share"].as_f64().unwrap();
     assert!(share > 0.2 && share < 0.95, "{summary}");
     let found = reasons(&place);
     assert!(found["stale:l_elbow"] > 100, "{found:?}");
     // A saturated force/torque sensor: its frozen values are not used as measurements.
-    let summary = demo(&place, 8.0, &["--fault", "saturate:l_arm_ft_sensor@6..7"]);
+    let summary = demo(&place, 12.0, &["--fault", "saturate:l_arm_ft_sensor@9..10"]);
     let share = summary["valid_share"].as_f64().unwrap();
     assert!(share > 0.2 && share < 0.95, "{summary}");
     let found = reasons(&place);
     assert!(found["saturated:l_arm_ft_sensor"] > 100, "{found:?}");
     // An undeclared push on the hand is detected while it lasts.
-    demo(&place, 8.0, &["--fault", "push:l_hand=50@6..7"]);
+    demo(&place, 12.0, &["--fault", "push:l_hand=50@9..10"]);
     let table = place.read("d/estimates.csv");
     let column = |name: &str| {
         table

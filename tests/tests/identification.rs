@@ -1064,11 +1064,11 @@ fn identification_begins_where_the_session_before_ended() {
         .set_identified(&inertias, &[offset], &known.root)
         .unwrap();
     setup.apply(&parameters).unwrap();
-    // From 2.5 s of motion on no contact since the start is possible any more. Without what was
+    // From 4 s of motion on no contact since the start is possible any more. Without what was
     // known, the arm is hardly better than CAD then.
     let log = sessions.log("validate");
     let (begin, _) = sessions.moving("validate");
-    let early = |t: f64| t > begin + 2.5 && t < begin + 6.0;
+    let early = |t: f64| t > begin + 4.0 && t < begin + 8.0;
     let resumed = scores(&sessions, "validate", &log, setup, early);
     let cad = scores(
         &sessions,
@@ -1143,7 +1143,7 @@ fn a_state_is_resumed_and_one_that_does_not_fit_is_refused() {
         .filter_map(|row| {
             let t = truth.column("t")[row];
             let at = told.iter().find(|e| (e.t.seconds() - t).abs() < 1e-6)?;
-            let is_early = t > begin + 2.5 && t < begin + 5.0;
+            let is_early = t > begin + 4.0 && t < begin + 7.0;
             is_early.then(|| {
                 at.torques.joints()[3].torque - truth.column(&format!("joint/{joint}/torque"))[row]
             })
@@ -1959,7 +1959,9 @@ fn a_payload_is_identified() {
             (found - right - 0.5).abs() < 0.05,
             "{found} kg, without payload {right}"
         );
-        let run = |setup| scores(&sessions, "payload", &log, setup, |t| t > all_from);
+        // A second after it is there, the parameters that include it are confirmed.
+        let settled = |t: f64| t > all_from + 1.5;
+        let run = |setup| scores(&sessions, "payload", &log, setup, settled);
         let (cad, own) = (
             run(sessions.setup(Urdf::Cad, Some("payload"))),
             run(with(sessions.setup(Urdf::Cad, Some("payload")), &outcome)),

@@ -81,6 +81,12 @@ impl Withheld {
                 this.add(&format!("{}{}", reason.word(), hint(reason)), name);
                 continue;
             }
+            if std.is_infinite() {
+                let why = "uncertain, until a few seconds of motion have shown that the setup is \
+                           as configured";
+                this.add(why, name);
+                continue;
+            }
             let why = if is_valid(&offsets_known, dof) {
                 unknown_offsets(setup)
             } else if is_valid(&all_known, dof) {

@@ -16,15 +16,16 @@
 //! smallest deviate is taken as present, provided that this deviate is at most [`PLAUSIBLE`]; the
 //! one detected before is given an advantage of [`PREVIOUS`]. A detected contact is a force within
 //! [`CONTACT_RADIUS`] of the contact's `position_m`: without that bound, any six numbers could be a
-//! wrench at any contact. It stays present until `q` has been plausible without it for [`GONE`]: in
-//! some postures a load hardly shows. If no contact explains the residual, all torques of the sub-tree are withheld, because the place where the
+//! wrench at any contact. It stays present until `q` is plausible without it. In some postures a
+//! load hardly shows, so torques assume that it may still be there until [`GONE`]. If no contact
+//! explains the residual, all torques of the sub-tree are withheld, because the place where the
 //! wrench acts is unknown.
 //!
 //! A contact that is detected from the start on may as well be a wrong offset, a wrong mounting, or
 //! another direction of gravity. So it counts only once the residual of its sub-tree has been
 //! plausible without it for [`FREE`].
 
-use super::steps::Step;
+use super::steps::{SIGNIFICANT, Step, TIME_CONSTANT};
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{
@@ -33,15 +34,11 @@ use proprio_dynamics::{
 use proprio_identification::statistics::deviate;
 use proprio_topics::Nanos;
 
-/// The deviate above which a residual is significant: by chance, 3 of 10 million instants.
-pub(super) const SIGNIFICANT: f64 = 5.0;
 /// The deviate up to which a residual is plausible: 99 % of instants without an unknown wrench.
 const PLAUSIBLE: f64 = 2.326;
 /// Advantage of the contact that was detected before, a deviate: of two that fit about equally well
 /// it is preferred.
 const PREVIOUS: f64 = 1.0;
-/// Time constant of the mean imbalance.
-pub(super) const TIME_CONSTANT: Nanos = Nanos::from_millis(50);
 /// Distance from a contact's position to the force of a detected contact, one standard deviation
 /// \[m\]: 99 % within 17 cm, the size of a hand or a foot.
 const CONTACT_RADIUS: f64 = 0.05;
@@ -98,6 +95,8 @@ struct SubtreeState {
     free: f64,
     /// For how long it has been so without a break.
     lately: f64,
+    /// The detected contact, or the last one, if it may still be there.
+    lingering: Option<usize>,
 }
 
 /// Exponential mean of the imbalance `b`.
@@ -128,6 +127,7 @@ impl ResidualMonitor {
             tested: Nanos::MIN,
             free: 0.0,
             lately: 0.0,
+            lingering: None,
         };
         Self {
             subtrees: (0..structure.subtrees().len()).map(nothing).collect(),
@@ -155,6 +155,14 @@ impl ResidualMonitor {
         detected
     }
 
+    /// These, and those that may still be there, though the residual is plausible without them.
+    pub(super) fn possible(&self) -> ContactSet {
+        let mut possible = ContactSet::EMPTY;
+        let lingering = self.subtrees.iter().filter_map(|state| state.lingering);
+        lingering.for_each(|contact| possible.insert(contact));
+        possible
+    }
+
     /// Tests the residuals at an instant. `covariance` is that of a sub-tree's imbalance without
     /// F/T noise, `P + M`; none where the sub-tree has a fault. Does not allocate.
     pub(super) fn update(
@@ -176,7 +184,7 @@ impl ResidualMonitor {
                 covariance(number)
             };
             let Some(model_covariance) = model_covariance else {
-                state.mean = None;
+                (state.mean, state.lingering) = (None, None);
                 state.steps.iter_mut().for_each(Step::end);
                 continue;
             };
@@ -218,11 +226,13 @@ impl ResidualMonitor {
             } else {
                 state.lately = 0.0;
             }
-            if state.residual.contact.is_none()
-                && !state.residual.is_unexplained
-                && state.lately < GONE
+            if state.residual.contact.is_some() {
+                state.lingering = state.residual.contact;
+            } else if state.residual.is_unexplained
+                || state.lately > GONE
+                || declared != ContactSet::EMPTY
             {
-                state.residual.contact = before.filter(|contact| !declared.contains(*contact));
+                state.lingering = None;
             }
             let is_disturbed = state.residual.contact.is_some() || state.residual.is_unexplained;
             state.residual.is_unconfirmed = is_disturbed && state.free < FREE;
@@ -240,6 +250,7 @@ impl ResidualMonitor {
     pub(super) fn reset(&mut self) {
         for subtree in &mut self.subtrees {
             (subtree.residual, subtree.mean) = (SubtreeResidual::NOTHING, None);
+            subtree.lingering = None;
             subtree.steps.iter_mut().for_each(Step::end);
         }
     }

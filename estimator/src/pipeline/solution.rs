@@ -19,21 +19,29 @@ impl Pipeline {
         self.contacts.place(&mut self.setup.robot, t);
         let (base, imu) = self.evaluate_channels(t, &active);
         // A contact detected at the last instant is most likely still there.
-        let detected = self.residuals.detected().difference(&active);
-        let mut solved = self.solve(t, &base, imu.as_ref(), &active.union(&detected));
+        let possible = self.residuals.possible().difference(&active);
+        let mut solved = self.solve(t, &base, imu.as_ref(), &active.union(&possible));
         self.test_residuals(t, &active, solved);
-        if solved && self.residuals.detected() != detected {
+        if solved && self.residuals.possible() != possible {
             solved = self.solve(
                 t,
                 &base,
                 imu.as_ref(),
-                &active.union(&self.residuals.detected()),
+                &active.union(&self.residuals.possible()),
             );
         }
         if solved {
-            self.cover_steps(&active);
+            self.steps.update(
+                &self.setup.state.model,
+                &self.setup.robot.structure,
+                &self.kinematics,
+                &self.solver,
+                &self.readings,
+                (&active, &self.residuals.possible()),
+                self.residuals.steps(),
+            );
         }
-        self.write_estimate(t, solved);
+        self.write_estimate(t, &active, solved);
     }
 
     /// Solves with the contacts in `active` present, and computes all standard deviations. False if
@@ -126,7 +134,7 @@ impl Pipeline {
     }
 
     /// Writes the estimate: values, standard deviations, validity and reasons.
-    fn write_estimate(&mut self, t: Nanos, is_solved: bool) {
+    fn write_estimate(&mut self, t: Nanos, active: &ContactSet, is_solved: bool) {
         self.estimate.t = t;
         self.estimate.torques.header.acquired = t;
         self.estimate.contacts.header.acquired = t;
@@ -286,7 +294,10 @@ impl Pipeline {
             if reason == Reason::None {
                 reason = link.and_then(doubted).unwrap_or_default();
             }
+            // One that may still be there is not reported.
+            let is_known = detected.contains(number) || active.contains(number);
             match result.certainty {
+                _ if !is_known => (reason, cause) = (Reason::Absent, NO_CAUSE),
                 Certainty::Absent => (reason, cause) = (Reason::Absent, NO_CAUSE),
                 Certainty::Assumed if reason == Reason::None => reason = Reason::Undetermined,
                 _ => {}

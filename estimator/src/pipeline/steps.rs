@@ -7,8 +7,6 @@
 //! same in the axes of the sensor, while a contact rarely does. So it is refuted as soon as the
 //! residual has changed there significantly since it settled.
 
-use super::Pipeline;
-use super::residuals::{SIGNIFICANT, TIME_CONSTANT};
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::{Pose, Wrench};
@@ -19,6 +17,12 @@ use proprio_topics::Nanos;
 /// Deviations within which a torque lies that may be the true one. At four, the promise, almost
 /// half of the room remains for its own uncertainty.
 const COVERED: f64 = 2.5;
+
+/// The deviate above which a residual is significant: by chance, 3 of 10 million instants.
+pub(super) const SIGNIFICANT: f64 = 5.0;
+
+/// Time constant of mean residuals.
+pub(super) const TIME_CONSTANT: Nanos = Nanos::from_millis(50);
 
 /// Time after which a mean shows a step whole, but for a thousandth.
 const SETTLED: Nanos = Nanos::from_millis(350);
@@ -164,9 +168,10 @@ impl StepCover {
     }
 
     /// Compares the torques of `solver` with those of all steps that are not refuted. `declared`
-    /// are the contacts that are known to be present, `detected` those that residuals show.
+    /// are the contacts that are known to be present, `detected` those that residuals show. Does
+    /// not allocate.
     #[allow(clippy::too_many_arguments, reason = "each of another kind")]
-    fn update<'a>(
+    pub(super) fn update<'a>(
         &mut self,
         model: &Model,
         structure: &Structure,
@@ -201,21 +206,5 @@ impl StepCover {
                 *deviation = deviation.max((torque - other).abs() / COVERED);
             }
         }
-    }
-}
-
-impl Pipeline {
-    /// Compares the torques with those that steps of F/T offsets make likely. Does not allocate.
-    pub(super) fn cover_steps(&mut self, active: &ContactSet) {
-        let detected = self.residuals.detected();
-        self.steps.update(
-            &self.setup.state.model,
-            &self.setup.robot.structure,
-            &self.kinematics,
-            &self.solver,
-            &self.readings,
-            (active, &detected),
-            self.residuals.steps(),
-        );
     }
 }

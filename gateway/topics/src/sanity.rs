@@ -29,8 +29,8 @@
 //!
 //! # Jumps
 //! A value that is far from where those before it lead is doubtful until the next one confirms it:
-//! one wrong reading is no motion and no load. A value that stops at once, in the midst of a motion,
-//! is not confirmed by its repeats. See [`Jumps`].
+//! one wrong reading is no motion and no load. A value that stops at once, in the midst of a
+//! motion, is not confirmed by its repeats. See [`Jumps`].
 
 use crate::{Nanos, Quality};
 

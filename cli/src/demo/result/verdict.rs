@@ -77,7 +77,7 @@ impl Verdict {
              parameters and {cad:.3} Nm with the CAD's, {since}"
         );
         let is_better = findings.cad_error == 0.0 || identified < cad;
-        let (worked, headline, mut figures) = if findings.valid == 0 {
+        let (worked, headline, mut figures) = if findings.valid == 0 && findings.has_settled {
             (
                 Some(false),
                 FAILED,

@@ -16,16 +16,16 @@
 //! counts as one tick.
 //!
 //! # What follows
-//! Unless a hypothesis is less likely than an error beyond the promised four deviations, its torques
-//! may be the true ones. So the deviation of a torque is at least that of the hypothesis, and covers
-//! the torque of the hypothesis within [`COVERED`] deviations. If another hypothesis than the stated
-//! one is the likeliest, no torque is valid that depends on the sub-tree or its sensors; it is named
-//! once the stated one is that unlikely. A hypothesis with odds below a millionth is refuted, and
-//! dropped.
+//! Unless a hypothesis is less likely than an error beyond the promised four deviations, its
+//! torques may be the true ones. So the deviation of a torque is at least that of the hypothesis,
+//! and covers the torque of the hypothesis within [`COVERED`] deviations. If another hypothesis
+//! than the stated one is the likeliest, no torque is valid that depends on the sub-tree or its
+//! sensors; it is named once the stated one is that unlikely. A hypothesis with odds below a
+//! millionth is refuted, and dropped.
 //!
 //! Before the first two seconds of motion nothing is known about a new setup, and its torques are
-//! unknown. A setup that an earlier run has confirmed is taken as stated until something contradicts
-//! it.
+//! unknown. A setup that an earlier run has confirmed is taken as stated until something
+//! contradicts it.
 
 mod evidence;
 mod hypothesis;
@@ -279,8 +279,8 @@ impl Bank {
     }
 
     /// Sets the doubts about the torques of a solution, which is in use. Torques that can not be
-    /// compared keep theirs. `disturbed` are the components whose rows are rejected, a bit each: what
-    /// was learnt does not explain their readings.
+    /// compared keep theirs. `disturbed` are the components whose rows are rejected, a bit each:
+    /// what was learnt does not explain their readings.
     pub(crate) fn doubt(&mut self, solution: &mut Solution, disturbed: u64) {
         let Self {
             place,
