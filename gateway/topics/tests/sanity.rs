@@ -381,8 +381,10 @@ fn an_encoder_that_stops_at_once_is_stuck_and_one_that_brakes_is_not() {
         }
         (doubtful, last)
     };
+    // At rest its noise shows; then it moves.
+    run(&mut channel, 0.0, 100);
     let (doubtful, last) = run(&mut channel, 0.5, 100);
-    assert_eq!(doubtful, 0);
+    assert!(doubtful <= 2, "{doubtful}");
     // Stuck for ten seconds; then it goes on from elsewhere.
     assert!((0..1000).all(|_| channel.read(last)));
     assert!(run(&mut channel, 0.5, 100).0 <= 2);

@@ -67,11 +67,11 @@ impl Verdict {
             1 => format!("the joint{place}"),
             count => format!("the {count} joints{place}"),
         };
-        let validity = format!(
-            "{} of all torques were valid, {} of these within two standard deviations of the truth",
-            percent(*valid_share),
-            percent(*within_2_sigma)
-        );
+        let mut validity = format!("{} of all torques were valid", percent(*valid_share));
+        if findings.valid > 0 {
+            let within = percent(*within_2_sigma);
+            validity += &format!(", {within} of these within two standard deviations of the truth");
+        }
         let errors = format!(
             "at {joints} the RMS error of the torques is {identified:.3} Nm with the identified \
              parameters and {cad:.3} Nm with the CAD's, {since}"
