@@ -9,17 +9,14 @@ const OPEN: &[&str] = &[
     "push where no contact is",
     "payload taken",
     "gravity 20 deg off",
-    "not learning, offsets wrong by 10 N",
     "F/T gain 8 % off",
-    "F/T one in ten",
     "F/T late 100 ms",
     "F/T saturated",
-    "F/T offset jumps",
+    "F/T turned 5 deg",
     "encoder stuck",
     "encoder in degrees",
     "encoder gear 20 % off",
     "encoder drifts",
-    "encoders swapped",
     "IMU turned 5 deg",
 ];
 
