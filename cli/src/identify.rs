@@ -2,7 +2,9 @@
 //!
 //! Writes into one folder, each file atomically: `summary.json` (for programs: [`summary`]),
 //! `parameters.toml`, `identified.urdf` and `report.html` (for a person). If nothing can be
-//! identified, summary and report give the reason and there are no parameters.
+//! identified, or what was identified explains too little, is no better than the CAD, or comes from
+//! a wrong configuration, summary and report give the reason, there are no parameters, and the
+//! program exits with 1.
 
 pub(crate) mod advice;
 #[cfg(test)]
@@ -11,7 +13,7 @@ mod page;
 pub(crate) mod summary;
 
 use crate::convert::check_columns;
-use advice::{Advice, findings, sentence};
+use advice::{Advice, Grade, findings, sentence};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use proprio_dynamics::model::Model;
@@ -123,7 +125,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let json = summary::summary(&outcome, &advice);
     let mut text = serde_json::to_string_pretty(&json)?;
     text.push('\n');
-    if !matches!(outcome.verdict, Verdict::Nothing(_)) {
+    if advice.grade != Grade::Reject {
         let parameters = export::parameters(
             &outcome,
             &setup.robot,
@@ -158,6 +160,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         bail!(
             "nothing was identified: {}",
             reason.trim().trim_end_matches('.')
+        );
+    }
+    if advice.grade == Grade::Reject {
+        bail!(
+            "the result was rejected, and no parameters were written: {} gives the reasons",
+            args.out.join("report.html").display()
         );
     }
     Ok(())

@@ -561,6 +561,31 @@ fn given_velocities_are_kept_and_differentiated() {
     assert!(velocity < 1e-6 && acceleration < 1e-5);
 }
 
+/// Accelerations that a controller has differenced are noise: those of the positions are better.
+#[test]
+fn derivatives_that_are_noise_are_not_used() {
+    let robot = robot("");
+    let mut table = log(&robot, 10.0, 100.0, 0.0, 0.0, 1);
+    (table.header).push("joint/elbow/acceleration".to_owned());
+    let mut noise = Random(3);
+    for (t, row) in &mut table.rows {
+        let given = motion(1, Nanos(*t).seconds())[2] + 12.0 * noise.normal();
+        row.push(if row[0].is_nan() { f64::NAN } else { given });
+    }
+    let instants = table.dataset(&robot);
+    let [Defect::NoisyDerivative { joint, given, off }] = all_defects(&instants)[..] else {
+        panic!("{:?}", all_defects(&instants));
+    };
+    assert_eq!((joint.as_str(), *given), ("elbow", "acceleration"));
+    assert!((off - 12.0).abs() < 1.5, "{off}");
+    let usable = instants
+        .observations()
+        .iter()
+        .filter(|i| i.has_motion(&robot.channels));
+    let error = rms(usable.map(|i| i.acceleration[1] - motion(1, i.t.seconds())[2]));
+    assert!(error < 0.1, "{error}");
+}
+
 /// The defects, including the offset jumps.
 fn all_defects(instants: &Dataset) -> Vec<&Defect> {
     instants

@@ -17,7 +17,7 @@ use proprio_estimator::inertial::InertialState;
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::setup::Setup;
 use proprio_estimator::{offline, reading};
-use proprio_identification::robot::{IdentificationInput, TorqueSide};
+use proprio_identification::robot::{BaseMotion, IdentificationInput, TorqueSide};
 use proprio_identification::{
     Finding, FindingCode, LogOutcome, Options, Outcome, Predicted, Role, Severity, Verdict,
     identify, implausible,
@@ -1062,6 +1062,33 @@ fn simulate_motion(
         text += "\n";
     }
     text
+}
+
+/// An arm on a wall whose configuration has it stand on the floor: no parameters make up for it.
+#[test]
+fn gravity_that_points_elsewhere_is_named() {
+    let setup = arm();
+    let truth = real(&setup, 3);
+    let log = simulate(&setup, &truth, 20.0, 0.01, 3);
+    let mut wrong = arm();
+    let on_a_wall = FrameMotion::standing(&Vec3::new(9.80665, 0.0, 0.0));
+    wrong.robot.base = BaseMotion::Standing(on_a_wall);
+    let [right, wrong] = [setup, wrong].map(|setup| {
+        let outcome = run(&setup, &[("log", Role::Train, &log)], &[]);
+        let named = (outcome.findings.into_iter()).find(|f| f.code == FindingCode::WrongGravity);
+        (outcome.verdict, named)
+    });
+    assert_eq!((right.0, right.1.is_none()), (Verdict::Identified, true));
+    let (Verdict::Nothing(why), Some(named)) = wrong else {
+        panic!("{wrong:?}");
+    };
+    assert!(
+        named.text.contains("gravity_mps2 = [9.8, 0.0, 0.0]")
+            && named.text.contains("with [0.0, 0.0, -9.8]")
+            && why == named.text,
+        "{}",
+        named.text
+    );
 }
 
 /// A log of joint torques of the arm, with noise of this standard deviation, where

@@ -47,8 +47,13 @@ pub(crate) struct Advice {
     pub(crate) next: Vec<String>,
 }
 
-/// Relative difference of two validation errors below which they count as equal.
+/// Relative difference of two validation errors below which they count as equal; and the error of
+/// the CAD below which there is nothing to gain: measured torques repeat to a hundredth or two.
 const NOTICEABLE: f64 = 0.02;
+
+/// Relative error above which less than half of the power of what was measured is explained: to
+/// predict zero has an error of one.
+const UNEXPLAINED: f64 = std::f64::consts::FRAC_1_SQRT_2;
 
 impl Advice {
     /// What `outcome` means.
@@ -67,8 +72,14 @@ impl Advice {
             return this;
         }
         this.assess_errors(outcome);
+        this.refuse_wrong_configuration(outcome);
         if outcome.verdict == Verdict::NoBetterThanCad {
-            this.worsen(Grade::Care);
+            let has_errors = |log: &&LogOutcome| log.predicted.relative_error.cad > NOTICEABLE;
+            this.worsen(if outcome.logs.iter().any(|log| has_errors(&log)) {
+                Grade::Reject
+            } else {
+                Grade::Care
+            });
             let why = if findings(outcome).any(|(_, f)| f.code == FindingCode::NotCrossValidated) {
                 "The logs are too short for cross-validation, so the parameters keep their CAD \
                  values"
@@ -116,7 +127,9 @@ impl Advice {
         }
         this.look_at_findings(outcome);
         this.assess_excitation(outcome);
-        if this.grade != Grade::Reject {
+        if this.grade == Grade::Reject {
+            this.why.push("No parameters were written.".into());
+        } else {
             if !outcome.logs.iter().any(|log| log.role == Role::Validate) {
                 this.next.push(
                     "Record a different motion and pass it with --validate: only that shows how \
@@ -149,6 +162,7 @@ impl Advice {
             Role::Train
         };
         let mut compared = false;
+        let (mut least, mut gained, mut to_gain) = (f64::INFINITY, false, false);
         for log in outcome.logs.iter().filter(|log| log.role == role) {
             let Both { cad, identified } = log.predicted.relative_error;
             if !(cad.is_finite() && identified.is_finite()) {
@@ -162,6 +176,16 @@ impl Advice {
                 continue;
             }
             compared = true;
+            let is_disturbed = log
+                .findings
+                .iter()
+                .any(|f| f.code == FindingCode::Disturbance);
+            // Errors where something touched the robot say little about the parameters.
+            if validated && !is_disturbed {
+                least = least.min(identified);
+                to_gain |= cad > NOTICEABLE;
+            }
+            gained |= identified < cad;
             let how = if validated {
                 ", which was not used for training"
             } else {
@@ -182,12 +206,8 @@ impl Advice {
             ));
             if identified > cad * (1.0 + NOTICEABLE) {
                 if validated {
-                    self.worsen(Grade::Reject);
-                    if log
-                        .findings
-                        .iter()
-                        .any(|f| f.code == FindingCode::Disturbance)
-                    {
+                    if is_disturbed {
+                        self.worsen(Grade::Care);
                         self.why.push(format!(
                             "That is worse than the CAD, but {} contains undeclared contacts or \
                              loads.",
@@ -199,6 +219,7 @@ impl Advice {
                             log.file
                         ));
                     } else {
+                        self.worsen(Grade::Reject);
                         self.why.push(
                             "That is worse than the CAD: the parameters are not valid outside the \
                              training motion."
@@ -227,8 +248,43 @@ impl Advice {
                     .into(),
             );
         }
+        if least.is_finite() && least > UNEXPLAINED {
+            self.worsen(Grade::Reject);
+            self.why.push(
+                "An error of this size explains little of what was measured: a prediction of zero \
+                 has 100 %."
+                    .into(),
+            );
+        }
+        if to_gain && !gained {
+            self.worsen(Grade::Reject);
+            self.why
+                .push("Nothing was gained over the CAD on any of them.".into());
+        }
         if !validated {
             self.why.push("No validation log was given.".into());
+        }
+    }
+
+    /// With a wrong sign, frame or gravity in the configuration, the parameters make up for it in
+    /// the training motion alone. (A log that was refused for it is not part of them.)
+    fn refuse_wrong_configuration(&mut self, outcome: &Outcome) {
+        let is_wrong = |(log, finding): &(Option<&LogOutcome>, &Finding)| {
+            finding.severity >= Severity::Warning
+                && log.is_none_or(|log| log.role == Role::Train && log.used > 0)
+                && [
+                    FindingCode::WrongSign,
+                    FindingCode::WrongFrame,
+                    FindingCode::WrongGravity,
+                ]
+                .contains(&finding.code)
+        };
+        if findings(outcome).any(|found| is_wrong(&found)) {
+            self.worsen(Grade::Reject);
+            self.why.push(
+                "The configuration is wrong, see \"Findings\": parameters cannot make up for it."
+                    .into(),
+            );
         }
     }
 
@@ -247,6 +303,7 @@ impl Advice {
                 f.code,
                 FindingCode::WrongSign
                     | FindingCode::WrongFrame
+                    | FindingCode::WrongGravity
                     | FindingCode::EncoderOffset
                     | FindingCode::WrongUnits
                     | FindingCode::Scale
@@ -450,11 +507,19 @@ mod tests {
             "{advice:?}"
         );
         outcome.logs[1].findings.clear();
-        // Equal to the CAD is not accepted without a remark, nor is a hundredth better or worse.
+        // Equal to the CAD is no gain, and a hundredth is not accepted without a remark.
         outcome.logs[1].predicted.relative_error.identified = 0.0645;
-        assert_eq!(Advice::of(&outcome).grade, Grade::Care);
+        assert_eq!(Advice::of(&outcome).grade, Grade::Reject);
         outcome.logs[1].predicted.relative_error.identified = 0.064;
+        assert_eq!(Advice::of(&outcome).grade, Grade::Reject);
+        outcome.logs[1].predicted.relative_error.identified = 0.0635;
         assert_eq!(Advice::of(&outcome).grade, Grade::Care);
+        // An error of the size of what was measured is no use, however bad the CAD is.
+        outcome.logs[1].predicted.relative_error = Both {
+            cad: 1.1,
+            identified: 0.8,
+        };
+        assert_eq!(Advice::of(&outcome).grade, Grade::Reject);
     }
 
     #[test]
@@ -480,6 +545,14 @@ mod tests {
         assert_eq!(Advice::of(&example::outcome()).grade, Grade::Care);
         let mut outcome = good();
         outcome.verdict = Verdict::NoBetterThanCad;
+        assert_eq!(Advice::of(&outcome).grade, Grade::Reject);
+        // Where the CAD is right to a hundredth there is nothing to gain.
+        for log in &mut outcome.logs {
+            log.predicted.relative_error = Both {
+                cad: 0.01,
+                identified: 0.01,
+            };
+        }
         assert_eq!(Advice::of(&outcome).grade, Grade::Care);
         let mut outcome = good();
         outcome.findings.push(Finding {
@@ -489,7 +562,7 @@ mod tests {
             text: "r_leg_ft_sensor seems to be mounted the wrong way round".into(),
         });
         let advice = Advice::of(&outcome);
-        assert_eq!(advice.grade, Grade::Care);
+        assert_eq!(advice.grade, Grade::Reject);
         assert!(
             advice
                 .next

@@ -5,7 +5,8 @@
 //! 2. [`plausible_model`]: the measurement model, which makes rows of observations
 //!    ([`crate::measurement::model`]). Logs with F/T readings in wrong units
 //!    ([`crate::diagnose::wrench_units`]) are refused, and so is a wrong measurement frame or
-//!    direction of a sensor, in all logs or in one ([`crate::diagnose::sensor_frame`]).
+//!    direction of a sensor, in all logs or in one ([`crate::diagnose::sensor_frame`]), and a wrong
+//!    gravity ([`crate::diagnose::gravity`]).
 //! 3. [`exclude_disturbed`]: noise and MAP estimate in turn, until the noise converges
 //!    ([`crate::fit::alternate_noise_and_map`]). After each such fit, undeclared contacts
 //!    ([`crate::diagnose::undeclared`]) and loads ([`crate::diagnose::load`]) are excluded and
@@ -29,7 +30,9 @@ use crate::cross_validation::{self, Retention};
 use crate::dataset::{Dataset, Role};
 use crate::diagnose::structural_vibration::StructuralVibration;
 use crate::diagnose::undeclared::{self, Undeclared};
-use crate::diagnose::{delay, encoder_offsets, load, sensor_frame, torque_units, wrench_units};
+use crate::diagnose::{
+    delay, encoder_offsets, gravity, load, sensor_frame, torque_units, wrench_units,
+};
 use crate::finding::{Finding, FindingCode, Severity};
 use crate::fit::{
     Identified, IdentifyError, LOAD_VARIANCE_RATIO, NoiseAndMap, OffsetDrift, added,
@@ -293,6 +296,13 @@ fn plausible_model<'a>(
             ),
         );
         outcome.findings.extend(wrong);
+        return Ok(ControlFlow::Break(Box::new(outcome)));
+    }
+
+    // Gravity.
+    if let Some(wrong) = gravity::wrong(&measurement, &training) {
+        let mut outcome = assemble::nothing(robot, logs, wrong.text.clone());
+        outcome.findings.push(wrong);
         return Ok(ControlFlow::Break(Box::new(outcome)));
     }
 

@@ -3,6 +3,7 @@
 pub(crate) mod delay;
 pub(crate) mod disturbance;
 pub(crate) mod encoder_offsets;
+pub(crate) mod gravity;
 pub(crate) mod load;
 pub(crate) mod offset_jumps;
 pub(crate) mod plausibility;

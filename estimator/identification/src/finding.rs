@@ -57,6 +57,8 @@ pub enum FindingCode {
     WrongSign,
     /// An F/T sensor measures in another frame than configured.
     WrongFrame,
+    /// Gravity points elsewhere than configured.
+    WrongGravity,
     /// An undeclared contact or load acted.
     Disturbance,
     /// When disturbances acted did not converge.
@@ -129,6 +131,7 @@ impl FindingCode {
             Self::Outliers => "outliers",
             Self::WrongSign => "wrong_sign",
             Self::WrongFrame => "wrong_frame",
+            Self::WrongGravity => "wrong_gravity",
             Self::Disturbance => "disturbance",
             Self::DisturbancesNotConverged => "disturbances_not_converged",
             Self::LoadChanged => "load_changed",

@@ -341,7 +341,9 @@ pub(crate) fn finding(defect: &Defect) -> Finding {
         Defect::Still { channel } => (FindingCode::JointStill, channel.clone()),
         Defect::Saturated { channel, .. } => (FindingCode::Saturated, channel.clone()),
         Defect::WrongUnits { channels, .. } => (FindingCode::WrongUnits, channels.join(", ")),
-        Defect::Derivative { joint, .. } => (FindingCode::Derivative, joint.clone()),
+        Defect::Derivative { joint, .. } | Defect::NoisyDerivative { joint, .. } => {
+            (FindingCode::Derivative, joint.clone())
+        }
         Defect::NoMotion { .. } => (FindingCode::NoMotion, String::new()),
         Defect::TooShort { .. } => (FindingCode::TooShort, String::new()),
         Defect::Jump { channel, .. } => (FindingCode::OffsetJump, channel.clone()),

@@ -148,6 +148,15 @@ pub enum Defect {
         /// The ratio of the true derivative to the given one.
         factor: f64,
     },
+    /// A given derivative that is noisier than the one of the positions, and is not used.
+    NoisyDerivative {
+        /// The joint.
+        joint: String,
+        /// `velocity` or `acceleration`.
+        given: &'static str,
+        /// RMS of its difference from the derivative of the positions, SI.
+        off: f64,
+    },
     /// The robot does not move.
     NoMotion {
         /// The largest motion of any joint \[rad or m\].
@@ -352,6 +361,16 @@ impl fmt::Display for Defect {
                 f,
                 "joint/{joint}: the logged {given} must be multiplied by {factor:.4} to match the \
                  derivative of the other column: check its unit and sign, or remove the column"
+            ),
+            Self::NoisyDerivative { joint, given, off } => write!(
+                f,
+                "joint/{joint}: the logged {given} is not that of the positions: {off:.3} {} off, \
+                 most of it noise; it is not used",
+                if *given == "velocity" {
+                    "rad/s"
+                } else {
+                    "rad/s^2"
+                }
             ),
             Self::NoMotion { most } => write!(
                 f,

@@ -3,7 +3,7 @@
 use crate::dataset::cleaning::{FREEZE, STEEP, label, merged, steep};
 use crate::dataset::defects::{Defect, LEAST_ROWS, LEAST_SECONDS, Units};
 use crate::dataset::recording::{Recording, SkippedRows};
-use crate::dataset::smooth::quantum;
+use crate::dataset::smooth::{Scratch, quantum};
 use crate::dataset::stream::{MOTION, Stream, range};
 use crate::robot::{AXES, ChannelRole, Robot};
 use crate::statistics::median;
@@ -40,6 +40,25 @@ pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
                         });
                     }
                 }
+                for (given, order) in [("velocity", 1), ("acceleration", 2)] {
+                    let track = &mut recording.joints[dof];
+                    let stream = match order {
+                        1 => &track.velocity,
+                        _ => &track.acceleration,
+                    };
+                    if let Some(off) = noisy(&track.position, stream, order) {
+                        found.push(Defect::NoisyDerivative {
+                            joint: joint.clone(),
+                            given,
+                            off,
+                        });
+                        match order {
+                            1 => track.velocity = Stream::default(),
+                            _ => track.acceleration = Stream::default(),
+                        }
+                    }
+                }
+                let track = &recording.joints[dof];
                 let cut = cut_off(&track.torque, 0, |from, to| recording.moves(from, to, None));
                 let torque = &mut recording.joints[dof].torque;
                 found.extend(cut.and_then(|cut| saturated(torque, cut, label(channel), "torque")));
@@ -282,6 +301,34 @@ fn factor(of: &Stream<1>, given: &Stream<1>, position: bool) -> Option<f64> {
     let correlation = uv / (uu * vv).sqrt();
     let factor = uv / uu;
     (enough && correlation.abs() > 0.8 && !(0.8..=1.25).contains(&factor)).then_some(factor)
+}
+
+/// The RMS difference of a given derivative from that of the positions, if the positions tell it
+/// better: at least half of the difference's square is noise of the given one (its scatter about
+/// its own smooth course), and the difference is a tenth of the motion or more. A smaller one
+/// changes no torque by more than a tenth of its inertial part.
+///
+/// Without it, accelerations that a controller differenced raise the error on held-out torques from
+/// .7 to 30 %.
+fn noisy(position: &Stream<1>, given: &Stream<1>, order: usize) -> Option<f64> {
+    const EDGE: f64 = 0.3;
+    const MOST: usize = 2000;
+    const NOTICEABLE: f64 = 0.1;
+    if given.t.len() < 100 || range(position.value.iter().map(|[v]| *v)) < 0.05 {
+        return None;
+    }
+    let (smooth, noise) = (position.smoother(0), given.smoother(0).sigma());
+    let mut scratch = Scratch::default();
+    let (mut off, mut motion, mut count) = (0.0, 0.0, 0.0);
+    for i in (0..given.t.len()).step_by(given.t.len().div_ceil(MOST)) {
+        if let Some(own) = smooth.at(given.t[i], order..=order, EDGE, &mut scratch) {
+            off += (given.value[i][0] - own[order]).powi(2);
+            motion += own[order].powi(2);
+            count += 1.0;
+        }
+    }
+    let is_noise = 2.0 * noise * noise * count > off;
+    (is_noise && off > NOTICEABLE.powi(2) * motion).then(|| (off / count).sqrt())
 }
 
 fn units(recording: &Recording, robot: &Robot, found: &mut Vec<Defect>) {

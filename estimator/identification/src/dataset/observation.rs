@@ -1,7 +1,7 @@
 //! Observations: the values of all channels at one time, and annotations by fits.
 
 use crate::robot::{Channel, ChannelRole};
-use proprio_dynamics::spatial::Wrench;
+use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{BitSet, ContactSet, FrameMotion, SensorSet};
 use proprio_topics::{Nanos, Reason};
 
@@ -81,6 +81,13 @@ impl Observation {
             self.velocity[dof] *= -1.0;
             self.acceleration[dof] *= -1.0;
         }
+        self
+    }
+
+    /// Adds a proper acceleration of the base.
+    #[must_use]
+    pub(crate) fn accelerated(mut self, by: &Vec3) -> Self {
+        self.base.proper_acceleration += by;
         self
     }
 
