@@ -2656,12 +2656,12 @@ fn reasons(place: &Place) -> BTreeMap<String, usize> {
 #[test]
 fn a_demonstration_ends_well_and_leaves_nothing_behind() {
     let place = Place::new();
-    let summary = demo(&place, 9.0, &["--seed", "4"]);
+    let summary = demo(&place, 12.0, &["--seed", "4"]);
     assert_eq!(summary["lost"], 0, "{summary}");
     assert_eq!(summary["seed"], 4);
     browse(&place.path("d/report.html"));
     // Until motion has confirmed the setup, torques are uncertain and withheld.
-    assert!(summary["valid_share"].as_f64().unwrap() > 0.2, "{summary}");
+    assert!(summary["valid_share"].as_f64().unwrap() > 0.1, "{summary}");
     // Their figures rest on the valid ones alone.
     for (joint, error) in summary["torque_rms_error_nm"].as_object().unwrap() {
         let count = summary["valid_estimates"][joint].as_u64().unwrap();
@@ -2682,7 +2682,7 @@ fn a_demonstration_ends_well_and_leaves_nothing_behind() {
         "{summary}"
     );
     assert!(
-        identification["moving_since_s"].as_f64().unwrap() < 2.3,
+        identification["moving_since_s"].as_f64().unwrap() < 3.1,
         "{summary}"
     );
     assert_eq!(
@@ -2710,7 +2710,7 @@ fn a_demonstration_of_other_boards_ends_well() {
     for (robot, joints, limit) in [("six_axis_arm", 6, 0.8), ("moteus_leg", 3, 0.03)] {
         let place = Place::new();
         let more = ["--robot", robot, "--seed", "4", "--cad-error", "0"];
-        let summary = demo_of(joints, &place, 9.0, &more);
+        let summary = demo_of(joints, &place, 12.0, &more);
         assert_eq!(summary["lost"], 0, "{summary}");
         // From about four seconds of motion on, and while nothing is declared to push.
         assert!(summary["valid_share"].as_f64().unwrap() > 0.1, "{summary}");
