@@ -10,7 +10,7 @@
 
 use proprio_tests::watch::{Newest, all_valid, open, valid_since};
 use proprio_tests::{Arm, PATIENCE, Process, Rig, now, until};
-use proprio_topics::ipc::{Reader, Topic, Writer};
+use proprio_topics::ipc::{Reader, TakeError, Topic, Writer};
 use proprio_topics::{
     Description, Entry, EstimatorHealth, Header, JointState, Kind, Name, Nanos, Publisher, Reading,
     Role, Sample, TorqueEstimate, Wrench,
@@ -55,7 +55,11 @@ fn recovery(torques: &mut Reader<TorqueEstimate>, since: Nanos) -> (bool, String
         let turn = now();
         paused = paused.max(turn - std::mem::replace(&mut last, turn));
         // A writer that is killed as it connects is an error that ends with the next attempt.
-        while let Ok(Some(estimate)) = torques.try_take() {
+        let mut next = || match torques.try_take() {
+            Err(TakeError::Connection) => None,
+            taken => taken.expect("shared memory can be read"),
+        };
+        while let Some(estimate) = next() {
             if estimate.header.acquired <= since {
                 continue;
             }

@@ -74,8 +74,8 @@ impl Advice {
         this.assess_errors(outcome);
         this.refuse_wrong_configuration(outcome);
         if outcome.verdict == Verdict::NoBetterThanCad {
-            let has_errors = |log: &&LogOutcome| log.predicted.relative_error.cad > NOTICEABLE;
-            this.worsen(if outcome.logs.iter().any(|log| has_errors(&log)) {
+            let has_errors = |log: &LogOutcome| log.predicted.relative_error.cad > NOTICEABLE;
+            this.worsen(if outcome.logs.iter().any(has_errors) {
                 Grade::Reject
             } else {
                 Grade::Care

@@ -68,7 +68,7 @@ mod job;
 mod parameters;
 mod solution;
 
-pub use bank::{Hypothesis, Sight, View};
+pub use bank::{COVERED, Hypothesis, Sight, View};
 pub use job::Job;
 pub use solution::{
     Change, ComponentSolution, Counts, Doubt, Observation, OnlineError, Paused, Solution,
@@ -406,9 +406,9 @@ impl Online {
                 kinematics.base(),
             );
             tick.copy_from(slot, motion, readings, active);
-            let moving = (self.components.iter().enumerate())
-                .filter(|(_, component)| component.is_moved(observation));
-            tick.moving = moving.fold(0, |bits, (number, _)| bits | bank::bit(number));
+            let all = self.components.iter().enumerate();
+            let moving = all.filter(|(_, component)| component.is_moved(observation));
+            tick.moving = bank::bits(moving.map(|(number, _)| number));
         }
         Ok(())
     }

@@ -25,11 +25,12 @@
 //! another direction of gravity. So it counts only once the residual of its sub-tree has been
 //! plausible without it for [`FREE`].
 
-use super::steps::{SIGNIFICANT, Step, TIME_CONSTANT};
+use super::steps::{SIGNIFICANT, Step, TIME_CONSTANT, kept};
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{
-    ContactKind, ContactSet, Kinematics, LeastSquares, Solver, Structure, noise_factor, unknowns,
+    ContactKind, ContactSet, Kinematics, LeastSquares, SensorSet, Solver, Structure, noise_factor,
+    unknowns,
 };
 use proprio_identification::statistics::deviate;
 use proprio_topics::Nanos;
@@ -76,6 +77,11 @@ impl SubtreeResidual {
         is_unexplained: false,
         is_unconfirmed: false,
     };
+
+    /// Whether it is significant.
+    pub(super) fn is_disturbed(&self) -> bool {
+        self.contact.is_some() || self.is_unexplained
+    }
 }
 
 /// Tests the residuals of all sub-trees.
@@ -146,6 +152,13 @@ impl ResidualMonitor {
         all.flat_map(|(number, state)| state.steps.iter().map(move |step| (number, step)))
     }
 
+    /// The sensors of the sub-trees whose model has not been confirmed without a contact.
+    pub(super) fn unconfirmed(&self, structure: &Structure) -> SensorSet {
+        let both = structure.subtrees().iter().zip(self.subtrees());
+        both.filter(|(_, residual)| residual.is_unconfirmed)
+            .fold(SensorSet::EMPTY, |all, (own, _)| all.union(&own.sensors))
+    }
+
     /// The detected contacts.
     pub(super) fn detected(&self) -> ContactSet {
         let mut detected = ContactSet::EMPTY;
@@ -210,7 +223,7 @@ impl ResidualMonitor {
             };
             state.mean = Some(test.mean);
             state.residual = test.run(least, before);
-            let is_disturbed = state.residual.contact.is_some() || state.residual.is_unexplained;
+            let is_disturbed = state.residual.is_disturbed();
             let covariance = test.noise + test.model;
             for step in &mut state.steps {
                 let pose = solved.solver.sensor_pose(step.sensor);
@@ -234,7 +247,6 @@ impl ResidualMonitor {
             {
                 state.lingering = None;
             }
-            let is_disturbed = state.residual.contact.is_some() || state.residual.is_unexplained;
             state.residual.is_unconfirmed = is_disturbed && state.free < FREE;
         }
     }
@@ -265,7 +277,7 @@ impl Mean {
                 t,
             };
         };
-        let keep = (-(t - before.t).seconds() / TIME_CONSTANT.seconds()).exp();
+        let keep = kept(t - before.t);
         Self {
             value: before.value * keep + b * (1.0 - keep),
             variance_ratio: keep * keep * before.variance_ratio + (1.0 - keep) * (1.0 - keep),

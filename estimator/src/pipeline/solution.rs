@@ -2,13 +2,12 @@
 //! with their validity.
 
 use super::Pipeline;
-use super::buffers::Sanity;
 use super::motion::OperatingPoint;
-use super::residuals;
+use super::residuals::{self, SubtreeResidual};
 use crate::pipeline::validity::ValidityCheck;
 use proprio_dynamics::spatial::Pose;
 use proprio_dynamics::{Certainty, ContactSet, FrameMotion, JointState};
-use proprio_identification::robot::{Channel, ChannelRole};
+use proprio_identification::robot::ChannelRole;
 use proprio_topics::{ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Nanos, Reason, Residual};
 
 impl Pipeline {
@@ -159,44 +158,40 @@ impl Pipeline {
         let structure = &self.setup.robot.structure;
         let residual = |number: usize| self.residuals.subtrees().nth(number);
         // What a wrong offset does to one sub-tree, it does to the other one at that sensor.
-        let is_unconfirmed = |number: usize| {
-            let shares = |other: &usize| {
-                let [a, b] = [number, *other].map(|k| structure.subtrees()[k].sensors);
-                *other == number || a.iter().any(|sensor| b.iter().any(|s| s == sensor))
-            };
-            let mut near = (0..structure.subtrees().len()).filter(shares);
-            near.any(|other| residual(other).is_some_and(|own| own.is_unconfirmed))
-        };
+        let unconfirmed = self.residuals.unconfirmed(structure);
         let doubted = |link: usize| {
             let number = structure.subtree_of(link)?;
+            let sensors = structure.subtrees().get(number)?.sensors;
             match residual(number)? {
                 own if own.is_unexplained => Some(Reason::Unexplained),
-                _ if is_unconfirmed(number) => Some(Reason::Contradicted),
+                _ if !sensors.intersection(&unconfirmed).is_empty() => Some(Reason::Contradicted),
                 _ => None,
             }
         };
-        let disturbed = |link: &usize| {
+        let is_any_disturbed = self.residuals.subtrees().any(SubtreeResidual::is_disturbed);
+        let is_disturbed = |link: &usize| {
             let own = structure.subtree_of(*link).and_then(residual);
-            own.is_some_and(|own| own.contact.is_some() || own.is_unexplained)
+            own.is_some_and(SubtreeResidual::is_disturbed)
         };
         // An encoder that stands beside a residual may be stuck: then no contact explains it.
-        let is_stuck = |channel: usize| match self.setup.robot.channels.get(channel) {
-            Some(Channel {
-                role: ChannelRole::Joint(dof),
-                ..
-            }) if self.sanity.get(channel).is_some_and(Sanity::is_still) => {
-                let moved = structure.moved_by(*dof);
-                moved.iter().any(disturbed).then_some(moved)
-            }
-            _ => None,
-        };
         let stuck = |dof: usize| {
+            if !is_any_disturbed {
+                return None;
+            }
             let own = structure.moved_by(dof);
-            let shares = |channel: &usize| {
-                let other = is_stuck(*channel).unwrap_or_default();
-                other.iter().any(|link| own.contains(link))
-            };
-            (0..self.setup.robot.channels.len()).find(shares)
+            let channels = &self.setup.robot.channels;
+            channels
+                .iter()
+                .zip(&self.sanity)
+                .position(|(channel, sanity)| {
+                    let ChannelRole::Joint(other) = channel.role else {
+                        return false;
+                    };
+                    let moved = structure.moved_by(other);
+                    sanity.is_still()
+                        && moved.iter().any(is_disturbed)
+                        && moved.iter().any(|link| own.contains(link))
+                })
         };
         let moved = |dof: usize| structure.moved_by(dof).iter().copied();
         let identification = self.identification.as_ref();

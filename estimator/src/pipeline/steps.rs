@@ -11,18 +11,20 @@ use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::{Pose, Wrench};
 use proprio_dynamics::{ContactSet, Kinematics, Solver, Structure};
+use proprio_identification::online::COVERED;
 use proprio_identification::statistics::deviate;
 use proprio_topics::Nanos;
-
-/// Deviations within which a torque lies that may be the true one. At four, the promise, almost
-/// half of the room remains for its own uncertainty.
-const COVERED: f64 = 2.5;
 
 /// The deviate above which a residual is significant: by chance, 3 of 10 million instants.
 pub(super) const SIGNIFICANT: f64 = 5.0;
 
 /// Time constant of mean residuals.
 pub(super) const TIME_CONSTANT: Nanos = Nanos::from_millis(50);
+
+/// The part of an exponential mean that is left after this time.
+pub(super) fn kept(since: Nanos) -> f64 {
+    (-since.seconds() / TIME_CONSTANT.seconds()).exp()
+}
 
 /// Time after which a mean shows a step whole, but for a thousandth.
 const SETTLED: Nanos = Nanos::from_millis(350);
@@ -93,7 +95,7 @@ impl Step {
         };
         let now = back(&(*residual).into());
         let next = |mean: Vector6<f64>, before: Nanos| {
-            let keep = (-(t - before).seconds() / TIME_CONSTANT.seconds()).exp();
+            let keep = kept(t - before);
             mean * keep + now * (1.0 - keep)
         };
         let in_sensor = || {

@@ -16,8 +16,9 @@ pub(super) struct Robot {
     pub(super) name: String,
     /// estimator.toml, with unknown offsets; `model` names no file.
     pub(super) config: Table,
-    pub(super) urdf: String,
     /// The URDF.
+    pub(super) urdf: String,
+    /// The URDF's model.
     pub(super) cad: Model,
     /// The links that may be touched.
     pub(super) tips: Vec<String>,

@@ -40,22 +40,19 @@ pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
                         });
                     }
                 }
-                for (given, order) in [("velocity", 1), ("acceleration", 2)] {
-                    let track = &mut recording.joints[dof];
-                    let stream = match order {
-                        1 => &track.velocity,
-                        _ => &track.acceleration,
-                    };
+                let track = &mut recording.joints[dof];
+                let derivatives = [
+                    ("velocity", 1, &mut track.velocity),
+                    ("acceleration", 2, &mut track.acceleration),
+                ];
+                for (given, order, stream) in derivatives {
                     if let Some(off) = noisy(&track.position, stream, order) {
                         found.push(Defect::NoisyDerivative {
                             joint: joint.clone(),
                             given,
                             off,
                         });
-                        match order {
-                            1 => track.velocity = Stream::default(),
-                            _ => track.acceleration = Stream::default(),
-                        }
+                        *stream = Stream::default();
                     }
                 }
                 let track = &recording.joints[dof];

@@ -48,7 +48,7 @@ use unit::Unit;
 
 /// Deviations within which the torque of a hypothesis lies that is not refuted. At four, the
 /// promise, almost half of the room remains for the uncertainty of that torque itself.
-const COVERED: f64 = 2.5;
+pub const COVERED: f64 = 2.5;
 /// Postures in which torques are compared, one in [`APART`] ticks: those of 10 s.
 const POSTURES: usize = 20;
 const APART: usize = 5;
@@ -102,8 +102,13 @@ impl Tick {
 }
 
 /// The bit of a component in [`Tick`].
-pub(crate) fn bit(component: usize) -> u64 {
+fn bit(component: usize) -> u64 {
     1 << component.min(63)
+}
+
+/// The bits of these components.
+pub(crate) fn bits(components: impl Iterator<Item = usize>) -> u64 {
+    components.fold(0, |bits, component| bits | bit(component))
 }
 
 /// What a component contributes.
@@ -296,7 +301,8 @@ impl Bank {
             .for_each(|own| own.leading = None);
         for unit in units.iter() {
             let dofs = place.dofs(&unit.columns.sensors, Some(unit.subtree));
-            let (leading, alternatives) = (unit.leading(), unit.alternatives());
+            let leading = unit.leading();
+            let (is_doubtful, is_settled) = (unit.is_doubtful(), unit.is_settled());
             let of_component = &mut solution.components[unit.component].leading;
             *of_component = of_component.or(leading);
             let mut add = |dof: usize, deviation: f64| {
@@ -306,15 +312,22 @@ impl Bank {
             };
             // The first postures of a motion do not show yet how far apart the torques will be.
             let is_shown = unit.fits[0].ticks() >= SHOWN && disturbed & bit(unit.component) == 0;
-            if unit.is_doubtful() || !unit.is_settled() {
+            if is_doubtful || !is_settled {
                 let beyond = place.dofs(&measured_with(unit, units), None);
                 beyond.iter().for_each(|&dof| add(dof, f64::INFINITY));
             }
-            if unit.is_doubtful() || !unit.is_settled() && !is_shown {
+            if is_doubtful || !is_settled && !is_shown {
                 dofs.iter().for_each(|&dof| add(dof, f64::INFINITY));
                 continue;
             }
             let learnt = |tick: &&Tick| tick.learnt & bit(unit.component) != 0;
+            if recent.iter().any(|tick| learnt(&tick)) {
+                dofs.iter().for_each(|&dof| add(dof, 0.0));
+            }
+            let alternatives = unit.alternatives();
+            if alternatives.is_empty() {
+                continue;
+            }
             for tick in recent.iter().filter(learnt) {
                 let published = place.torques(tick, &Hypothesis::AS_STATED, &in_use, &dofs);
                 for other in &alternatives {
@@ -325,7 +338,6 @@ impl Bank {
                         }
                     }
                 }
-                dofs.iter().for_each(|&dof| add(dof, 0.0));
             }
         }
         for (to, doubt) in solution.doubts.iter_mut().zip(doubts) {

@@ -2,7 +2,7 @@
 //! use.
 
 use crate::linear::information::{Information, Panel};
-use crate::online::bank::{Bank, Tick, bit};
+use crate::online::bank::{self, Bank, Tick};
 use crate::online::channel::{Channel, SecondMean};
 use crate::online::component::{Component, channels};
 use crate::online::parameters::Parameters;
@@ -643,7 +643,7 @@ impl Job {
             }
         }
         let disturbed = (self.parts.iter().enumerate()).filter(|(_, part)| part.is_disturbed);
-        let disturbed = disturbed.fold(0, |bits, (number, _)| bits | bit(number));
+        let disturbed = bank::bits(disturbed.map(|(number, _)| number));
         self.bank.doubt(&mut self.solution, disturbed);
     }
 

@@ -253,6 +253,7 @@ impl Doubt {
         deviation: f64::INFINITY,
         leading: None,
     };
+    /// Where nothing is in doubt.
     pub(crate) const NONE: Self = Self {
         deviation: 0.0,
         leading: None,

@@ -168,11 +168,12 @@ impl Unit {
 
     /// The odds of what is stated, or differs from it by a contact with next to no force.
     fn stated(&self) -> f64 {
+        let odds = |fit: &Fit| fit.branches[0].log_odds;
+        let own = odds(&self.fits[0]);
         let contacts = self.fits.iter().filter(|fit| fit.contact.is_some());
-        let harmless = contacts.filter(|fit| fit.force(&self.columns) <= LITTLE);
-        harmless
-            .map(|fit| fit.branches[0].log_odds)
-            .fold(self.fits[0].branches[0].log_odds, f64::max)
+        let likelier = contacts.filter(|fit| odds(fit) > own);
+        let harmless = likelier.filter(|fit| fit.force(&self.columns) <= LITTLE);
+        harmless.map(odds).fold(own, f64::max)
     }
 
     /// Whether another hypothesis is likelier than what is stated.
