@@ -1166,7 +1166,7 @@ fn a_state_is_resumed_and_one_that_does_not_fit_is_refused() {
     assert!(
         refused(&format!("{}{other}{}", &text[..at], &text[at + 1..])).contains("wrong checksum")
     );
-    assert!(refused(&text.replacen("state 4", "state 5", 1)).contains("schema 5"));
+    assert!(refused(&text.replacen("state 3", "state 4", 1)).contains("schema 4"));
     let mut config = Config::load(&sessions.folder.join("estimator.toml")).unwrap();
     config.identification.enabled = true;
     config.contact.last_mut().unwrap().presence = Presence::Possible;

@@ -339,8 +339,6 @@ impl Online {
             begun.tau = f64::NAN;
             debug_assert_eq!(begun.root.ncols(), parameters);
             part.selection.replace_all(begun);
-            // Identification names what is wrong with a setup.
-            job.bank.confirm(number);
             part.write_solution(known);
             part.last_valid.clone_from(known);
         }

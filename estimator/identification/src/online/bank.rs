@@ -20,12 +20,12 @@
 //! torques may be the true ones. So the deviation of a torque is at least that of the hypothesis,
 //! and covers the torque of the hypothesis within [`COVERED`] deviations. If another hypothesis
 //! than the stated one is the likeliest, no torque is valid that depends on the sub-tree or its
-//! sensors; it is named once the stated one is that unlikely. A hypothesis with odds below a
-//! millionth is refuted, and dropped.
+//! sensors; it is named once the stated one is that unlikely. A hypothesis whose odds have fallen by
+//! four decades is refuted, and dropped.
 //!
-//! Before the first two seconds of motion nothing is known about a new setup, and its torques are
-//! unknown. A setup that an earlier run has confirmed is taken as stated until something
-//! contradicts it.
+//! The setup is taken as stated until something contradicts it: the prior odds of each hypothesis
+//! about it are small. Those of a contact since the start are not. Before the first two seconds of
+//! motion nothing is known about it, and the torques that it matters to are unknown.
 
 mod evidence;
 mod hypothesis;
@@ -360,17 +360,6 @@ impl Bank {
         let model = self.place.model.clone();
         self.of(component)
             .for_each(|unit| unit.forget_loads(&model));
-    }
-
-    /// From now on the setup of a component is taken as one that was confirmed before.
-    pub(crate) fn confirm(&mut self, component: usize) {
-        self.of(component).for_each(Unit::confirm);
-    }
-
-    /// Whether the setup of a component is as stated, as far as is known.
-    pub(crate) fn is_confirmed(&self, component: usize) -> bool {
-        let mut own = self.units.iter().filter(|unit| unit.component == component);
-        own.all(Unit::is_confirmed)
     }
 
     fn of(&mut self, component: usize) -> impl Iterator<Item = &mut Unit> {

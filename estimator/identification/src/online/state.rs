@@ -1,11 +1,11 @@
 //! The state of on-line identification as a file, so that it survives a restart.
 //!
 //! ```text
-//! proprio identification state 4
+//! proprio identification state 3
 //! robot <name>
 //! model <hash of the links, the sensors and CAD>
 //! sensors <hash of their mounting and calibration>
-//! component <unknowns> <tau> <1: learnt parameters are in use, 0: CAD's> <1: setup is confirmed>
+//! component <unknowns> <tau> <1: learnt parameters are in use, 0: CAD's>
 //! noise <variance of each F/T channel>
 //! row <R_kk ... R_kn z_k>                     one line per parameter
 //! ...
@@ -27,7 +27,7 @@ use proprio_dynamics::Structure;
 use proprio_dynamics::calibration::Calibration;
 
 const TITLE: &str = "proprio identification state";
-const SCHEMA: &str = "4";
+const SCHEMA: &str = "3";
 /// Text for a difference of the sensors.
 const SENSORS: &str = "mounting or calibration of its force/torque sensors";
 
@@ -146,13 +146,15 @@ impl Job {
         let (model, sensors) = (model(&self.parts), &sensors.0);
         let mut text =
             format!("{TITLE} {SCHEMA}\nrobot {robot}\nmodel {model}\nsensors {sensors}\n");
-        for (number, part) in self.parts.iter().enumerate() {
+        for part in &self.parts {
             let parameters = part.information.trailing(6 * part.sensors.len());
             let _ = write!(text, "component {}", parameters.unknowns());
             let is_learnt = part.selection.in_use().effective > 0.0;
-            let flags = [is_learnt, self.bank.is_confirmed(number)];
-            let flags = flags.map(|flag| f64::from(u8::from(flag)));
-            put(&mut text, "", std::iter::once(part.tau).chain(flags));
+            put(
+                &mut text,
+                "",
+                [part.tau, f64::from(u8::from(is_learnt))].into_iter(),
+            );
             put(&mut text, "noise", part.variances.iter().copied());
             for k in 0..parameters.unknowns() {
                 put(&mut text, "row", parameters.row(k).iter().copied());
@@ -217,8 +219,8 @@ impl Online {
         for part in &job.parts {
             let (offset_count, parameters) =
                 (6 * part.sensors.len(), LINK_PARAMETERS * part.links.len());
-            let [tau, is_learnt, is_confirmed] =
-                numbers(lines.next(), &format!("component {parameters}"), 3)?[..]
+            let [tau, is_learnt] =
+                numbers(lines.next(), &format!("component {parameters}"), 2)?[..]
             else {
                 return Err(StateError::Damaged("the weight is missing"));
             };
@@ -238,15 +240,11 @@ impl Online {
             if !(tau > 0.0 && variances.iter().all(|v| *v > 0.0)) {
                 return Err(StateError::Damaged("a variance is not positive"));
             }
-            let flags = [is_learnt, is_confirmed].map(|flag| flag > 0.0);
-            read.push((tau, flags, variances, information));
+            read.push(((tau, is_learnt > 0.0), variances, information));
         }
-        let parts = job.parts.iter_mut().zip(&mut self.components);
-        for (number, ((part, component), read)) in parts.zip(read).enumerate() {
-            let (tau, [is_learnt, is_confirmed], variances, information) = read;
-            if is_confirmed {
-                job.bank.confirm(number);
-            }
+        for ((part, component), ((tau, is_learnt), variances, information)) in
+            job.parts.iter_mut().zip(&mut self.components).zip(read)
+        {
             part.tau = tau;
             part.is_replaced = is_learnt;
             part.variances.copy_from_slice(&variances);

@@ -10,20 +10,21 @@ use proprio_dynamics::{ContactSet, Structure};
 
 /// Prior odds of a contact since the start.
 const CONTACT: f64 = 0.1;
-/// Prior odds of each other hypothesis about a setup that is new, and about one that was confirmed
-/// before: one start in a hundred thousand is the first one after somebody has changed it.
-const STRUCTURAL: f64 = 1e-3;
-const CHANGED: f64 = 1e-5;
+/// Prior odds of each hypothesis about the setup. It takes evidence of 6.4 to need cover, and 16 to
+/// be the likeliest. Errors of a model are not among the hypotheses, and look like them: those of a
+/// real leg, with F/T errors of ten times the stated noise, are worth up to 8 for the likeliest one.
+const STRUCTURAL: f64 = 1e-7;
 /// Odds below which a hypothesis needs no cover: it is no likelier than an error of more than four
 /// deviations.
 const UNLIKELY: f64 = 6.3e-5;
-/// Odds below which a hypothesis is refuted. With a hundred hypotheses about a robot, one of ten
-/// thousand robots has a true one refuted.
-const REFUTED: f64 = 1e-6;
+/// Evidence below which a hypothesis is refuted: one in ten thousand. That is how often at most a
+/// true one is ever refuted, however long it is observed (Ville's inequality).
+const REFUTED: f64 = 1e-4;
 /// Force of a contact since the start that does not matter \[N\]: a tenth of the expected one.
 const LITTLE: f64 = 0.1 * FORCE;
-/// Ticks in which a misfit lasts: a second. In them it counts as one.
-const LASTING: f64 = 10.0;
+/// Ticks in which a misfit lasts: the 3 s of a movement, for it depends on the posture. In them it
+/// counts as one.
+const LASTING: f64 = 30.0;
 
 /// See the [module](self).
 #[derive(Clone, Debug)]
@@ -61,28 +62,6 @@ impl Unit {
     /// Drops everything that was learnt.
     pub(super) fn begin_anew(&mut self) {
         self.fits.clone_from(&self.at_start);
-    }
-
-    /// From now on the setup is taken as one that was confirmed before.
-    pub(super) fn confirm(&mut self) {
-        let fits = self.fits.iter_mut().chain(&mut self.at_start);
-        for fit in fits {
-            let view = fit.view;
-            for branch in &mut fit.branches {
-                if is_structural(view, branch.sight) {
-                    branch.log_prior = CHANGED.ln();
-                }
-            }
-        }
-    }
-
-    /// Whether everything but a contact is as stated, as far as is known.
-    pub(super) fn is_confirmed(&self) -> bool {
-        let mut structural = self.fits.iter().flat_map(|fit| {
-            let of_fit = fit.branches.iter();
-            of_fit.filter(|branch| is_structural(fit.view, branch.sight))
-        });
-        !structural.any(Branch::needs_cover)
     }
 
     pub(super) fn forget_offsets(&mut self) {
@@ -156,7 +135,8 @@ impl Unit {
             for (place, branch) in fit.branches.iter_mut().enumerate() {
                 branch.log_odds -= best;
                 // What is stated may become likely again.
-                branch.is_refuted |= branch.log_odds < REFUTED.ln() && (number, place) != (0, 0);
+                let is_refuted = branch.log_odds < branch.log_prior + REFUTED.ln();
+                branch.is_refuted |= is_refuted && (number, place) != (0, 0);
             }
         }
         let mut number = 0;
@@ -198,7 +178,11 @@ impl Unit {
 
     /// Whether everything is as stated, as far as is known.
     pub(super) fn is_settled(&self) -> bool {
-        self.is_confirmed() && !self.may_have_begun_in_contact()
+        let mut structural = self.fits.iter().flat_map(|fit| {
+            let of_fit = fit.branches.iter();
+            of_fit.filter(|branch| fit.view != View::AsStated || branch.sight != Sight::AsStated)
+        });
+        !structural.any(Branch::needs_cover) && !self.may_have_begun_in_contact()
     }
 
     /// Whether there may have been a contact since the start, with a force that matters. One with
@@ -223,11 +207,6 @@ impl Unit {
         .filter_map(|(fit, number, _)| fit.posterior(&self.columns, number))
         .collect()
     }
-}
-
-/// Whether a hypothesis is about the setup.
-fn is_structural(view: View, sight: Sight) -> bool {
-    view != View::AsStated || sight != Sight::AsStated
 }
 
 impl Branch {
