@@ -304,7 +304,7 @@ fn the_demonstration_runs_on_interfaces() {
             "--robot",
             &arm.folder,
             "--seconds",
-            "3",
+            "10",
             "--out",
             text(&out),
         ];
