@@ -34,7 +34,8 @@ pub(super) struct Sanity {
     repeats: Repeats<6>,
     jumps: Jumps<6>,
     is_encoder: bool,
-    /// An encoder's readings repeat themselves as its noise makes impossible.
+    /// An encoder's readings repeat themselves as its noise makes impossible, or since it stopped
+    /// at once.
     is_still: bool,
 }
 
@@ -79,7 +80,7 @@ impl Sanity {
         let least = u32::try_from(max_silence.0 / period).unwrap_or(LONGEST);
         let least = least.clamp(2, LONGEST);
         let is_repeated = self.repeats.look(values, quality, least) != 0;
-        self.is_still = is_repeated && self.is_encoder;
+        self.is_still = self.is_encoder && (is_repeated || self.jumps.has_stopped());
         let mut flags = quality;
         if is_repeated && !self.is_encoder {
             flags |= Quality::FROZEN;

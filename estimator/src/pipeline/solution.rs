@@ -173,7 +173,17 @@ impl Pipeline {
             let own = structure.subtree_of(*link).and_then(residual);
             own.is_some_and(SubtreeResidual::is_disturbed)
         };
-        // An encoder that stands beside a residual may be stuck: then no contact explains it.
+        let joints = self.setup.robot.model.joints();
+        let is_beyond = |mut link: usize, dof: usize| {
+            while let Some(joint) = link.checked_sub(1).and_then(|joint| joints.get(joint)) {
+                if joint.dof == Some(dof) {
+                    return true;
+                }
+                link = joint.parent;
+            }
+            false
+        };
+        // An encoder that stands before a residual may be stuck: then no contact explains it.
         let stuck = |dof: usize| {
             if !is_any_disturbed {
                 return None;
@@ -187,10 +197,10 @@ impl Pipeline {
                     let ChannelRole::Joint(other) = channel.role else {
                         return false;
                     };
-                    let moved = structure.moved_by(other);
+                    let is_before = |link: &usize| is_beyond(*link, other);
                     sanity.is_still()
-                        && moved.iter().any(is_disturbed)
-                        && moved.iter().any(|link| own.contains(link))
+                        && (1..=joints.len()).any(|link| is_before(&link) && is_disturbed(&link))
+                        && own.iter().any(is_before)
                 })
         };
         let moved = |dof: usize| structure.moved_by(dof).iter().copied();

@@ -197,6 +197,8 @@ const MEMORY: f64 = 32.0;
 const FIRST: u32 = 16;
 /// No brake stops a joint in less time \[s\].
 const BRAKING: f64 = 0.02;
+/// A stop counts as at once from so many times the largest recent distance on.
+const STOP: f64 = 2.0;
 /// How much larger the expected distance becomes by one reading, at most: two wrong readings that
 /// confirm each other by chance shall not make the third a usual one.
 const GROWTH: f64 = 2.0;
@@ -223,6 +225,8 @@ struct Path {
     resumes: bool,
     /// A doubtful reading, and its distance.
     doubtful: Option<(Nanos, f64, f64)>,
+    /// It has stopped at once, and its value has been the same since then.
+    has_stopped: bool,
 }
 
 impl Path {
@@ -237,6 +241,7 @@ impl Path {
         count: 0,
         resumes: false,
         doubtful: None,
+        has_stopped: false,
     };
 
     /// Takes a reading; returns whether it is doubtful.
@@ -261,6 +266,10 @@ impl Path {
         if self.resumes {
             return self.accept(t, value, 0.0);
         }
+        let most = self.most.max(self.step).max(self.least);
+        // A joint that moves steadily never shows its resolution, so that does not count here.
+        let is_at_once = distance > STOP * self.most * (after / self.period).max(1.0);
+        self.has_stopped = value == self.value && (self.has_stopped || is_at_once);
         // The last good value again and again, without time to brake: it is stuck.
         if let Some((then, before, _)) = self.doubtful
             && value == before
@@ -269,7 +278,6 @@ impl Path {
         {
             return true;
         }
-        let most = self.most.max(self.step).max(self.least);
         let usual = FAR * most;
         // Smooth values bend with the square of the time.
         let longer = (after / self.period).max(1.0);
@@ -340,6 +348,13 @@ impl<const N: usize> Jumps<N> {
     #[must_use]
     pub fn period(&self) -> f64 {
         self.0.first().map_or(0.0, |path| path.period)
+    }
+
+    /// Whether an axis has stopped at once, and has had the same value since then: it is stuck, or
+    /// something stopped it.
+    #[must_use]
+    pub fn has_stopped(&self) -> bool {
+        self.0.iter().any(|path| path.has_stopped)
     }
 
     /// Takes a reading at `t`, NaN where it has none; returns whether it is doubtful.

@@ -347,6 +347,31 @@ fn what_has_changed_is_confirmed_by_the_next_reading() {
     assert!(!channel.read(700.0));
 }
 
+/// An encoder that is stuck stops at once; a joint that stops has to brake.
+#[test]
+fn what_stops_at_once_has_stopped() {
+    // Half a count of noise, rounded; 50 counts a reading, and two less with each when it brakes.
+    for brakes in [false, true] {
+        let (mut channel, mut noise) = (Channel::default(), Noise(3));
+        let mut value = 0.0;
+        let mut last = 0.0;
+        let braking = (0..25).map(|k| 48.0 - 2.0 * f64::from(k));
+        let steps = std::iter::repeat_n(50.0, 100).chain(braking.filter(|_| brakes));
+        for step in steps {
+            value += step;
+            last = (value + 0.5 * noise.next()).round();
+            channel.read(last);
+            assert!(!channel.jumps.has_stopped());
+        }
+        for _ in 0..200 {
+            channel.read(last);
+            assert_eq!(channel.jumps.has_stopped(), !brakes);
+        }
+        channel.read(last + 3.0);
+        assert!(!channel.jumps.has_stopped());
+    }
+}
+
 #[test]
 fn after_a_gap_it_may_be_anywhere_near() {
     let swing = |t: i64| 1000.0 * (t as f64 * 1e-3 * 3.0).sin();

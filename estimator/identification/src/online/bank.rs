@@ -20,8 +20,8 @@
 //! torques may be the true ones. So the deviation of a torque is at least that of the hypothesis,
 //! and covers the torque of the hypothesis within [`COVERED`] deviations. If another hypothesis
 //! than the stated one is the likeliest, no torque is valid that depends on the sub-tree or its
-//! sensors; it is named once the stated one is that unlikely. A hypothesis whose odds have fallen by
-//! four decades is refuted, and dropped.
+//! sensors; it is named once the stated one is that unlikely. A hypothesis whose odds have fallen
+//! by four decades is refuted, and dropped.
 //!
 //! The setup is taken as stated until something contradicts it: the prior odds of each hypothesis
 //! about it are small. Those of a contact since the start are not. Before the first two seconds of

@@ -12,7 +12,8 @@ use proprio_dynamics::{ContactSet, Structure};
 const CONTACT: f64 = 0.1;
 /// Prior odds of each hypothesis about the setup. It takes evidence of 6.4 to need cover, and 16 to
 /// be the likeliest. Errors of a model are not among the hypotheses, and look like them: those of a
-/// real leg, with F/T errors of ten times the stated noise, are worth up to 8 for the likeliest one.
+/// real leg, with F/T errors of ten times the stated noise, are worth up to 8 for the likeliest
+/// one.
 const STRUCTURAL: f64 = 1e-7;
 /// Odds below which a hypothesis needs no cover: it is no likelier than an error of more than four
 /// deviations.
