@@ -9,19 +9,20 @@
 pub(crate) mod advice;
 #[cfg(test)]
 mod example;
+mod logs;
 mod page;
+mod payload;
 pub(crate) mod summary;
 
-use crate::convert::check_columns;
 use advice::{Advice, Grade, findings, sentence};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
+use logs::{names, open, read};
 use proprio_dynamics::model::Model;
-use proprio_estimator::setup::Setup;
-use proprio_estimator::{export, reading};
+use proprio_estimator::export;
 use proprio_identification::{Options, Outcome, Progress, Role, Severity, Verdict, identify};
-use std::fs::{self, File};
-use std::io::{BufRead, BufReader, Cursor, IsTerminal, Read};
+use std::fs;
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
 /// `proprio identify`.
@@ -37,8 +38,16 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     validate: Vec<PathBuf>,
     /// Folder for summary.json, parameters.toml, identified.urdf and report.html
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
+    #[arg(long, value_name = "DIR", required_unless_present = "payload")]
+    out: Option<PathBuf>,
+    /// Identify, instead of the robot, what this link or frame carries in the samples: its mass,
+    /// centre of mass and inertia
+    #[arg(long, value_name = "LINK", conflicts_with_all = ["validate", "out"])]
+    payload: Option<String>,
+    /// The robot without the payload: its parameters.toml, or a table of samples, which may be
+    /// given several times [default: the parameters that estimator.toml names]
+    #[arg(long, value_name = "FILE", requires = "payload")]
+    reference: Vec<PathBuf>,
     /// Print the summary as JSON
     #[arg(long)]
     json: bool,
@@ -54,6 +63,16 @@ const FILES: [&str; 4] = [
 
 /// Identifies.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    if let Some(name) = &args.payload {
+        return payload::run(
+            &args.config,
+            &args.samples,
+            name,
+            &args.reference,
+            args.json,
+        );
+    }
+    let out = args.out.as_deref().unwrap_or_else(|| Path::new("."));
     let (config, setup) = proprio_estimator::daemon::load(&args.config, |config| {
         // Identification starts from the URDF, not from parameters identified earlier.
         config.parameters = None;
@@ -73,10 +92,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     }
     // All inputs are open. Remove the results of an earlier run, which could be mistaken for
     // results of this one.
-    fs::create_dir_all(&args.out)
-        .with_context(|| format!("{}: cannot be created", args.out.display()))?;
+    fs::create_dir_all(out).with_context(|| format!("{}: cannot be created", out.display()))?;
     for name in FILES {
-        let file = args.out.join(name);
+        let file = out.join(name);
         match fs::remove_file(&file) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
                 return Err(error)
@@ -104,8 +122,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             &format!("reading {name}"),
             of_reading * number as f64 / files.len() as f64,
         );
-        let dataset = reading::dataset_or_unreadable(&setup.robot, &name, *role, table);
-        datasets.push(dataset.with_context(|| name.clone())?);
+        datasets.push(read(&setup, &name, *role, table)?);
     }
     let result = identify(
         &setup.robot,
@@ -131,18 +148,18 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             &setup.robot,
             concat!("proprio ", env!("CARGO_PKG_VERSION")),
         )?;
-        let file = args.out.join("parameters.toml");
+        let file = out.join("parameters.toml");
         parameters
             .save(&file)
             .with_context(|| file.display().to_string())?;
         let urdf = parameters
             .urdf(&urdf, &setup.robot)
             .with_context(|| config.model.display().to_string())?;
-        write(&args.out, "identified.urdf", &urdf)?;
+        write(out, "identified.urdf", &urdf)?;
     }
     // The summary is written last: if it exists, the others do.
-    write(&args.out, "report.html", &page::page(&outcome, &advice))?;
-    write(&args.out, "summary.json", &text)?;
+    write(out, "report.html", &page::page(&outcome, &advice))?;
+    write(out, "summary.json", &text)?;
     for (log, finding) in findings(&outcome).filter(|(_, f)| f.severity > Severity::Note) {
         let place = log.map(|l| format!("{}: ", l.file)).unwrap_or_default();
         eprintln!(
@@ -154,7 +171,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     if args.json {
         print_line!("{json}");
     } else {
-        print_outcome(&outcome, &advice, &args.out);
+        print_outcome(&outcome, &advice, out);
     }
     if let Verdict::Nothing(reason) = &outcome.verdict {
         bail!(
@@ -165,58 +182,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     if advice.grade == Grade::Reject {
         bail!(
             "the result was rejected, and no parameters were written: {} gives the reasons",
-            args.out.join("report.html").display()
+            out.join("report.html").display()
         );
     }
     Ok(())
-}
-
-/// Opens a log and checks its columns.
-fn open(file: &Path, config: &Path, setup: &Setup) -> anyhow::Result<impl Read + Send + use<>> {
-    let mut table = BufReader::with_capacity(
-        1 << 18,
-        File::open(file).with_context(|| format!("{}: cannot be read", file.display()))?,
-    );
-    let mut header = Vec::new();
-    // Skip blank lines before the header.
-    while header.trim_ascii().is_empty() {
-        let read = table
-            .read_until(b'\n', &mut header)
-            .with_context(|| format!("{}: cannot be read", file.display()))?;
-        if read == 0 {
-            break;
-        }
-    }
-    check_columns(&header, file, config, setup)?;
-    Ok(Cursor::new(header).chain(table))
-}
-
-/// Names of the logs: file names, with as many parent folders as make them unique.
-fn names(files: &[(&PathBuf, Role)]) -> Vec<String> {
-    let short = |file: &Path, parts: usize| -> String {
-        let all: Vec<_> = file
-            .components()
-            .map(|c| c.as_os_str().to_string_lossy())
-            .collect();
-        all.get(all.len().saturating_sub(parts)..)
-            .unwrap_or_default()
-            .join("/")
-    };
-    files
-        .iter()
-        .map(|(file, _)| {
-            let most = file.components().count();
-            let alone = |parts: &usize| {
-                files
-                    .iter()
-                    .filter(|(f, _)| short(f, *parts) == short(file, *parts))
-                    .count()
-                    == 1
-            };
-            let told = (1..=most).find(alone).map(|parts| short(file, parts));
-            told.unwrap_or_else(|| file.display().to_string())
-        })
-        .collect()
 }
 
 /// A progress bar if stderr is a terminal.
@@ -258,35 +227,4 @@ fn print_outcome(outcome: &Outcome, advice: &Advice, out: &Path) {
         .filter(|name| out.join(name).exists())
         .collect();
     print_line!("{}: {}", out.display(), written.join(", "));
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn logs_have_the_shortest_unique_names() {
-        let files: Vec<PathBuf> = [
-            "/a/one/x.csv",
-            "/a/two/x.csv",
-            "y.csv",
-            "/a/two/y.csv",
-            "/z.csv",
-            "/z.csv",
-        ]
-        .map(PathBuf::from)
-        .to_vec();
-        let files: Vec<(&PathBuf, Role)> = files.iter().map(|f| (f, Role::Train)).collect();
-        assert_eq!(
-            names(&files),
-            [
-                "one/x.csv",
-                "two/x.csv",
-                "y.csv",
-                "two/y.csv",
-                "/z.csv",
-                "/z.csv"
-            ]
-        );
-    }
 }

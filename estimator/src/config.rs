@@ -377,9 +377,7 @@ pub struct Identification {
     /// force-force and torque-torque cross-talk. For cross-talk of a torque into a force it is
     /// divided by the sensor's length, for a force into a torque multiplied by it. The length is
     /// the ratio of RMS `noise_nm` to RMS `noise_n`, which is about the ratio of the full scales.
-    /// With `gain = "auto"` it is also the required improvement: at one sensor or more, the mean
-    /// square error in held-out data must fall by more than the square of this number times the
-    /// mean square of the sensor's readings.
+    /// Where the logs show smaller errors, it is reduced, to a tenth at most (evidence).
     pub gain_std: f64,
     /// Whether `proprio identify` also identifies the drift of readings with the temperature of the
     /// sensor's board, if that was recorded.

@@ -5,11 +5,12 @@ use crate::parameters::{
     Calibrated, Friction, Offset, Parameters, ParametersError, Provenance, Rotor, Span,
 };
 use nalgebra::DMatrix;
+use proprio_dynamics::calibration::Unknown;
 use proprio_dynamics::regressor::identifiable::Column;
 use proprio_dynamics::spatial::Wrench;
 use proprio_identification::Robot;
 use proprio_identification::robot::{AXES, ChannelRole};
-use proprio_identification::{LogOutcome, Outcome, Role};
+use proprio_identification::{Known, LogOutcome, Outcome, Role};
 
 /// The identified parameters of `robot`: inertial parameters of the links in the covariance,
 /// offsets, calibrations, friction, rotor inertias. Offsets and friction are those at the end of
@@ -145,6 +146,32 @@ fn frictions(log: &LogOutcome) -> Vec<Friction> {
         .collect()
 }
 
+/// What is known with these parameters about `robot` before it takes a payload up.
+#[must_use]
+pub fn known(parameters: &Parameters, robot: &Robot) -> Known {
+    let links: Vec<usize> = parameters.identified().collect();
+    let root = parameters.root();
+    // The deviation of each channel's gain with itself, the largest.
+    let mut gains = vec![0.0; robot.offsets.len()];
+    for (place, offset) in parameters.offsets().iter().enumerate() {
+        let Some(sensor) = robot.sensor(&offset.sensor) else {
+            continue;
+        };
+        let unknowns = offset.calibrated.iter().flat_map(|own| own.kind.unknowns());
+        let deviations = parameters.calibration_deviation(place);
+        for (unknown, deviation) in unknowns.zip(deviations) {
+            if matches!(unknown, Unknown::Gain { channel, of } if channel == of) {
+                gains[sensor] = deviation.max(gains[sensor]);
+            }
+        }
+    }
+    Known {
+        root: root.columns(0, 10 * links.len()).into_owned(),
+        links,
+        gains,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -152,8 +179,8 @@ mod tests {
     use crate::setup::Setup;
     use proprio_dynamics::spatial::RigidInertia;
     use proprio_identification::{
-        ChannelNoise, Consistency, CovarianceRoot, FrictionOutcome, LinkOutcome, ModelComparison,
-        OffsetOutcome, Predicted, RotorOutcome, Verdict,
+        ChannelNoise, CovarianceRoot, FrictionOutcome, LinkOutcome, OffsetOutcome, Predicted,
+        RotorOutcome, Verdict,
     };
     use proprio_topics::Nanos;
     use std::collections::BTreeMap;
@@ -209,7 +236,6 @@ mod tests {
             excluded: vec![],
             onset: None,
             predicted: Predicted::default(),
-            fitted_error: ModelComparison::default(),
             joints: vec![],
             sensors: vec![],
             two_route: vec![],
@@ -219,7 +245,6 @@ mod tests {
                 end,
                 deviation: [0.0; 6],
                 rate: [0.1, 0.2, 0.3, 0.01, 0.02, 0.03],
-                offset_jumps: vec![],
             }],
             friction: vec![FrictionOutcome {
                 joint: "l_elbow".into(),
@@ -230,13 +255,6 @@ mod tests {
             }],
             findings: vec![],
             curves: vec![],
-            spectra: vec![],
-        };
-        let consistency = Consistency {
-            feasible: Some(true),
-            deviations: 0.0,
-            links: vec![],
-            text: String::new(),
         };
         Outcome {
             robot: robot.name.clone(),
@@ -272,7 +290,6 @@ mod tests {
                 })
                 .collect(),
             time_offsets: vec![],
-            consistency,
             logs: vec![
                 log("train.csv", Role::Train, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
                 log("validate.csv", Role::Validate, [9.0; 6]),

@@ -359,6 +359,16 @@ impl Setup {
         self.state.apply(&self.robot, parameters)
     }
 
+    /// The robot with the parameters and calibrations in use as those of its URDF and
+    /// configuration.
+    #[must_use]
+    pub fn robot_as_identified(&self) -> Robot {
+        let mut robot = self.robot.clone();
+        robot.model = self.state.model.clone();
+        robot.calibrations.clone_from(&self.state.calibrations);
+        robot
+    }
+
     /// The number of a channel: those of the robot come first, then the skins.
     #[must_use]
     pub fn channel(&self, kind: Kind, name: &str) -> Option<usize> {
@@ -805,7 +815,7 @@ fn stances(
 
 /// The frame of a link or of a link that was folded into another; the error suggests a similar
 /// name.
-fn frame(model: &Model, name: &str) -> Result<Frame, String> {
+pub fn frame(model: &Model, name: &str) -> Result<Frame, String> {
     model.frame(name).ok_or_else(|| {
         if model.is_dropped(name) {
             return dropped(model, name);

@@ -159,7 +159,7 @@ impl Table {
     /// All its defects, including the offset jumps.
     fn defects(&self, robot: &Robot) -> Vec<Defect> {
         let dataset = self.dataset(robot);
-        all_defects(&dataset).into_iter().cloned().collect()
+        dataset.defects().to_vec()
     }
 }
 
@@ -404,7 +404,6 @@ fn a_clean_log_has_no_defects_and_its_instants_are_true() {
     for (rate, jitter) in [(100.0, 0.5), (500.0, 0.3)] {
         let instants = log(&robot, 20.0, rate, jitter, 0.0, 7).dataset(&robot);
         assert_eq!(instants.defects(), []);
-        assert_eq!(instants.offset_jumps(), []);
         let usable: Vec<&Observation> = instants
             .observations()
             .iter()
@@ -471,7 +470,7 @@ fn a_log_that_holds_everything_is_used_row_by_row() {
         .collect();
     let table = Table { header, rows };
     let check = |instants: &Dataset| {
-        assert_eq!(all_defects(instants), [] as [&Defect; 0]);
+        assert_eq!(instants.defects(), []);
         assert_eq!(instants.observations().len(), table.rows.len());
         for (instant, (_, row)) in instants.observations().iter().zip(&table.rows) {
             assert!(instant.faults.iter().all(|f| *f == Reason::None));
@@ -540,7 +539,7 @@ fn given_velocities_are_kept_and_differentiated() {
         row.extend(given.collect::<Vec<_>>());
     }
     let instants = table.dataset(&robot);
-    assert_eq!(all_defects(&instants), [] as [&Defect; 0]);
+    assert_eq!(instants.defects(), []);
     let usable = instants
         .observations()
         .iter()
@@ -573,8 +572,8 @@ fn derivatives_that_are_noise_are_not_used() {
         row.push(if row[0].is_nan() { f64::NAN } else { given });
     }
     let instants = table.dataset(&robot);
-    let [Defect::NoisyDerivative { joint, given, off }] = all_defects(&instants)[..] else {
-        panic!("{:?}", all_defects(&instants));
+    let [Defect::NoisyDerivative { joint, given, off }] = &instants.defects()[..] else {
+        panic!("{:?}", instants.defects());
     };
     assert_eq!((joint.as_str(), *given), ("elbow", "acceleration"));
     assert!((off - 12.0).abs() < 1.5, "{off}");
@@ -584,15 +583,6 @@ fn derivatives_that_are_noise_are_not_used() {
         .filter(|i| i.has_motion(&robot.channels));
     let error = rms(usable.map(|i| i.acceleration[1] - motion(1, i.t.seconds())[2]));
     assert!(error < 0.1, "{error}");
-}
-
-/// The defects, including the offset jumps.
-fn all_defects(instants: &Dataset) -> Vec<&Defect> {
-    instants
-        .defects()
-        .iter()
-        .chain(instants.offset_jumps().iter().map(|b| &b.jump))
-        .collect()
 }
 
 /// The kind of a defect, without its numbers.
@@ -611,7 +601,6 @@ fn kind(defect: &Defect) -> &'static str {
         Defect::Derivative { .. } => "derivative",
         Defect::NoMotion { .. } => "no motion",
         Defect::TooShort { .. } => "too short",
-        Defect::Jump { .. } => "jump",
         Defect::Outliers { .. } => "outliers",
         _ => "other",
     }
@@ -813,40 +802,6 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
             "the log of 1.",
         ),
         (
-            "a jump",
-            Box::new(|t| {
-                each(t, &mut |t, r| {
-                    if t > 9 * second {
-                        r[2] += 3.0
-                    }
-                })
-            }),
-            &["jump"],
-            "wrench/ft: fx jumps by 3.",
-        ),
-        (
-            "a slide",
-            Box::new(|t| {
-                each(t, &mut |t, r| {
-                    r[3] += 40.0 * ((t - 9 * second) as f64 / (0.3 * second as f64)).clamp(0.0, 1.0)
-                })
-            }),
-            &["jump"],
-            "wrench/ft: fy jumps by ",
-        ),
-        (
-            "blows",
-            Box::new(|t| {
-                each(t, &mut |t, r| {
-                    if between(t, 90, 91) && t % second < 30_000_000 {
-                        r[4] += 9.0
-                    }
-                })
-            }),
-            &["outliers"],
-            "outliers of fz",
-        ),
-        (
             "ticks of the encoder",
             Box::new(|t| {
                 for i in [400, 900, 1300] {
@@ -973,7 +928,7 @@ fn gating_follows_contacts_quality_and_edges() {
         ]);
     }
     let instants = table.dataset(&robot);
-    let defects = all_defects(&instants);
+    let defects = instants.defects();
     let kinds: Vec<&str> = defects.iter().map(|defect| kind(defect)).collect();
     assert_eq!(kinds, ["saturated"], "{defects:#?}");
     let sensor = robot.channels.iter().position(|c| c.name == "ft").unwrap();
@@ -1102,40 +1057,21 @@ fn the_leg_of_a_real_icub_has_its_true_defects_and_no_others() {
         .defects()
         .iter()
         .for_each(|d| println!("{:?}: {d}", d.severity()));
-    println!(
-        "{} instants, breaks {:?}",
-        instants.observations().len(),
-        instants.offset_jumps()
-    );
+    println!("{} instants", instants.observations().len());
     assert_eq!(instants.observations().len(), 1981);
-    let warnings: Vec<&Defect> = all_defects(&instants)
-        .into_iter()
-        .filter(|d| d.severity() > Severity::Note)
-        .collect();
+    let warnings = instants
+        .defects()
+        .iter()
+        .filter(|d| d.severity() > Severity::Note);
     // The left leg's board repeats one reading for nine seconds, and others now and then. All other
     // streams have no defect.
-    let (left, right): (Vec<&Defect>, Vec<&Defect>) = warnings
-        .into_iter()
-        .partition(|d| d.to_string().contains("l_leg_ft_sensor"));
+    let (left, right): (Vec<&Defect>, Vec<&Defect>) =
+        warnings.partition(|d| d.to_string().contains("l_leg_ft_sensor"));
     assert!(
         left.iter()
             .any(|d| matches!(d, Defect::Frozen { from, to, .. } if (*to - *from).seconds() > 9.0))
     );
-    // The right hip stops abruptly: an outlier in the leg's sensor, and before it a force that no
-    // motion explains.
-    let leg = "wrench/r_leg_ft_sensor";
-    let blow = |d: &&Defect| {
-        matches!(d, Defect::Outliers { channel, t, .. }
-            if channel == leg && (25.5..25.7).contains(&t.seconds()))
-    };
-    let slide = |d: &&Defect| {
-        matches!(d, Defect::Jump { channel, axis: "fx", t, size }
-            if channel == leg
-                && (25.0..25.5).contains(&t.seconds())
-                && (4.0..8.0).contains(size))
-    };
-    assert!(right.iter().any(blow) && right.iter().any(slide) && right.len() == 2);
-    assert_eq!(instants.offset_jumps().len(), 1);
+    assert_eq!(right, [] as [&Defect; 0]);
 }
 
 #[test]
@@ -1154,7 +1090,7 @@ fn the_logs_of_a_real_kuka_are_clean() {
             .defects()
             .iter()
             .for_each(|d| println!("{:?}: {d}", d.severity()));
-        assert_eq!(all_defects(&instants), [] as [&Defect; 0]);
+        assert_eq!(instants.defects(), []);
         let usable = instants
             .observations()
             .iter()

@@ -105,26 +105,6 @@ impl Advice {
                 ));
             }
         }
-        if outcome.consistency.feasible.is_none() {
-            this.worsen(Grade::Care);
-            this.why
-                .push("Physical consistency of the parameters could not be decided.".into());
-        }
-        if outcome.consistency.feasible == Some(false) {
-            // The parameters written are the nearest consistent ones; their validation error
-            // decides.
-            this.worsen(Grade::Care);
-            this.why.push(
-                "The parameters that fit the logs best are physically inconsistent; the nearest \
-                 consistent ones were written."
-                    .into(),
-            );
-            this.next.push(
-                "Check the signs, frames and units of the sensors, the joints' zero positions, and \
-                 that every contact is declared."
-                    .into(),
-            );
-        }
         this.look_at_findings(outcome);
         this.assess_excitation(outcome);
         if this.grade == Grade::Reject {
@@ -536,13 +516,7 @@ mod tests {
     }
 
     #[test]
-    fn inconsistency_findings_and_no_gain_each_lower_the_grade() {
-        let mut outcome = good();
-        outcome.consistency.feasible = Some(false);
-        let advice = Advice::of(&outcome);
-        assert_eq!(advice.grade, Grade::Care);
-        assert!(advice.next[0].starts_with("Check the signs"), "{advice:?}");
-        assert_eq!(Advice::of(&example::outcome()).grade, Grade::Care);
+    fn findings_and_no_gain_each_lower_the_grade() {
         let mut outcome = good();
         outcome.verdict = Verdict::NoBetterThanCad;
         assert_eq!(Advice::of(&outcome).grade, Grade::Reject);
@@ -623,10 +597,7 @@ mod tests {
     }
 
     #[test]
-    fn undecided_consistency_and_partial_retention_are_reported() {
-        let mut outcome = good();
-        outcome.consistency.feasible = None;
-        assert_eq!(Advice::of(&outcome).grade, Grade::Care);
+    fn partial_retention_is_reported() {
         let mut outcome = good();
         outcome.links[2].retained_fraction = 0.0;
         let advice = Advice::of(&outcome);

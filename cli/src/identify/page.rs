@@ -10,7 +10,7 @@ use super::summary::severity;
 use crate::report::{self, escape, number};
 use identified::{excitation, parameters, sessions};
 use prediction::{curves, logs, residuals};
-use proprio_identification::{FindingCode, LogOutcome, Outcome, Severity, Verdict};
+use proprio_identification::{LogOutcome, Outcome, Severity, Verdict};
 use words::{counted, role_words};
 
 /// The page.
@@ -83,15 +83,6 @@ fn key_facts(outcome: &Outcome) -> String {
             percent(outcome.least_retained_fraction),
         ));
     }
-    let physical = match outcome.consistency.feasible {
-        Some(true) => "yes",
-        Some(false) => "no",
-        None => "undecided",
-    };
-    facts.push((
-        "physically consistent with the logs".into(),
-        physical.into(),
-    ));
     let facts: Vec<(&str, String)> = facts
         .iter()
         .map(|(name, value)| (name.as_str(), value.clone()))
@@ -125,18 +116,6 @@ fn found(outcome: &Outcome) -> Option<String> {
             serious.is_empty() && notes.len() < 6,
             &[list(notes.iter().map(item).collect())],
         ));
-    }
-    let text = &outcome.consistency.text;
-    let is_finding = |code| all.iter().any(|(_, f)| f.code == code);
-    if !text.is_empty()
-        && ![FindingCode::NotPhysical, FindingCode::FeasibilityUndecided]
-            .into_iter()
-            .any(is_finding)
-    {
-        body.push(report::paragraph(&format!(
-            "Physical consistency: {}",
-            sentence(text)
-        )));
     }
     (!body.is_empty()).then(|| report::section("Findings", &body))
 }
@@ -180,7 +159,7 @@ mod tests {
             "Accept with care",
             "2.35 %",
             "6.40 %",
-            "jumps by 20.1 N",
+            "undeclared disturbance 1 time",
             "walk_2.csv",
             "onset of motion",
             "Excitation spectrum",
@@ -216,7 +195,6 @@ mod tests {
                     ..log.curves[0].clone()
                 })
                 .collect();
-            log.spectra = vec![log.spectra[0].clone(); 80];
         }
         let html = made(&outcome);
         assert!(html.len() < 2_000_000, "{} bytes", html.len());

@@ -25,7 +25,6 @@
 //! | `weakest` | worst first: {`expression`, `relative`, `prior_share`}: below |
 //! | `not_separable` | combinations that the motion of the logs cannot separate, in words |
 //! | `time_offsets` | {`channel`, `seconds` (> 0: late), `std`, `significant`}: not corrected |
-//! | `feasibility` | {`feasible`, `standard_deviations`, `links`, `text`}: below |
 //! | `findings` | {`log` or `null`, `severity`, `code`, `subject`, `text`}: below |
 //! | `links` | a list: below |
 //! | `base_parameters` | {`expression`, `unit`, `cad`, `identified`, `std`} |
@@ -37,8 +36,6 @@
 //!   hold any back: the parameters are those of the CAD then; `nothing`: there are no parameters.
 //! - `weakest`: `relative` is the singular value over the greatest; `prior_share` is the share of
 //!   the variance that is the prior's.
-//! - `feasibility`: `feasible` is whether physical bodies with the identified parameters exist
-//!   (`null`: not decided), `standard_deviations` how far the nearest physical bodies are.
 //! - `findings`: `severity` is `note`, `warning` or `refusal`; `code` one word
 //!   ([`proprio_identification::FindingCode`]); `subject` a channel, joint or link.
 //! - `links`: {`name`, `observed`, `retained_fraction`: share of the change from the CAD that is
@@ -58,12 +55,11 @@
 //! | `excluded` | those not used: {`reason`, `observations`, `first_s`, `last_s`} |
 //! | `onset_s` | when the robot began to move; `null`: from the start, or never |
 //! | `predicted` | the prediction errors by which parameters are judged: below |
-//! | `fitted_error` | the three: relative error, with drifting offsets and friction fitted |
 //! | `joints` | {name: {`rms_nm`: the three, `measured_rms_nm`, `coverage`}} |
 //! | `sensors` | {name: {`rms`: the three, six numbers each; `coverage`: six numbers}} |
 //! | `two_route_rms_nm` | {joint: the three}: RMS of the difference between the two torques |
 //! | `two_route_rms_mean_removed_nm` | the same without the mean of the difference |
-//! | `offsets` | {sensor: {`start`, `end`, `std`, `rate`: six numbers each, `offset_jumps_s`}} |
+//! | `offsets` | {sensor: {`start`, `end`, `std`, `rate`: six numbers each}} |
 //! | `friction` | {joint: {`coulomb_nm`, `viscous`: Nm s/rad, `offset_nm`, `std`: of the three}} |
 //!
 //! `coverage` is the share of observations within 1.96 standard deviations. The two torques of
@@ -162,9 +158,8 @@ pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
         (&r.joint, json!({ "kgm2": r.inertia, "std": r.deviation }))
     });
     let calibration = object(&outcome.calibrations, |c| (&c.sensor, calibration(c)));
-    let c = &outcome.consistency;
     json!({
-        "schema": 2, "robot": outcome.robot, "version": env!("CARGO_PKG_VERSION"),
+        "schema": 3, "robot": outcome.robot, "version": env!("CARGO_PKG_VERSION"),
         "verdict": verdict, "reason": reason,
         "advice": { "grade": advice.grade.word(), "why": advice.why, "next": advice.next },
         "logs": outcome.logs.iter().map(log).collect::<Vec<_>>(),
@@ -173,10 +168,6 @@ pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
         "rank": outcome.rank, "effective_parameters": outcome.effective,
         "condition": outcome.condition, "singular_values": outcome.singular_values,
         "weakest": weakest, "not_separable": outcome.not_separable, "time_offsets": time_offsets,
-        "feasibility": {
-            "feasible": c.feasible, "standard_deviations": c.deviations, "links": c.links,
-            "text": c.text,
-        },
         "findings": found, "links": links, "base_parameters": base, "rotor_inertia": rotors,
         "calibration": calibration, "channels": channels,
     })
@@ -224,12 +215,10 @@ fn log(log: &LogOutcome) -> Json {
         )
     });
     let offsets = object(&log.offsets, |o| {
-        let jumps: Vec<f64> = o.offset_jumps.iter().map(|t| since(*t)).collect();
         (
             &o.sensor,
             json!({
                 "start": o.start, "end": o.end, "std": o.deviation, "rate": o.rate,
-                "offset_jumps_s": jumps,
             }),
         )
     });
@@ -247,7 +236,7 @@ fn log(log: &LogOutcome) -> Json {
         "role": role(log.role),
         "span_s": since(log.span.1), "observations": log.used, "excluded": excluded,
         "onset_s": log.onset.map(since),
-        "predicted": predicted(&log.predicted), "fitted_error": three(&log.fitted_error),
+        "predicted": predicted(&log.predicted),
         "joints": joints, "sensors": sensors,
         "two_route_rms_nm": object(&log.two_route, |t| (&t.joint, three(&t.rms_nm))),
         "two_route_rms_mean_removed_nm":
@@ -320,10 +309,6 @@ mod tests {
         );
         assert_eq!(json["logs"][1]["role"], "validate");
         assert_eq!(
-            log["fitted_error"],
-            json!({ "cad": null, "cad_fitted": 0.054, "identified": 0.0215 })
-        );
-        assert_eq!(
             log["predicted"],
             json!({
                 "relative_error": { "cad": 0.064, "identified": 0.0235 },
@@ -356,7 +341,6 @@ mod tests {
         );
         assert_eq!(json["weakest"].as_array().map(Vec::len), Some(20));
         assert_eq!(json["time_offsets"][0]["channel"], "wrench/r_leg_ft_sensor");
-        assert_eq!(json["feasibility"]["feasible"], true);
         assert_eq!(log["onset_s"], 4.0);
         assert_eq!(
             log["excluded"][1],
@@ -366,7 +350,7 @@ mod tests {
             })
         );
         assert_eq!(json["findings"][0]["log"], Json::Null);
-        assert_eq!(json["findings"][1]["code"], "offset_jump");
+        assert_eq!(json["findings"][1]["code"], "disturbance");
     }
 
     #[test]
@@ -389,11 +373,7 @@ mod tests {
         ] {
             objects.push(&json[list][0]);
         }
-        objects.extend([
-            &json["feasibility"],
-            &json["advice"],
-            &json["logs"][0]["excluded"][0],
-        ]);
+        objects.extend([&json["advice"], &json["logs"][0]["excluded"][0]]);
         objects.extend([
             &json["calibration"]["r_leg_ft_sensor"],
             &json["logs"][0]["offsets"]["r_leg_ft_sensor"],

@@ -210,8 +210,7 @@ fn wrench(torque_first: &Vector6<f64>) -> Wrench {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Gain {
-    /// Chosen by cross-validation: more entries only if they predict held-out data better than
-    /// fewer.
+    /// All 36 where there is a sensor: the prior keeps those that the logs do not determine.
     #[default]
     Auto,
     /// None: the factory gain is correct.
@@ -259,7 +258,7 @@ impl Kind {
     #[must_use]
     pub fn count(&self) -> usize {
         let gains = match self.gain {
-            // `Auto` has none until it is chosen.
+            // `Auto` has none until the logs are known.
             Gain::None | Gain::Auto => 0,
             Gain::Diagonal => 6,
             Gain::Full => 36,

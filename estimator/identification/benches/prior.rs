@@ -1,15 +1,14 @@
-//! Time of a fit under a prior, and of the search for the nearest bodies, by the number of links.
+//! Time of a fit under a prior, by the number of links.
 //!
 //! `taskset -c 1 cargo bench -p proprio-identification --bench prior`
 //!
 //! Data: the information in the base wrench of a chain of revolute joints, with all base parameters
-//! known to between 1e-4 and 1e-2. The bodies differ from CAD by a fifth, or are impossible.
+//! known to between 1e-4 and 1e-2. The bodies differ from CAD by a fifth.
 
 use divan::{Bencher, black_box};
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::model::Model;
 use proprio_dynamics::regressor::identifiable::{Identifiable, Measured, Offsets, Regime, Scope};
-use proprio_identification::prior::feasibility::nearest;
 use proprio_identification::prior::{Posterior, Prior};
 
 fn main() {
@@ -23,9 +22,8 @@ struct Case {
     right: DVector<f64>,
 }
 
-/// A chain of `count` links. `d` is CAD's parameters times -0.2 to 0.2, or with every other mass
-/// negative.
-fn case(count: usize, is_possible: bool) -> Case {
+/// A chain of `count` links. `d` is CAD's parameters times -0.2 to 0.2.
+fn case(count: usize) -> Case {
     let mut text = String::from("<robot name=\"chain\">");
     for link in 0..count {
         text += &format!(
@@ -57,11 +55,7 @@ fn case(count: usize, is_possible: bool) -> Case {
     });
     let mut difference = DVector::zeros(10 * count);
     for (link, body) in model.inertias().iter().enumerate() {
-        let factor = match (is_possible, link % 2) {
-            (true, _) => 0.2 * ((link % 5) as f64 / 2.0 - 1.0),
-            (false, 0) => 0.2,
-            (false, _) => -1.3,
-        };
+        let factor = 0.2 * ((link % 5) as f64 / 2.0 - 1.0);
         for (index, value) in body.parameters().iter().enumerate() {
             difference[10 * link + index] = factor * value;
         }
@@ -76,7 +70,7 @@ fn case(count: usize, is_possible: bool) -> Case {
 
 #[divan::bench(args = [5, 12, 39])]
 fn fit(bencher: Bencher<'_, '_>, count: usize) {
-    let case = case(count, true);
+    let case = case(count);
     bencher.bench_local(|| {
         let posterior = Posterior::new(
             &case.prior,
@@ -91,7 +85,7 @@ fn fit(bencher: Bencher<'_, '_>, count: usize) {
 
 #[divan::bench(args = [5, 12, 39])]
 fn weigh(bencher: Bencher<'_, '_>, count: usize) {
-    let case = case(count, true);
+    let case = case(count);
     bencher.bench_local(|| {
         let posterior = Posterior::new(
             &case.prior,
@@ -101,33 +95,5 @@ fn weigh(bencher: Bencher<'_, '_>, count: usize) {
             &[],
         );
         posterior.expect("data").maximise_evidence().expect("a fit")
-    });
-}
-
-#[divan::bench(args = [5, 12, 39])]
-fn nearest_possible(bencher: Bencher<'_, '_>, count: usize) {
-    let case = case(count, true);
-    bencher.bench_local(|| {
-        nearest(
-            &case.prior,
-            &case.links,
-            black_box(&case.data),
-            &case.right,
-            &[],
-        )
-    });
-}
-
-#[divan::bench(args = [5, 12, 39])]
-fn nearest_impossible(bencher: Bencher<'_, '_>, count: usize) {
-    let case = case(count, false);
-    bencher.bench_local(|| {
-        nearest(
-            &case.prior,
-            &case.links,
-            black_box(&case.data),
-            &case.right,
-            &[],
-        )
     });
 }

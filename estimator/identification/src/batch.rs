@@ -9,26 +9,21 @@
 //!    gravity ([`crate::diagnose::gravity`]).
 //! 3. [`exclude_disturbed`]: noise and MAP estimate in turn, until the noise converges
 //!    ([`crate::fit::alternate_noise_and_map`]). After each such fit, undeclared contacts
-//!    ([`crate::diagnose::undeclared`]) and loads ([`crate::diagnose::load`]) are excluded and
-//!    offset jumps that the fit does not confirm are dropped; then the next fit, until neither
-//!    changes.
-//! 4. [`choose_gain`]: gains of the F/T sensors, if requested or worth it; then 3 again, with these
-//!    unknown ([`with_gains`]).
-//! 5. [`cross_validated_fit`]: segments of the logs are predicted from the others. The change from
-//!    CAD is shrunk where it does not improve the prediction ([`crate::cross_validation`]).
-//! 6. [`without_vibration`]: structural vibration that other sensors observe
-//!    ([`crate::diagnose::structural_vibration`]) is subtracted; then the fit of 3 and the
-//!    cross-validation of 5 once more.
-//! 7. Disturbances in validation logs, encoder errors ([`encoder_offsets::encoder_errors`]) and
+//!    ([`crate::diagnose::undeclared`]) and loads ([`crate::diagnose::load`]) are excluded; then
+//!    the next fit, until they do not change.
+//! 4. [`with_gains`]: all gains of the F/T sensors, unless the configuration says otherwise; then 3
+//!    again.
+//! 5. [`cross_validated_fit`]: fifths of the logs are predicted from the others. That share of the
+//!    change from CAD is retained which predicts best ([`crate::cross_validation`]).
+//! 6. Disturbances in validation logs, encoder errors ([`encoder_offsets::encoder_errors`]) and
 //!    delays ([`delay::delays`]) are reported, not corrected.
-//! 8. [`assemble::outcome`]: figures for every log and the parameters' uncertainty.
+//! 7. [`assemble::outcome`]: figures for every log and the parameters' uncertainty.
 
 mod gains;
 
-use crate::batch::gains::{GainChoice, choose_gain, fit_gains};
-use crate::cross_validation::{self, Retention};
+use crate::batch::gains::fit_gains;
+use crate::cross_validation;
 use crate::dataset::{Dataset, Role};
-use crate::diagnose::structural_vibration::StructuralVibration;
 use crate::diagnose::undeclared::{self, Undeclared};
 use crate::diagnose::{
     delay, encoder_offsets, gravity, load, sensor_frame, torque_units, wrench_units,
@@ -39,9 +34,9 @@ use crate::fit::{
     alternate_noise_and_map, negative_rotors, parameters_without_cad, per_column, posterior,
     unsettled, walk_limits, without_negative_rotors,
 };
-use crate::measurement::channels;
 use crate::measurement::model::MeasurementModel;
-use crate::measurement::reduction::reduce;
+use crate::measurement::noise_model::Seconds;
+use crate::measurement::reduction::{reduce, residuals};
 use crate::prior::Fit;
 use crate::report::assemble::{self, Diagnosis};
 use crate::report::outcome::Outcome;
@@ -64,7 +59,7 @@ pub struct Options {
 /// Progress of [`identify`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Progress {
-    /// The current step, in a few words: `structural vibration`, `figures`.
+    /// The current step, in a few words: `cross-validation`, `figures`.
     pub step: String,
     /// Fraction done, 0 to 1.
     pub done: f64,
@@ -121,12 +116,14 @@ pub fn identify(
     // 3. Noise and MAP estimate, without undeclared disturbances.
     let mut clean = exclude_disturbed(robot, &measurement, &mut logs, &mut report_progress)?;
 
+    let signs = encoder_offsets::wrong_signs(&measurement, &training_logs(&logs), &clean.estimate);
+
     // 4. Gains of the F/T sensors.
-    let GainChoice {
-        gain,
-        finding: gain_finding,
-        retention,
-    } = choose_gain(&mut measurement, &mut logs, &clean.estimate)?;
+    let gain = match robot.calibrated.gain {
+        Gain::Auto if measurement.unknowns().sensors.is_empty() => Gain::None,
+        Gain::Auto => Gain::Full,
+        wanted => wanted,
+    };
     let calibrated = Kind {
         gain,
         ..robot.calibrated
@@ -156,34 +153,27 @@ pub fn identify(
         inputs.clone(),
         calibrated,
         estimate,
-        retention,
         &mut report_progress,
     )?;
 
-    // 6. Structural vibration.
-    report_progress("structural vibration".into(), 0.75);
-    identified = without_vibration(
-        &measurement,
-        &mut logs,
-        inputs,
-        calibrated,
-        identified,
-        &mut report_progress,
-    )?;
     identified.findings.extend(not_converged);
-    identified.findings.extend(gain_finding);
     identified
         .findings
         .extend(not_available(robot, &identified.inputs));
 
-    // 7. Disturbances in validation logs, encoder errors, delays.
+    // 6. Disturbances in validation logs, encoder errors, delays.
     undeclared::report_validation(&measurement, &mut logs, &identified);
     let training = training_logs(&logs);
     report_progress("figures".into(), 0.88);
-    let encoder_offsets = encoder_offsets::encoder_errors(&measurement, &training, &identified);
+    // A wrong sign looks like offsets of other joints.
+    let encoder_offsets = if signs.is_empty() {
+        encoder_offsets::encoder_errors(&measurement, &training, &identified)
+    } else {
+        signs
+    };
     let (time_offsets, delays) = delay::delays(&measurement, &training, &identified);
 
-    // 8. Figures.
+    // 7. Figures.
     let diagnosis = Diagnosis {
         encoder_offsets,
         time_offsets,
@@ -202,7 +192,7 @@ pub fn identify(
 }
 
 /// The inputs that are configured, or else those that the robot has.
-fn chosen_inputs(robot: &Robot, options: &Options) -> Vec<IdentificationInput> {
+pub(crate) fn chosen_inputs(robot: &Robot, options: &Options) -> Vec<IdentificationInput> {
     if options.inputs.is_empty() {
         vec![if robot.structure.sensors().is_empty() {
             IdentificationInput::Torque
@@ -216,7 +206,10 @@ fn chosen_inputs(robot: &Robot, options: &Options) -> Vec<IdentificationInput> {
 
 /// Logs of observations with known motion. Joint torques with a wrong sign or unit are excluded,
 /// repeated logs are refused.
-fn prepare_logs(robot: &Robot, datasets: Vec<Dataset>) -> Result<Vec<TrainingLog>, IdentifyError> {
+pub(crate) fn prepare_logs(
+    robot: &Robot,
+    datasets: Vec<Dataset>,
+) -> Result<Vec<TrainingLog>, IdentifyError> {
     let mut logs = Vec::new();
     for dataset in datasets {
         let mut log = prepare(robot, dataset);
@@ -232,7 +225,7 @@ fn prepare_logs(robot: &Robot, datasets: Vec<Dataset>) -> Result<Vec<TrainingLog
 /// The measurement model of the training logs whose F/T readings have plausible units, frames and
 /// directions; other logs are refused. Breaks off with an outcome without parameters if no log
 /// remains, no row contains a link, or a sensor is wrong in all logs.
-fn plausible_model<'a>(
+pub(crate) fn plausible_model<'a>(
     robot: &'a Robot,
     inputs: &[IdentificationInput],
     logs: &mut [TrainingLog],
@@ -340,52 +333,6 @@ fn surveyed_again<'a>(
     )?))
 }
 
-/// Subtracts structural vibration, if other sensors observe it, from all logs and fits again.
-fn without_vibration(
-    measurement: &MeasurementModel<'_>,
-    logs: &mut [TrainingLog],
-    inputs: Vec<IdentificationInput>,
-    calibrated: Kind,
-    identified: Identified,
-    progress: &mut dyn FnMut(String, f64),
-) -> Result<Identified, IdentifyError> {
-    let Some(vibration) = StructuralVibration::find(
-        measurement,
-        &sample(measurement, &training_logs(logs)),
-        &identified.noise,
-        &identified.d,
-    ) else {
-        return Ok(identified);
-    };
-    for log in &mut *logs {
-        vibration.apply(measurement, &mut log.instants, &log.offset_jumps);
-    }
-    // Rounds start again here: their fraction done is not shown.
-    let mut progress = |step: String, _| progress(format!("{step}, vibration subtracted"), 0.75);
-    let training = training_logs(logs);
-    let estimate = alternate_noise_and_map(
-        measurement.robot(),
-        measurement,
-        &training,
-        OffsetDrift::AsStated,
-        Some(identified.noise),
-        &mut progress,
-    )?;
-    let mut identified = cross_validated_fit(
-        measurement,
-        &training,
-        inputs,
-        calibrated,
-        estimate,
-        None,
-        &mut progress,
-    )?;
-    identified
-        .findings
-        .extend(vibration_findings(measurement, &vibration));
-    Ok(identified)
-}
-
 /// What the configuration requests but the inputs do not contain.
 fn not_available(robot: &Robot, inputs: &[IdentificationInput]) -> Vec<Finding> {
     let note = |code, key: &str, text: String| Finding {
@@ -427,48 +374,17 @@ fn not_available(robot: &Robot, inputs: &[IdentificationInput]) -> Vec<Finding> 
     notes
 }
 
-/// A note for each sub-tree whose structural vibration was subtracted.
-fn vibration_findings(
-    measurement: &MeasurementModel<'_>,
-    vibration: &StructuralVibration,
-) -> Vec<Finding> {
-    let robot = measurement.robot();
-    let names = |sensors: &[usize]| -> String {
-        let names: Vec<String> = sensors
-            .iter()
-            .map(|s| channels::sensor_name(robot, *s))
-            .collect();
-        names.join(" and ")
-    };
-    let own = measurement.sensors_of_subtrees();
-    let parts = vibration.parts.iter();
-    parts
-        .map(|part| Finding {
-            severity: Severity::Note,
-            code: FindingCode::StructuralVibration,
-            subject: names(&own[part.subtree]),
-            text: format!(
-                "structural vibration that the encoders do not show: {:.0} % of the fast part of \
-                 the imbalance at {} is observed by {}, and is subtracted",
-                100.0 * part.explained,
-                names(&own[part.subtree]),
-                names(&part.sensors)
-            ),
-        })
-        .collect()
-}
-
 /// An estimate from which undeclared disturbances are excluded.
-struct CleanFit {
-    estimate: NoiseAndMap,
-    undeclared: Undeclared,
+pub(crate) struct CleanFit {
+    pub(crate) estimate: NoiseAndMap,
+    pub(crate) undeclared: Undeclared,
     /// Present if the excluded disturbances did not converge.
     not_converged: Option<Finding>,
 }
 
 /// Fits, excludes what an undeclared disturbance acted on, and fits again, until the excluded set
 /// does not change.
-fn exclude_disturbed(
+pub(crate) fn exclude_disturbed(
     robot: &Robot,
     measurement: &MeasurementModel<'_>,
     logs: &mut [TrainingLog],
@@ -517,7 +433,10 @@ fn exclude_disturbed(
                 Some(estimate.noise.clone()),
                 &mut progress,
             )?;
-            let ratio = without.noise.variance_ratio(&estimate.noise, &channels);
+            let ratio =
+                without
+                    .noise
+                    .variance_ratio(&estimate.noise, measurement.unknowns(), &channels);
             if ratio > LOAD_VARIANCE_RATIO {
                 estimate = without;
                 continue;
@@ -613,15 +532,13 @@ fn with_gains(
 }
 
 /// Cross-validates an estimate and fits all instants with the noise that this shows; the change
-/// from CAD is shrunk to the retained fraction. `retention`: the cross-validation, if it was done
-/// already.
+/// from CAD is shrunk to the retained fraction.
 fn cross_validated_fit(
     measurement: &MeasurementModel<'_>,
     training: &[&TrainingLog],
     inputs: Vec<IdentificationInput>,
     calibrated: Kind,
     estimate: NoiseAndMap,
-    retention: Option<Retention>,
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<Identified, IdentifyError> {
     let unknowns = measurement.unknowns().clone();
@@ -629,21 +546,23 @@ fn cross_validated_fit(
     let NoiseAndMap {
         prior,
         noise,
-        fit: Fit { tau, .. },
+        fit: Fit { tau, x, .. },
         change,
         ..
     } = estimate;
     progress("cross-validation".into(), 0.69);
     let sampled = sample(measurement, training);
-    let mut retention = match retention {
-        Some(retention) => retention,
-        None => cross_validation::held_out(measurement, &prior, &sampled, &noise, tau)?,
-    };
+    let mut retention = cross_validation::held_out(measurement, &prior, &sampled, &noise, tau)?;
     retention.findings.extend(unsettled(change));
     // The fit has absorbed a part of the noise of its own data, most of all noise that is as slow
     // as the motion.
     let walk_limits = walk_limits(measurement.robot(), &unknowns, OffsetDrift::AsStated);
-    let noise = retention.noise(measurement, &sampled, noise, &walk_limits);
+    let mut noise = retention.noise(measurement, &sampled, noise, &walk_limits);
+    // Of the seconds that were not sampled, too.
+    let left = map_segments(measurement, &segments, |measurement, _, segment| {
+        residuals(measurement, segment, &noise, std::slice::from_ref(&x))
+    });
+    noise.seconds = Seconds::of(&unknowns, &segments, &left, 0);
     let reduced = map_segments(measurement, &segments, |measurement, _, segment| {
         reduce(measurement, segment, &noise)
     });
@@ -693,7 +612,6 @@ mod tests {
             span: (instants[0].t, instants[instants.len() - 1].t),
             torque_rate: 0.0,
             instants: instants.to_vec(),
-            offset_jumps: Vec::new(),
             excluded: Vec::new(),
             findings: Vec::new(),
             refused: false,
@@ -771,7 +689,15 @@ mod tests {
         for &channel in &foot {
             (less_noise.square[channel], less_noise.block[channel]) = (0.25, 0.25);
         }
-        assert!((less_noise.variance_ratio(&noise, &foot) - 4.0).abs() < 1e-9);
-        assert!((less_noise.variance_ratio(&noise, &thigh) - 0.2).abs() < 1e-9);
+        let unknowns = measurement.unknowns();
+        let ratio = |channels: &[usize]| less_noise.variance_ratio(&noise, unknowns, channels);
+        assert!((ratio(&foot) - 4.0).abs() < 1e-9);
+        assert!((ratio(&thigh) - 0.2).abs() < 1e-9);
+        // Half of the seconds have nineteen times the variance.
+        let mut varying = noise.clone();
+        varying.seconds.0 = [((0, 0), 1.0), ((0, 1), 19.0)].into_iter().collect();
+        let ratio = |channels: &[usize]| less_noise.variance_ratio(&varying, unknowns, channels);
+        assert!((ratio(&foot) - 40.0).abs() < 1e-9);
+        assert!((ratio(&[12]) - 0.01).abs() < 1e-9, "{}", ratio(&[12]));
     }
 }

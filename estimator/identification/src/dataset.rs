@@ -6,7 +6,6 @@
 //!     -> ordered stamps; repeats, spikes removed     cleaning, repeats
 //!     -> checks of single channels                   inspection
 //!     -> every channel at common times               resampling, stream, smooth
-//!     -> outliers and offset jumps of F/T readings   readings
 //!     -> Dataset: observations, defects
 //! ```
 
@@ -14,7 +13,6 @@ mod cleaning;
 pub mod defects;
 mod inspection;
 pub mod observation;
-mod readings;
 pub mod recording;
 mod repeats;
 pub mod resampling;
@@ -22,7 +20,7 @@ pub mod smooth;
 mod stream;
 
 use crate::robot::{ChannelRole, Robot};
-use defects::{Defect, OffsetJump};
+use defects::Defect;
 use observation::Observation;
 use proprio_topics::Nanos;
 use recording::Recording;
@@ -54,7 +52,6 @@ pub struct Dataset {
     /// Its use.
     pub role: Role,
     pub(crate) instants: Vec<Observation>,
-    pub(crate) offset_jumps: Vec<OffsetJump>,
     pub(crate) defects: Vec<Defect>,
     pub(crate) torque_rate: f64,
     /// Sample spacing, if it exceeds the time that a channel may be silent.
@@ -100,13 +97,11 @@ impl Dataset {
         }
         inspection::inspect(&mut recording, robot);
         let spacing = recording.spacing();
-        let mut found = recording.instants(robot);
-        readings::inspect(&recording, robot, &mut found);
+        let found = recording.instants(robot);
         Ok(Self {
             name: name.to_owned(),
             role,
             instants: found.instants,
-            offset_jumps: found.offset_jumps,
             defects: found.defects,
             torque_rate: recording.torque_rate(),
             apart: (recording.is_stamped() && spacing > robot.max_silence).then_some(spacing),
@@ -120,7 +115,6 @@ impl Dataset {
             name: name.to_owned(),
             role,
             instants: Vec::new(),
-            offset_jumps: Vec::new(),
             defects: vec![Defect::Unreadable { reason }],
             torque_rate: 0.0,
             apart: None,
@@ -131,13 +125,6 @@ impl Dataset {
     #[must_use]
     pub fn observations(&self) -> &[Observation] {
         &self.instants
-    }
-
-    /// Where the offset of an F/T sensor seems to jump, judged by its readings minus the CAD's
-    /// prediction.
-    #[must_use]
-    pub fn offset_jumps(&self) -> &[OffsetJump] {
-        &self.offset_jumps
     }
 
     /// Samples of joint torques per second, from the median spacing of their stamps: the rate of

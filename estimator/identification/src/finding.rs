@@ -49,8 +49,6 @@ pub enum FindingCode {
     SampleSpacing,
     /// A log is given twice.
     DuplicateLog,
-    /// The offset of an F/T sensor jumped.
-    OffsetJump,
     /// Samples lie far off their neighbours.
     Outliers,
     /// A channel has the wrong sign.
@@ -71,16 +69,12 @@ pub enum FindingCode {
     EncoderOffset,
     /// A stream is stamped late or early.
     TimeOffset,
-    /// Structural vibration was subtracted.
-    StructuralVibration,
     /// Noise and prior weight did not converge.
     NotConverged,
     /// Parameters were shrunk to those of the CAD model.
     ShrunkToCad,
     /// There was too little data for cross-validation.
     NotCrossValidated,
-    /// A channel is predicted less well than with the CAD model.
-    WorseThanCad,
     /// The inertia of a rotor comes out negative.
     NegativeRotorInertia,
     /// Rotor inertias were requested but cannot be identified.
@@ -91,16 +85,10 @@ pub enum FindingCode {
     NoTemperature,
     /// The motion does not show entries of a calibration.
     CalibrationNotObservable,
-    /// Gains of F/T sensors are identified, too.
-    GainChosen,
     /// A common gain error cannot be separated from mass.
     GainMassNotSeparable,
     /// The inertia of the URDF is that of no body, or nearly none.
     InertiaRegularised,
-    /// No physical bodies have the identified parameters.
-    NotPhysical,
-    /// Whether physical bodies have the identified parameters is not decided.
-    FeasibilityUndecided,
     /// Nothing was identified.
     NotIdentified,
 }
@@ -127,7 +115,6 @@ impl FindingCode {
             Self::TooShort => "too_short",
             Self::SampleSpacing => "sample_spacing",
             Self::DuplicateLog => "duplicate_log",
-            Self::OffsetJump => "offset_jump",
             Self::Outliers => "outliers",
             Self::WrongSign => "wrong_sign",
             Self::WrongFrame => "wrong_frame",
@@ -138,21 +125,16 @@ impl FindingCode {
             Self::Unexplained => "unexplained",
             Self::EncoderOffset => "encoder_offset",
             Self::TimeOffset => "time_offset",
-            Self::StructuralVibration => "structural_vibration",
             Self::NotConverged => "not_converged",
             Self::ShrunkToCad => "shrunk_to_cad",
             Self::NotCrossValidated => "not_cross_validated",
-            Self::WorseThanCad => "worse_than_cad",
             Self::NegativeRotorInertia => "negative_rotor_inertia",
             Self::RotorsNotAvailable => "rotors_not_available",
             Self::CalibrationNotAvailable => "calibration_not_available",
             Self::NoTemperature => "no_temperature",
             Self::CalibrationNotObservable => "calibration_not_observable",
-            Self::GainChosen => "gain_chosen",
             Self::GainMassNotSeparable => "gain_mass_not_separable",
             Self::InertiaRegularised => "inertia_regularised",
-            Self::NotPhysical => "not_physical",
-            Self::FeasibilityUndecided => "feasibility_undecided",
             Self::NotIdentified => "not_identified",
         }
     }

@@ -1,5 +1,5 @@
 //! The test of whether an additional effect explains residuals: a load, an offset jump, an encoder
-//! offset, a delay, physically infeasible bodies.
+//! offset and a delay.
 //!
 //! An effect adds unknowns to the parameters
 //! and the noise. Its gain is the increase of twice the log-likelihood with these unknowns, with

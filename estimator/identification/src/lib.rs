@@ -20,15 +20,14 @@
 //!    ([`linear::information`]). The maximum a posteriori (MAP) parameters under a prior at CAD
 //!    ([`prior`]) and the noise of each channel are estimated in turn. Undeclared contacts and
 //!    loads are excluded.
-//! 4. `choose_gain`, `with_gains`: gains of the F/T sensors, if requested or worth it.
-//! 5. `cross_validated_fit`: the change from CAD is shrunk where it does not improve the prediction
-//!    of held-out data.
-//! 6. `without_vibration`: vibration that other F/T sensors observe is subtracted.
-//! 7. `encoder_errors`, `delays`: encoder signs, encoder offsets and time offsets are reported.
-//! 8. `outcome`: the [`Outcome`].
+//! 4. `with_gains`: all gains of the F/T sensors.
+//! 5. `cross_validated_fit`: that share of the change from CAD is retained which predicts held-out
+//!    data best.
+//! 6. `encoder_errors`, `delays`: encoder signs, encoder offsets and time offsets are reported.
+//! 7. `outcome`: the [`Outcome`].
 //!
-//! One test, `hypothesis`, decides whether a load, an offset jump, an encoder offset or a delay
-//! explains more of the data than parameters and noise do.
+//! One test, `hypothesis`, decides whether a load, an encoder offset or a delay explains more of
+//! the data than parameters and noise do.
 //!
 //! # Notation
 //! ```text
@@ -75,6 +74,7 @@ pub mod linear;
 mod measurement;
 pub mod online;
 pub mod parallel;
+mod payload;
 pub mod prior;
 mod report;
 pub mod robot;
@@ -87,11 +87,12 @@ pub use dataset::{Dataset, Role};
 pub use diagnose::plausibility::implausible;
 pub use finding::{Finding, FindingCode, Severity};
 pub use fit::IdentifyError;
+pub use payload::{Known, Payload, PayloadError, payload};
 pub use report::outcome::{
-    BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, Consistency, CovarianceRoot,
-    Curve, FrictionOutcome, InForce, JointOutcome, LinkOutcome, LogOutcome, ModelComparison,
-    OffsetOutcome, Outcome, Predicted, RotorOutcome, SensorOutcome, Spectrum, TimeOffset,
-    TwoRouteOutcome, Verdict, WeakDirection,
+    BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, CovarianceRoot, Curve,
+    FrictionOutcome, InForce, JointOutcome, LinkOutcome, LogOutcome, ModelComparison,
+    OffsetOutcome, Outcome, Predicted, RotorOutcome, SensorOutcome, TimeOffset, TwoRouteOutcome,
+    Verdict, WeakDirection,
 };
 pub use report::prediction::predicted;
 pub use robot::Robot;

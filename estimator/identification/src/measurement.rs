@@ -7,4 +7,5 @@ pub(crate) mod noise_estimate;
 pub(crate) mod noise_model;
 pub(crate) mod reduction;
 pub(crate) mod rows;
+pub(crate) mod seconds;
 pub(crate) mod unknowns;

@@ -66,7 +66,6 @@
 //! Cholesky factorisation each; one or two from the previous solution. All factorisations use
 //! matrix products on blocks. To measure: `cargo bench -p proprio-identification --bench prior`.
 
-pub mod feasibility;
 mod posterior;
 
 use std::f64::consts::FRAC_1_SQRT_2;
@@ -75,7 +74,6 @@ use nalgebra::{Matrix4, SMatrix, SVector, SymmetricEigen};
 
 use proprio_dynamics::spatial::{Mat3, RigidInertia, Vec3};
 
-pub(crate) use posterior::CENTRED;
 pub use posterior::{Fit, Posterior};
 
 type Matrix10 = SMatrix<f64, 10, 10>;
@@ -266,6 +264,23 @@ impl Prior {
         let median = (relative * FRAC_1_SQRT_2).clamp(LEAST_TAU, GREATEST_TAU);
         let spread = QUALITY_FACTOR.ln();
         let expected = Expected { median, spread };
+        Self { expected, ..self }
+    }
+
+    /// As [`Prior::with_relative_std`], with the quality known to a factor of e only: whole logs
+    /// tell it better than whoever stated it.
+    ///
+    /// To a factor of 1.5, noise and prior settle where CAD's error is blamed on the noise: an arm
+    /// whose CAD is worse than stated had an error of 11 % on held-out torques, where least squares
+    /// has 9 % and no statement at all 4.5 %. Without any, half of a KUKA's postures predict the
+    /// others 10 to 14 % worse.
+    #[must_use]
+    pub fn with_roughly(self, relative: f64) -> Self {
+        let Expected { median, .. } = self.clone().with_relative_std(relative).expected;
+        let expected = Expected {
+            median,
+            spread: 1.0,
+        };
         Self { expected, ..self }
     }
 

@@ -3,8 +3,8 @@
 pub(crate) mod assemble;
 mod calibration;
 mod comparison;
+mod curves;
 mod log;
 pub(crate) mod outcome;
 pub(crate) mod prediction;
-mod spectra;
 mod uncertainty;

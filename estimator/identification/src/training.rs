@@ -1,7 +1,7 @@
 //! The logs of an identification: the observations that can be used, why others are excluded, and
 //! the segments in which they are processed.
 
-use crate::dataset::defects::{Defect, OffsetJump};
+use crate::dataset::defects::Defect;
 use crate::dataset::observation::{Annotated, Observation, UnitSet};
 use crate::dataset::{Dataset, Role};
 use crate::finding::{Finding, FindingCode, Severity};
@@ -18,9 +18,8 @@ use std::collections::BTreeMap;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Excluded {
     /// The reason, in a few words: `contact declared: hand (the links that it touches)`, `contact
-    /// suspected: the links at l_arm_ft_sensor`, `offset jump: the links at l_arm_ft_sensor`,
-    /// `another load: l_hand`, `outlier of r_leg_ft_sensor`, `stale of knee`, or that they are too
-    /// close to an end or a gap for accelerations.
+    /// suspected: the links at l_arm_ft_sensor`, `another load: l_hand`, `stale of knee`, or that
+    /// they are too close to an end or a gap for accelerations.
     pub reason: String,
     /// Number of observations.
     pub instants: u64,
@@ -30,8 +29,22 @@ pub struct Excluded {
     pub last: Nanos,
 }
 
-/// Fewest instants of a cross-validation fold.
+/// Fewest instants of a cross-validation fold ...
 pub(crate) const MIN_FOLD: usize = 50;
+
+/// ... or fewest seconds in which there are some: of an averaged static pose there is one instant.
+pub(crate) const MIN_SECONDS: usize = 5;
+
+/// Number of cross-validation folds that instants with these stamps suffice for.
+pub(crate) fn folds(stamps: impl Iterator<Item = Nanos>) -> usize {
+    let (mut count, mut seconds, mut last) = (0, 0, None);
+    for t in stamps {
+        let second = Some(t.0.div_euclid(1_000_000_000));
+        seconds += usize::from(second != last);
+        (count, last) = (count + 1, second);
+    }
+    (count / MIN_FOLD).max(seconds / MIN_SECONDS)
+}
 
 /// Most observations that noise, prior scale and cross-validation use, and in how many stretches of
 /// long logs. Shorter stretches would not show how slow the noise is, so of many logs only some are
@@ -52,7 +65,6 @@ pub(crate) struct TrainingLog {
     /// Sample rate of the fastest joint torque \[Hz\]; 0 if there is none.
     pub torque_rate: f64,
     pub instants: Vec<Annotated>,
-    pub offset_jumps: Vec<OffsetJump>,
     pub excluded: Vec<Excluded>,
     pub findings: Vec<Finding>,
     pub refused: bool,
@@ -87,12 +99,6 @@ impl TrainingLog {
             .iter()
             .any(|finding| finding.severity == Severity::Refusal);
         self.findings.extend(findings);
-    }
-
-    /// All findings of the log, offset jumps included.
-    pub(crate) fn all_findings(&self) -> Vec<Finding> {
-        let jumps = self.offset_jumps.iter().map(|b| finding(&b.jump));
-        self.findings.iter().cloned().chain(jumps).collect()
     }
 }
 
@@ -206,7 +212,6 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
         name: file,
         role,
         instants: all,
-        offset_jumps: breaks,
         defects,
         torque_rate,
         ..
@@ -250,13 +255,11 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
         }
         let mut excluded = Vec::new();
         for (channel, fault) in robot.channels.iter().zip(&instant.faults) {
-            if let ChannelRole::Sensor(sensor) = channel.role {
-                let outlier = instant.outliers.contains(sensor);
-                if *fault != Reason::None || outlier {
-                    let why = if outlier { "outlier" } else { fault.word() };
-                    leave_out(format!("{why} of {}", channel.name), t);
-                    excluded.push(sensor);
-                }
+            if let ChannelRole::Sensor(sensor) = channel.role
+                && *fault != Reason::None
+            {
+                leave_out(format!("{} of {}", fault.word(), channel.name), t);
+                excluded.push(sensor);
             }
         }
         for contact in instant.active.difference(&robot.always).iter() {
@@ -271,7 +274,8 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
             .fold(instant, Observation::without_reading);
         instants.push(Annotated::from(read));
     }
-    if instants.len() < MIN_FOLD && !refused {
+    let is_short = folds(instants.iter().map(|instant| instant.t)) < 1;
+    if is_short && !refused {
         findings.push(refusal(
             FindingCode::TooShort,
             too_few(instants.len(), apart, &reasons, &findings),
@@ -282,9 +286,8 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
         role,
         span,
         torque_rate,
-        refused: refused || instants.len() < MIN_FOLD,
+        refused: refused || is_short,
         instants,
-        offset_jumps: breaks,
         excluded: reasons.into_values().collect(),
         findings,
         disturbed: Vec::new(),
@@ -346,7 +349,6 @@ pub(crate) fn finding(defect: &Defect) -> Finding {
         }
         Defect::NoMotion { .. } => (FindingCode::NoMotion, String::new()),
         Defect::TooShort { .. } => (FindingCode::TooShort, String::new()),
-        Defect::Jump { channel, .. } => (FindingCode::OffsetJump, channel.clone()),
         Defect::Outliers { channel, .. } => (FindingCode::Outliers, channel.clone()),
         Defect::WrongSign { sensor } => (FindingCode::WrongSign, sensor.clone()),
         Defect::WrongFrame { sensor, .. } => (FindingCode::WrongFrame, sensor.clone()),
@@ -375,13 +377,13 @@ pub(crate) fn map_segments<'a, T: Send>(
 /// All instants of all logs, in segments of at most `most`.
 pub(crate) fn segments_of<'a>(training: &[&'a TrainingLog], most: usize) -> Vec<Segment<'a>> {
     let mut segments = Vec::new();
-    for log in training {
+    for (number, log) in training.iter().enumerate() {
         let count = log.instants.len().div_ceil(most).max(1);
-        for number in 0..count {
+        for part in 0..count {
             let at = |k: usize| log.instants.len() * k / count;
             segments.push(Segment {
-                instants: &log.instants[at(number)..at(number + 1)],
-                offset_jumps: &log.offset_jumps,
+                instants: &log.instants[at(part)..at(part + 1)],
+                log: Some(number),
             });
         }
     }

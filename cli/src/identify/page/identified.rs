@@ -4,7 +4,7 @@
 use super::words::WRENCH;
 use crate::identify::advice::{percent, sentence};
 use crate::report::plot::{Axis, Ink, Plot, Series};
-use crate::report::{self, Cell, Table, number, short};
+use crate::report::{self, Cell, Table, number};
 use proprio_dynamics::calibration::{Unknown, swapped};
 use proprio_identification::{BaseParameterOutcome, CalibrationOutcome, Outcome};
 
@@ -382,15 +382,9 @@ pub(super) fn sessions(outcome: &Outcome) -> Option<String> {
                 "at the start",
                 "at the end",
                 "rate [unit/√s]",
-                "offset jumps at [s]",
             ],
         );
         for o in &log.offsets {
-            let breaks: Vec<String> = o
-                .offset_jumps
-                .iter()
-                .map(|t| short((*t - log.span.0).seconds()))
-                .collect();
             for (i, (channel, unit)) in WRENCH.iter().enumerate() {
                 offsets.row(vec![
                     format!("{} {channel}", o.sensor).into(),
@@ -398,7 +392,6 @@ pub(super) fn sessions(outcome: &Outcome) -> Option<String> {
                     o.start[i].into(),
                     Cell::Uncertain(o.end[i], o.deviation[i]),
                     o.rate[i].into(),
-                    breaks.join(", ").into(),
                 ]);
             }
         }

@@ -6,9 +6,7 @@ use crate::identify::advice::percent;
 use crate::identify::summary::role;
 use crate::report::plot::{Axis, Ink, Plot, Series};
 use crate::report::{self, Cell, Table, number};
-use proprio_identification::{
-    Both, Curve, LogOutcome, ModelComparison, Outcome, Predicted, Role, Spectrum,
-};
+use proprio_identification::{Both, Curve, LogOutcome, ModelComparison, Outcome, Predicted, Role};
 use proprio_topics::Nanos;
 
 /// How many points all lines of a report have together, at the most: at some seven bytes each it
@@ -16,8 +14,6 @@ use proprio_topics::Nanos;
 const POINTS: usize = 130_000;
 /// So many curves are drawn at the most: more make a page that nobody looks through.
 const CURVES: usize = 160;
-/// So many points all spectra have together.
-const SPECTRUM_POINTS: usize = 40_000;
 /// Lines and bands that a curve of the outcome makes, those of its error included.
 const LINES: usize = 7;
 
@@ -39,17 +35,12 @@ pub(super) fn logs(outcome: &Outcome) -> Option<String> {
             "F/T, CAD, with drift",
         ],
     );
-    let mut fitted = Table::new(
-        "The same with drifting offsets and friction fitted to the log",
-        &[&["log", "role"], &ERRORS[..]].concat(),
-    );
     let mut used = Table::new(
         "Observations of each log",
         &["log", "use", "observations", "from [s]", "to [s]"],
     );
     for log in &outcome.logs {
-        let of_log = || -> Vec<Cell> { vec![log.file.as_str().into(), role(log.role).into()] };
-        let mut cells = of_log();
+        let mut cells: Vec<Cell> = vec![log.file.as_str().into(), role(log.role).into()];
         let Predicted {
             relative_error,
             relative_error_with_drift,
@@ -65,11 +56,6 @@ pub(super) fn logs(outcome: &Outcome) -> Option<String> {
             cells.push(Cell::Bar(percent(cad), cad / worst, Ink::Fitted));
         }
         relative.row(cells);
-        if columns(std::iter::once(&log.fitted_error)).len() == ERRORS.len() {
-            let mut cells = of_log();
-            cells.extend(errors(&log.fitted_error, percent));
-            fitted.row(cells);
-        }
         let since = |t: Nanos| (t - log.span.0).seconds();
         let mut row = |what: &str, count: u64, from: f64, to: f64| {
             used.row(vec![
@@ -92,7 +78,7 @@ pub(super) fn logs(outcome: &Outcome) -> Option<String> {
     }
     Some(report::section(
         "The logs",
-        &[relative, fitted, used]
+        &[relative, used]
             .iter()
             .filter(|table| !table.is_empty())
             .map(Table::html)
@@ -351,37 +337,6 @@ pub(super) fn residuals(outcome: &Outcome) -> Option<String> {
     if !tables.is_empty() {
         body.push(format!("<div class=\"figures\">{}</div>", tables.concat()));
     }
-    let count: usize = outcome
-        .logs
-        .iter()
-        .map(|l| l.spectra.len().min(CURVES))
-        .sum();
-    let most = (SPECTRUM_POINTS / (2 * count.max(1))).clamp(40, 300);
-    for log in &outcome.logs {
-        let plots: Vec<Plot> = log
-            .spectra
-            .iter()
-            .take(CURVES)
-            .map(|s| spectrum(s, most))
-            .collect();
-        if !plots.is_empty() {
-            body.push(report::folded(
-                &format!(
-                    "Power spectra of the residuals, {}: {}",
-                    log.file,
-                    counted(plots.len(), "plot")
-                ),
-                false,
-                &[
-                    report::paragraph(
-                        "A peak that identification does not lower has another cause than inertial \
-                         parameters: vibration, friction, a time offset, mains.",
-                    ),
-                    report::figures(&plots),
-                ],
-            ));
-        }
-    }
     let mut noise = Table::new(
         "Noise of each channel, from the residuals. Observations of a channel with a long \
          autocorrelation time are not independent; they are weighted accordingly.",
@@ -406,34 +361,6 @@ pub(super) fn residuals(outcome: &Outcome) -> Option<String> {
         body.push(report::folded("Noise", false, &[noise.html()]));
     }
     (!body.is_empty()).then(|| report::section("Residuals", &body))
-}
-
-fn spectrum(spectrum: &Spectrum, most: usize) -> Plot {
-    // Frequency 0 has no place on a logarithmic axis.
-    let points = |y: &[f64]| {
-        spectrum
-            .frequency
-            .iter()
-            .copied()
-            .zip(y.iter().copied())
-            .filter(|(f, _)| *f > 0.0)
-            .collect::<Vec<_>>()
-    };
-    Plot {
-        title: spectrum.name.clone(),
-        x: Axis::log("frequency [Hz]"),
-        y: Axis::log(&format!("[{}²/Hz]", spectrum.unit)),
-        series: vec![
-            Series::line(
-                "CAD, offsets fitted",
-                Ink::Fitted,
-                points(&spectrum.cad_fitted),
-            ),
-            Series::line("identified", Ink::Identified, points(&spectrum.identified)),
-        ],
-        most,
-        ..Plot::default()
-    }
 }
 
 #[cfg(test)]

@@ -20,17 +20,6 @@ pub enum Units {
     NotMetresPerSecondSquared,
 }
 
-/// An offset jump of an F/T sensor, judged by its readings.
-#[derive(Debug, Clone, PartialEq)]
-pub struct OffsetJump {
-    /// The sensor.
-    pub sensor: usize,
-    /// Time of the jump.
-    pub t: Nanos,
-    /// Its evidence: a [`Defect::Jump`].
-    pub jump: Defect,
-}
-
 /// Something wrong with a log. [`fmt::Display`] states what, where, how much, and what to do.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
@@ -170,17 +159,6 @@ pub enum Defect {
         rows: u64,
         /// Where its time begins to run backward, if most samples were excluded because of that.
         backward: Option<Nanos>,
-    },
-    /// A reading that changes suddenly and permanently, unexplained by motion.
-    Jump {
-        /// The channel.
-        channel: String,
-        /// The quantity that changes the most.
-        axis: &'static str,
-        /// Time of the jump.
-        t: Nanos,
-        /// Its size \[N or Nm\].
-        size: f64,
     },
     /// Samples far from their neighbours.
     Outliers {
@@ -397,18 +375,6 @@ impl fmt::Display for Defect {
             Self::TooShort { rows, .. } => write!(
                 f,
                 "the log of {rows} rows is too short: record at least {LEAST_ROWS}"
-            ),
-            Self::Jump {
-                channel,
-                axis,
-                t,
-                size,
-            } => write!(
-                f,
-                "{channel}: {axis} jumps by {size:.4} {} at {t} s and stays there, unexplained by \
-                 motion (a cable, internal stress, an undeclared contact): its offset is \
-                 re-initialised there",
-                unit(axis)
             ),
             Self::Outliers {
                 channel,

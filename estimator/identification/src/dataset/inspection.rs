@@ -454,8 +454,12 @@ fn motion(recording: &Recording, found: &mut Vec<Defect>) {
         }
         most = most.max(moved);
     }
-    let rotates = (0..3)
-        .any(|axis| range(recording.imu.angular_velocity.value.iter().map(|w| w[axis])) > 0.1);
+    // The gyroscope shows motion, the accelerometer that gravity turns from pose to pose.
+    let imu = &recording.imu;
+    let changes = |stream: &Stream<3>, by: f64| {
+        (0..3).any(|axis| range(stream.value.iter().map(|value| value[axis])) > by)
+    };
+    let rotates = changes(&imu.angular_velocity, 0.1) || changes(&imu.proper_acceleration, 1.0);
     if !rotates {
         found.push(Defect::NoMotion { most });
     }

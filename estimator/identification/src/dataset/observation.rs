@@ -2,7 +2,7 @@
 
 use crate::robot::{Channel, ChannelRole};
 use proprio_dynamics::spatial::{Vec3, Wrench};
-use proprio_dynamics::{BitSet, ContactSet, FrameMotion, SensorSet};
+use proprio_dynamics::{BitSet, ContactSet, FrameMotion};
 use proprio_topics::{Nanos, Reason};
 
 /// Parts of the robot whose equations hold or fail together: numbers of sub-trees, and
@@ -39,9 +39,6 @@ pub struct Observation {
     /// Per F/T sensor the temperature of its board \[degrees Celsius\], interpolated linearly; the
     /// first and the last sample are extrapolated as constants. NaN where none was recorded.
     pub temperatures: Vec<f64>,
-    /// F/T sensors whose reading is an outlier (a blow or a glitch): the motion does not explain
-    /// it, and no offset jump does.
-    pub outliers: SensorSet,
 }
 
 impl Observation {
@@ -110,10 +107,6 @@ pub(crate) struct Annotated {
     /// Units on which an undeclared disturbance (contact or load) was found to act: numbers of
     /// sub-trees, and [`Observation::TORQUES`] for measured joint torques.
     pub disturbed: UnitSet,
-    /// The wrenches that sub-trees need for structural vibration, which their encoders do not show,
-    /// where it is known: the sub-tree's number in the structure, and the wrench by all that it is
-    /// attached to, about its top link's origin and in that link's axes.
-    pub vibration: Vec<(usize, Wrench)>,
 }
 
 impl From<Observation> for Annotated {
@@ -123,7 +116,6 @@ impl From<Observation> for Annotated {
             observation,
             fitted: Vec::new(),
             disturbed: UnitSet::default(),
-            vibration: Vec::new(),
         }
     }
 }

@@ -21,7 +21,7 @@
 //! Readings are corrected as configured ([`proprio_dynamics::calibration`]). Configured offsets are
 //! not subtracted, since identification determines the reading without load.
 
-use crate::dataset::defects::{Defect, OffsetJump};
+use crate::dataset::defects::Defect;
 use crate::dataset::observation::Observation;
 use crate::dataset::recording::Recording;
 use crate::dataset::smooth::{Scratch, Smoother};
@@ -29,7 +29,7 @@ use crate::dataset::stream::{ImuTrack, JointAt, is_dense};
 use crate::parallel;
 use crate::robot::{BaseMotion, Channel, ChannelRole, Robot};
 use proprio_dynamics::spatial::{Vec3, Wrench};
-use proprio_dynamics::{ContactSet, FrameMotion, SensorSet};
+use proprio_dynamics::{ContactSet, FrameMotion};
 use proprio_topics::{Nanos, Reason};
 
 /// Greatest number of observations per second \[Hz\]. A slower log keeps its own stamps.
@@ -44,9 +44,6 @@ const EDGE: Nanos = Nanos::from_millis(300);
 pub struct Observations {
     /// In order of time.
     pub instants: Vec<Observation>,
-    /// Where the offset of an F/T sensor seems to jump, judged by its readings minus the CAD's
-    /// prediction. From there on the offset is re-initialised, unless a fit contradicts.
-    pub offset_jumps: Vec<OffsetJump>,
     /// All other defects of the log: those of single channels, and those found at common times.
     pub defects: Vec<Defect>,
 }
@@ -84,7 +81,6 @@ impl Recording {
                     .iter()
                     .map(|own| temperature_at(own, t))
                     .collect(),
-                outliers: SensorSet::default(),
             };
             for (channel, fault) in self.channels.iter().zip(&mut observation.faults) {
                 *fault = match channel.role {
@@ -118,7 +114,6 @@ impl Recording {
         };
         Observations {
             instants: parallel::in_chunks(times.len(), |range| range.map(at).collect()),
-            offset_jumps: Vec::new(),
             defects: self.defects.clone(),
         }
     }

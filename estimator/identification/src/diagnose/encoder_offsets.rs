@@ -5,8 +5,8 @@
 //! # Encoder sign
 //! The parameters are fitted again to the logs with a joint's position, velocity and acceleration
 //! negated. The joint that reduces the cost the most is accepted, then further joints in the same
-//! way. If a sign is wrong, offsets are not tested: a wrong sign looks like offsets of other
-//! joints.
+//! way, before gains of the F/T sensors are fitted. If a sign is wrong, offsets are not tested: a
+//! wrong sign looks like offsets of other joints.
 //!
 //! # Encoder offset
 //! A constant error of the position, of joints beyond or between F/T sensors, and of joints between
@@ -21,7 +21,7 @@
 
 use crate::dataset::observation::Annotated;
 use crate::finding::{Finding, FindingCode, Severity};
-use crate::fit::{Identified, added};
+use crate::fit::{Identified, NoiseAndMap, added};
 use crate::hypothesis::needed;
 use crate::linear::information::Information;
 use crate::measurement::model::MeasurementModel;
@@ -29,9 +29,11 @@ use crate::measurement::reduction::{Segment, reduce, reduce_with_angles};
 use crate::measurement::unknowns::Unknowns;
 use crate::parallel;
 use crate::prior::{Fit, Posterior};
+use crate::robot::Robot;
 use crate::training::{TrainingLog, map_segments};
 use nalgebra::{DMatrix, DVector};
-use proprio_dynamics::model::JointKind;
+use proprio_dynamics::model::{Joint, JointKind};
+use std::f64::consts::FRAC_1_SQRT_2;
 
 /// Prior standard deviation of an encoder offset \[rad\].
 const OFFSET_STD: f64 = 0.1;
@@ -56,6 +58,11 @@ const STRETCHES: usize = 4;
 /// The same for signs: a wrong sign shows in fewer observations.
 const ENOUGH_FOR_SIGN: usize = 1200;
 const LEAST_OF_LOG_FOR_SIGN: usize = 300;
+
+/// Fraction of the cost that the right sign must save. The noise is that of a fit with the wrong
+/// sign, which leaves most of the cost; a joint that hardly moves may save a little by chance of
+/// the model's errors.
+const SURE: f64 = 0.25;
 
 /// Most likely candidates that are fitted in each round.
 const TRIED: usize = 6;
@@ -282,26 +289,70 @@ fn stretches(log: &TrainingLog, share: usize) -> Vec<Segment<'_>> {
         let start = (log.instants.len() - count) * stretch / (stretches - 1).max(1);
         Segment {
             instants: &log.instants[start..start + count],
-            offset_jumps: &log.offset_jumps,
+            log: None,
         }
     };
     (0..stretches).map(segment).collect()
 }
 
-/// The joints among `dofs` with a wrong encoder sign.
-fn wrong_signs(
+/// Findings of wrong encoder signs, with a fit without gains: 36 of them would make up for much of
+/// a wrong sign.
+pub(crate) fn wrong_signs(
     measurement: &MeasurementModel<'_>,
     training: &[&TrainingLog],
-    identified: &Identified,
+    estimate: &NoiseAndMap,
+) -> Vec<Finding> {
+    let robot = measurement.robot();
+    let dofs = turning(robot);
+    let finding = |dof: &usize| {
+        let joint = format!("joint/{}", robot.model.dof_name(*dof));
+        Finding {
+            severity: Severity::Warning,
+            code: FindingCode::WrongSign,
+            text: format!(
+                "{joint}: wrong encoder sign, the data fit only with the position negated; negate \
+                 the encoder's reading, or the joint's axis in the URDF"
+            ),
+            subject: joint,
+        }
+    };
+    let negated = negated(measurement, training, estimate, &dofs);
+    negated.iter().map(finding).collect()
+}
+
+/// The revolute joint of a degree of freedom.
+fn revolute(robot: &Robot, dof: usize) -> Option<&Joint> {
+    let joint = robot.model.dof_joint(dof)?;
+    let joint = &robot.model.joints()[joint];
+    matches!(joint.kind, JointKind::Revolute(_)).then_some(joint)
+}
+
+/// The degrees of freedom that are tested. (A joint that moves no identified link has columns of
+/// zeros, and explains nothing.)
+fn turning(robot: &Robot) -> Vec<usize> {
+    let is_tested = |dof: &usize| robot.locked[*dof].is_nan() && revolute(robot, *dof).is_some();
+    (0..robot.model.dof_count()).filter(is_tested).collect()
+}
+
+/// The joints among `dofs` with a wrong encoder sign.
+fn negated(
+    measurement: &MeasurementModel<'_>,
+    training: &[&TrainingLog],
+    estimate: &NoiseAndMap,
     dofs: &[usize],
 ) -> Vec<usize> {
-    let Identified {
-        unknowns,
-        prior,
-        noise,
-        fit,
-        ..
-    } = identified;
+    let unknowns = measurement.unknowns();
+    let NoiseAndMap {
+        prior, noise, fit, ..
+    } = estimate;
+    // A joint's axis can be reversed by links that are nothing like CAD's: CAD is taken to be as
+    // good as stated.
+    let stated = measurement.robot().urdf_relative_std * FRAC_1_SQRT_2;
+    let tau = if stated > 0.0 {
+        fit.tau.min(stated)
+    } else {
+        fit.tau
+    };
     let share = (ENOUGH_FOR_SIGN / training.len().max(1)).max(LEAST_OF_LOG_FOR_SIGN);
     let segments: Vec<Segment<'_>> = training
         .iter()
@@ -314,23 +365,15 @@ fn wrong_signs(
         for segment in &segments {
             let other = |own: &Annotated| own.clone().map(|o| o.turned(negated));
             let instants: Vec<Annotated> = segment.instants.iter().map(other).collect();
-            let (instants, offset_jumps) = (&instants[..], segment.offset_jumps);
+            let (instants, log) = (&instants[..], segment.log);
             let _ = all.merge(
-                &reduce(
-                    &mut measurement,
-                    Segment {
-                        instants,
-                        offset_jumps,
-                    },
-                    noise,
-                )
-                .information,
+                &reduce(&mut measurement, Segment { instants, log }, noise).information,
                 &columns,
             );
         }
         let (r, z) = all.to_triangle();
         let posterior = Posterior::new(prior, &unknowns.links, &r, &z, &unknowns.precision);
-        let fit = posterior.ok()?.fit(fit.tau).ok()?;
+        let fit = posterior.ok()?.fit(tau).ok()?;
         Some(all.residual_square() + cost(unknowns, &fit, &unknowns.precision))
     };
     let mut negated: Vec<usize> = Vec::new();
@@ -352,7 +395,9 @@ fn wrong_signs(
             .zip(costs)
             .filter_map(|(dof, cost)| Some((*dof, cost?)));
         let best = found.min_by(|a, b| a.1.total_cmp(&b.1));
-        match best.filter(|best| least - best.1 > needed(1, dofs.len())) {
+        let is_sure =
+            |best: &(usize, f64)| best.1 < least - needed(1, dofs.len()).max(SURE * least);
+        match best.filter(is_sure) {
             Some((dof, cost)) => {
                 negated.push(dof);
                 least = cost;
@@ -362,7 +407,7 @@ fn wrong_signs(
     }
 }
 
-/// Findings of wrong encoder signs, or else of encoder offsets.
+/// Findings of encoder offsets.
 pub(crate) fn encoder_errors(
     measurement: &MeasurementModel<'_>,
     training: &[&TrainingLog],
@@ -370,43 +415,22 @@ pub(crate) fn encoder_errors(
 ) -> Vec<Finding> {
     let robot = measurement.robot();
     let unknowns = &identified.unknowns;
-    let joint = |dof: usize| {
-        let joint = robot
-            .model
-            .dof_joint(dof)
-            .map(|joint| &robot.model.joints()[joint]);
-        joint.filter(|joint| matches!(joint.kind, JointKind::Revolute(_)))
-    };
     // Joints between two identified links of a sub-tree; with joint torques, any joint with an
     // identified child link.
     let is_within = |dof: usize| {
-        joint(dof).is_some_and(|joint| {
+        revolute(robot, dof).is_some_and(|joint| {
             let inside = robot.structure.subtree_of(joint.parent)
                 == robot.structure.subtree_of(joint.child)
                 && unknowns.links.contains(&joint.parent);
             unknowns.links.contains(&joint.child) && (inside || !unknowns.joints.is_empty())
         })
     };
-    // A joint that moves no identified link has columns of zeros, and explains nothing.
-    let dofs: Vec<usize> = (0..robot.model.dof_count())
-        .filter(|&dof| robot.locked[dof].is_nan() && joint(dof).is_some())
-        .collect();
-    let negated = wrong_signs(measurement, training, identified, &dofs);
-    if !negated.is_empty() {
-        let finding = |dof: &usize| {
-            let joint = format!("joint/{}", robot.model.dof_name(*dof));
-            Finding {
-                severity: Severity::Warning,
-                code: FindingCode::WrongSign,
-                text: format!(
-                    "{joint}: wrong encoder sign, the data fit only with the position negated; \
-                     negate the encoder's reading, or the joint's axis in the URDF"
-                ),
-                subject: joint,
-            }
-        };
-        return negated.iter().map(finding).collect();
-    }
+    let mounting = if unknowns.sensors.is_empty() {
+        ""
+    } else {
+        " (an F/T sensor that is mounted turned, its rpy_rad, looks the same)"
+    };
+    let dofs = turning(robot);
     let search = Search::new(measurement, training, identified, &dofs);
     let Some((cost, offsets)) = search.run() else {
         return Vec::new();
@@ -471,12 +495,12 @@ pub(crate) fn encoder_errors(
         let text = if is_within {
             format!(
                 "joint/{name}: {what}; calibrate the encoder{rest}, or the parameters will contain \
-                 a shifted centre of mass"
+                 a shifted centre of mass{mounting}"
             )
         } else {
             format!(
                 "joint/{name}: {what}, or the base (its IMU, its gravity_mps2, the floor) is \
-                 tilted by as much; calibrate the encoder{rest}, and level the base"
+                 tilted by as much; calibrate the encoder{rest}, and level the base{mounting}"
             )
         };
         findings.push(Finding {

@@ -1,4 +1,7 @@
-//! A load that is picked up or put down within a log.
+//! A load on any link that is picked up or put down within a log, or is there in one of several.
+//!
+//! Without it, .8 kg on the forearm in one of two logs raise the error on held-out torques from
+//! .7 % to several times that, and nothing names the cause.
 
 use crate::dataset::observation::{Annotated, Observation, UnitSet};
 use crate::hypothesis::needed;
@@ -7,6 +10,7 @@ use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::reduction::{Segment, reduce};
 use crate::measurement::unknowns::Unknowns;
+use crate::parallel;
 use crate::prior::Prior;
 use crate::training::{TrainingLog, map_segments};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
@@ -83,8 +87,16 @@ impl Normal {
         self.right += r.transpose() * z;
     }
 
-    pub(crate) fn add_prior(&mut self, prior: &Prior, unknowns: &Unknowns, tau: f64) {
-        for (place, &link) in unknowns.links.iter().enumerate() {
+    /// Adds the prior, but for links whose parameters are known otherwise.
+    pub(crate) fn add_prior(
+        &mut self,
+        prior: &Prior,
+        unknowns: &Unknowns,
+        tau: f64,
+        is_known: &dyn Fn(usize) -> bool,
+    ) {
+        let unknown = unknowns.links.iter().copied().enumerate();
+        for (place, link) in unknown.filter(|(_, link)| !is_known(*link)) {
             let mut own = self
                 .matrix
                 .fixed_view_mut::<LINK_PARAMETERS, LINK_PARAMETERS>(
@@ -104,11 +116,17 @@ impl Normal {
     }
 }
 
+/// The precision of a body's parameters before any data: it is known to three times the link's own
+/// size.
+fn weak(prior: &Prior, link: usize) -> SMatrix<f64, LINK_PARAMETERS, LINK_PARAMETERS> {
+    prior.metric(link) / 18.0
+}
+
 /// The parameters of a body that is on the link at `place` in `some` of the data only, and by how
-/// much it reduces the squared residuals. `factor`: of all data and the prior; `x`: their solution.
+/// much it reduces the squared residuals. `weak`: the precision of its prior; `factor`: of all data
+/// and the prior; `x`: their solution.
 pub(crate) fn body(
-    prior: &Prior,
-    unknowns: &Unknowns,
+    weak: &SMatrix<f64, LINK_PARAMETERS, LINK_PARAMETERS>,
     place: usize,
     some: &Normal,
     factor: &nalgebra::Cholesky<f64, nalgebra::Dyn>,
@@ -121,8 +139,6 @@ pub(crate) fn body(
     let own = cross
         .fixed_rows::<LINK_PARAMETERS>(LINK_PARAMETERS * place)
         .into_owned();
-    // A weak prior: the body is known to three times the link's own size.
-    let weak = prior.metric(unknowns.links[place]) / 18.0;
     let rest = own + weak - cross.transpose() * factor.solve(&cross);
     let misfit = some
         .right
@@ -154,10 +170,10 @@ impl AddedBody {
 /// Looks for a load that changes within one of the logs, given the noise and the prior's scale
 /// `tau` of a fit to all of them.
 ///
-/// A log is divided into segments. For each boundary between two segments and each link at the end
-/// of a limb: the gain is the reduction of the squared residuals by a body on that link in the
-/// segments after the boundary only, or in those before it only. The side that is excluded: with
-/// several logs, the one with the larger gain; with a single log, the shorter one.
+/// A log is divided into segments. For each boundary between two segments and each link: the gain
+/// is the reduction of the squared residuals by a body on that link in the segments after the
+/// boundary only, or in those before it only. The side that is excluded: with several logs, the one
+/// with the larger gain; with a single log, the shorter one.
 pub(crate) fn find(
     measurement: &MeasurementModel<'_>,
     prior: &Prior,
@@ -166,13 +182,12 @@ pub(crate) fn find(
     tau: f64,
 ) -> Option<Load> {
     let unknowns = measurement.unknowns();
-    let model = &measurement.robot().model;
     let mut segments = Vec::new();
     let mut of_log: Vec<Range<usize>> = Vec::new();
     let segment_seconds = |log: &TrainingLog| {
         ((log.span.1 - log.span.0).seconds() / SEGMENTS as f64).max(SEGMENT_SECONDS)
     };
-    for log in training {
+    for (number, log) in training.iter().enumerate() {
         let first = segments.len();
         let seconds = segment_seconds(log);
         let mut start = 0;
@@ -184,7 +199,7 @@ pub(crate) fn find(
             if ends {
                 segments.push(Segment {
                     instants: &log.instants[start..i],
-                    offset_jumps: &log.offset_jumps,
+                    log: Some(number),
                 });
                 start = i;
             }
@@ -196,17 +211,9 @@ pub(crate) fn find(
     });
     let mut all = Normal::new(unknowns.parameters());
     reduced.iter().for_each(|reduced| all.add(reduced));
-    all.add_prior(prior, unknowns, tau);
+    all.add_prior(prior, unknowns, tau, &|_| false);
     let factor = all.matrix.clone().cholesky()?;
     let x = factor.solve(&all.right);
-    let ends: Vec<usize> = (0..unknowns.links.len())
-        .filter(|&place| {
-            model
-                .joints()
-                .iter()
-                .all(|joint| joint.parent != unknowns.links[place])
-        })
-        .collect();
     // The threshold is that of a single test, because the noise still includes the load. The noise
     // of the fit without it decides.
     let least = needed(LINK_PARAMETERS, 1);
@@ -219,27 +226,43 @@ pub(crate) fn find(
         reduced[range.clone()]
             .iter()
             .for_each(|reduced| whole.add(reduced));
-        let mut before = Normal::new(unknowns.parameters());
-        for at in range.start + 1..range.end + 1 - LEAST_SEGMENTS {
-            before.add(&reduced[at - 1]);
-            if at < range.start + LEAST_SEGMENTS {
-                continue;
-            }
-            let after = Normal {
-                matrix: &whole.matrix - &before.matrix,
-                right: &whole.right - &before.right,
-            };
-            for &place in &ends {
-                let of = |some: &Normal| {
-                    body(prior, unknowns, place, some, &factor, &x)
-                        .filter(|(added, _)| added.is_a_body())
-                        .map_or(0.0, |(_, gain)| gain)
-                };
-                let (later, earlier) = (of(&after), of(&before));
+        let mut test = |at: usize, before: &Normal, after: &Normal| {
+            // What one log has throughout more than the others is a load in it, not one that is
+            // missing.
+            let may_be = |added: &AddedBody| at > range.start || added.parameters[0] > 0.0;
+            let gains = parallel::map(unknowns.links.len(), |place| {
+                [after, before].map(|some| {
+                    body(
+                        &weak(prior, unknowns.links[place]),
+                        place,
+                        some,
+                        &factor,
+                        &x,
+                    )
+                    .filter(|(added, _)| added.is_a_body() && may_be(added))
+                    .map_or(0.0, |(_, gain)| gain)
+                })
+            });
+            for (place, [later, earlier]) in gains.into_iter().enumerate() {
                 let gain = later.max(earlier);
                 if gain > least && best.is_none_or(|best| gain > best.0.max(best.1)) {
                     best = Some((later, earlier, log, at, place));
                 }
+            }
+        };
+        let mut before = Normal::new(unknowns.parameters());
+        // With several logs, one of them may have the load throughout.
+        if training.len() > 1 {
+            test(range.start, &before, &whole);
+        }
+        for at in range.start + 1..range.end + 1 - LEAST_SEGMENTS {
+            before.add(&reduced[at - 1]);
+            if at >= range.start + LEAST_SEGMENTS {
+                let after = Normal {
+                    matrix: &whole.matrix - &before.matrix,
+                    right: &whole.right - &before.right,
+                };
+                test(at, &before, &after);
             }
         }
     }
@@ -270,7 +293,9 @@ pub(crate) fn find(
         }
     }
     // The change may be anywhere in the adjacent segment.
-    let (from, to) = if is_after {
+    let (from, to) = if excluded == *range {
+        (excluded.start, excluded.end)
+    } else if is_after {
         (excluded.start + 1, excluded.end)
     } else {
         (excluded.start, excluded.end - 1)
@@ -291,7 +316,8 @@ pub(crate) fn find(
 }
 
 /// The inertial parameters of a load, from the part of the log that was excluded for it and from
-/// all used data.
+/// all used data; and the place of the link that it is on, which shows better than when it was
+/// found, since the noise no longer contains it.
 pub(crate) fn added_body(
     measurement: &MeasurementModel<'_>,
     prior: &Prior,
@@ -300,7 +326,7 @@ pub(crate) fn added_body(
     noise: &NoiseModel,
     used: &Information,
     tau: f64,
-) -> Option<AddedBody> {
+) -> Option<(usize, AddedBody)> {
     let log = training.get(load.log)?;
     let is_clear = |instant: &&Annotated| load.clear.0 <= instant.t && instant.t <= load.clear.1;
     let first = log.instants.iter().position(|instant| is_clear(&instant))?;
@@ -309,7 +335,7 @@ pub(crate) fn added_body(
     measurement.include_disturbed(true);
     let segment = Segment {
         instants: &log.instants[first..first + count],
-        offset_jumps: &log.offset_jumps,
+        log: Some(load.log),
     };
     let reduced = reduce(&mut measurement, segment, noise);
     let unknowns = measurement.unknowns();
@@ -320,8 +346,19 @@ pub(crate) fn added_body(
         right: some.right.clone(),
     };
     all.add(used);
-    all.add_prior(prior, unknowns, tau);
+    all.add_prior(prior, unknowns, tau, &|_| false);
     let factor = all.matrix.clone().cholesky()?;
     let x = factor.solve(&all.right);
-    body(prior, unknowns, load.place, &some, &factor, &x).map(|(added, _)| added)
+    let each = (0..unknowns.links.len()).filter_map(|place| {
+        let (added, gain) = body(
+            &weak(prior, unknowns.links[place]),
+            place,
+            &some,
+            &factor,
+            &x,
+        )?;
+        added.is_a_body().then_some((gain, place, added))
+    });
+    let (_, place, added) = each.max_by(|a, b| a.0.total_cmp(&b.0))?;
+    Some((place, added))
 }

@@ -8,7 +8,7 @@ use crate::diagnose::{sensor_frame, wrench_units};
 use crate::finding::{Finding, FindingCode, Severity};
 use crate::measurement::model::MeasurementModel;
 use crate::robot::{IdentificationInput, Robot};
-use crate::training::{MIN_FOLD, prepare, stamps_apart};
+use crate::training::{folds, prepare, stamps_apart};
 
 /// Findings that mean that a log, or the configuration, is wrong. (Others mean that a log contains
 /// little information or that some instants are lost.)
@@ -52,7 +52,7 @@ pub fn implausible(robot: &Robot, dataset: Dataset) -> Vec<Finding> {
     log.findings.clear();
     // Without motion, with motion in wrong units, or with too few instants, F/T readings cannot be
     // tested.
-    log.refused = !has_motion || log.instants.len() < MIN_FOLD;
+    log.refused = !has_motion || folds(log.instants.iter().map(|instant| instant.t)) < 1;
     let wrench = [IdentificationInput::Wrench];
     let measurement = MeasurementModel::for_observations(robot, &wrench, log.instants.iter()).ok();
     if let Some(mut measurement) =

@@ -17,7 +17,7 @@ use crate::finding::{Finding, Severity};
 use crate::linear::nuisance::NuisanceFilter;
 use crate::measurement::channels;
 use crate::measurement::model::MeasurementModel;
-use crate::measurement::reduction::{OFFSET_VARIANCE, nuisance_prior};
+use crate::measurement::reduction::nuisance_prior;
 use crate::measurement::rows::Rows;
 use crate::robot::Robot;
 use crate::training::{TrainingLog, finding, map_segments, sample};
@@ -168,19 +168,8 @@ fn misfits(
         let mut misfits = vec![0.0; count];
         let mut nuisance = NuisanceFilter::new(&nuisance_prior(unknowns), count);
         let mut rows = Rows::new(unknowns);
-        let (mut lines, mut last) = (Vec::new(), None);
+        let mut lines = Vec::new();
         for instant in segment.instants {
-            let t = last.replace(instant.t).unwrap_or(instant.t);
-            for broken in segment
-                .offset_jumps
-                .iter()
-                .filter(|b| t < b.t && b.t <= instant.t)
-            {
-                if let Ok(place) = unknowns.sensors.binary_search(&broken.sensor) {
-                    (6 * place..6 * place + 6)
-                        .for_each(|unknown| nuisance.reset(unknown, OFFSET_VARIANCE));
-                }
-            }
             if measurement.make(instant, &mut rows).is_err() {
                 continue;
             }

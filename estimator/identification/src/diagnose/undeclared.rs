@@ -1,13 +1,11 @@
-//! Undeclared disturbances in the logs: contacts and loads, and which offset jumps are real. They
-//! are updated after each fit ([`crate::diagnose::disturbance`], [`crate::diagnose::load`] and
-//! [`crate::diagnose::offset_jumps`] find them), marked in the logs so that the next fit excludes
-//! them, and reported at the end.
+//! Undeclared disturbances in the logs: contacts and loads. They are updated after each fit
+//! ([`crate::diagnose::disturbance`] and [`crate::diagnose::load`] find them), marked in the logs
+//! so that the next fit excludes them, and reported at the end.
 
 use crate::dataset::Role;
-use crate::dataset::defects::OffsetJump;
 use crate::dataset::observation::UnitSet;
 use crate::diagnose::load::Load;
-use crate::diagnose::{disturbance, load, offset_jumps};
+use crate::diagnose::{disturbance, load};
 use crate::finding::{Finding, FindingCode, Severity};
 use crate::fit::{Identified, NoiseAndMap};
 use crate::measurement::channels;
@@ -19,14 +17,6 @@ use nalgebra::DVector;
 use proprio_topics::Nanos;
 use std::ops::Range;
 
-/// Longest apparent contact at an offset jump of a sensor of that part that counts as the jump
-/// itself \[s\]: the time of a jump is known to half the gap between the samples around it, and
-/// excluded blocks have a margin.
-const LONGEST_JUMP: f64 = 1.2;
-
-/// ... if it begins or ends within this time of the jump \[s\].
-const NEAR_JUMP: f64 = 0.3;
-
 /// A contact within this time of a change of load is the hand that gives or takes the load \[s\]
 /// ...
 const NEAR_LOAD_CHANGE: f64 = 1.0;
@@ -34,30 +24,23 @@ const NEAR_LOAD_CHANGE: f64 = 1.0;
 /// that is longer. Two changes of load within this time are the same one.
 const LONGEST_HANDOVER: f64 = 3.0;
 
-/// Most rounds of disturbances and offset jumps of validation logs, for a given fit.
+/// Most rounds of disturbances of validation logs, for a given fit.
 const ROUNDS: usize = 4;
 
-/// Undeclared disturbances of some logs, and which of their offset jumps are real.
+/// Undeclared disturbances of some logs.
 pub(crate) struct Undeclared {
     pub loads: Vec<Load>,
     /// Per log and instant.
     contacts: Vec<Vec<UnitSet>>,
-    /// All offset jumps that the readings suggest, per log.
-    jumps: Vec<Vec<OffsetJump>>,
 }
 
 impl Undeclared {
     /// No disturbances, yet, of these logs.
     pub(crate) fn none<'a>(logs: impl Iterator<Item = &'a mut TrainingLog>) -> Self {
-        let (mut contacts, mut jumps) = (Vec::new(), Vec::new());
-        for log in logs {
-            contacts.push(vec![UnitSet::default(); log.instants.len()]);
-            jumps.push(log.offset_jumps.clone());
-        }
+        let contacts = logs.map(|log| vec![UnitSet::default(); log.instants.len()]);
         Self {
             loads: Vec::new(),
-            contacts,
-            jumps,
+            contacts: contacts.collect(),
         }
     }
 
@@ -88,7 +71,7 @@ impl Undeclared {
         }
     }
 
-    /// Updates contacts and offset jumps from the residuals of a fit, and marks the logs; true if
+    /// Updates contacts from the residuals of a fit, and marks the logs; true if
     /// nothing changed.
     pub(crate) fn update<'a>(
         &mut self,
@@ -100,21 +83,10 @@ impl Undeclared {
         let logs: Vec<&mut TrainingLog> = logs.collect();
         let seen: Vec<&TrainingLog> = logs.iter().map(|log| &**log).collect();
         let contacts = disturbance::contacts(measurement, &seen, &self.loads, noise, d);
-        // Tests all jumps again: one that the noise of a contact hid may show when the contact is
-        // excluded.
-        let confirmed = offset_jumps::confirmed(measurement, &seen, &self.jumps, noise, d);
-        let unchanged = contacts == self.contacts
-            && seen
-                .iter()
-                .zip(&confirmed)
-                .all(|(log, confirmed)| log.offset_jumps == *confirmed);
+        let unchanged = contacts == self.contacts;
         if !unchanged {
             self.contacts = contacts;
-            let marked = logs.into_iter().zip(confirmed).map(|(log, confirmed)| {
-                log.offset_jumps = confirmed;
-                log
-            });
-            self.mark(marked);
+            self.mark(logs.into_iter());
         }
         unchanged
     }
@@ -160,16 +132,16 @@ impl Undeclared {
                 fit.tau,
             )
         };
-        let bodies: Vec<Option<load::AddedBody>> = loads.iter().map(body).collect();
+        let bodies: Vec<Option<(usize, load::AddedBody)>> = loads.iter().map(body).collect();
         let training = training_logs_mut(logs);
         for (number, (log, contacts)) in training.zip(contacts).enumerate() {
-            let own: Vec<(&Load, &Option<load::AddedBody>)> = loads
+            let own: Vec<(&Load, &Option<(usize, load::AddedBody)>)> = loads
                 .iter()
                 .zip(&bodies)
                 .filter(|(load, _)| load.log == number)
                 .collect();
             let loads: Vec<&Load> = own.iter().map(|(load, _)| *load).collect();
-            let apparent_contacts = apparent_contacts(robot, log, contacts, &loads);
+            let apparent_contacts = apparent_contacts(log, contacts, &loads);
             for unit in units(contacts).iter() {
                 let of = |cause| {
                     Tally::of(
@@ -179,12 +151,7 @@ impl Undeclared {
                             .filter(|contact_span| contact_span.is(unit, cause)),
                     )
                 };
-                let (jumps, contacts) = (of(Cause::Jump), of(Cause::Contact));
-                if let Some(jumps) = jumps {
-                    let reason = format!("offset jump: {}", part(robot, unit));
-                    log.excluded.push(jumps.excluded(reason));
-                }
-                let Some(contacts) = contacts else {
+                let Some(contacts) = of(Cause::Contact) else {
                     continue;
                 };
                 let reason = format!("contact suspected: {}", part(robot, unit));
@@ -194,8 +161,8 @@ impl Undeclared {
                     code: FindingCode::Disturbance,
                     subject: part(robot, unit),
                     text: format!(
-                        "{}: undeclared disturbance (contact or load) {}. These instants were \
-                         excluded; declare contacts where they occur",
+                        "{}: undeclared disturbance (contact, load or a jump of a sensor's offset) \
+                         {}. These instants were excluded; declare contacts where they occur",
                         part(robot, unit),
                         contacts.describe(log)
                     ),
@@ -218,11 +185,12 @@ fn report_load<'a>(
     measurement: &MeasurementModel<'_>,
     log: &mut TrainingLog,
     load: &Load,
-    body: Option<&load::AddedBody>,
+    body: Option<&(usize, load::AddedBody)>,
     handovers: impl Iterator<Item = &'a ApparentContact>,
 ) {
     let (robot, unknowns) = (measurement.robot(), measurement.unknowns());
-    let link = robot.model.link_name(unknowns.links[load.place]);
+    let place = body.map_or(load.place, |(place, _)| *place);
+    let link = robot.model.link_name(unknowns.links[place]);
     let since = |t: Nanos| (t - log.span.0).seconds();
     let mut out: Vec<bool> = log
         .instants
@@ -250,7 +218,7 @@ fn report_load<'a>(
     } else {
         ("Up to", last)
     };
-    let what = body.map_or(String::new(), |body| {
+    let what = body.map_or(String::new(), |(_, body)| {
         let p = &body.parameters;
         let sigma = |i: usize| body.covariance[(i, i)].sqrt();
         format!(
@@ -284,7 +252,7 @@ pub(crate) fn not_converged(fits: usize) -> Finding {
         code: FindingCode::DisturbancesNotConverged,
         subject: String::new(),
         text: format!(
-            "undeclared disturbances and offset jumps did not converge in {fits} fits: check the \
+            "undeclared disturbances did not converge in {fits} fits: check the \
              instants that the logs exclude, and declare contacts where they occurred"
         ),
     }
@@ -315,8 +283,6 @@ struct ApparentContact {
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Cause {
     Contact,
-    /// An offset jump of a sensor.
-    Jump,
     /// The hand that gives or takes the load of this number.
     Load(usize),
 }
@@ -336,19 +302,12 @@ fn units(contacts: &[UnitSet]) -> UnitSet {
 
 /// The apparent contacts of a log with their causes; `loads`: loads whose hands may be one.
 fn apparent_contacts(
-    robot: &Robot,
     log: &TrainingLog,
     contacts: &[UnitSet],
     loads: &[&Load],
 ) -> Vec<ApparentContact> {
     let mut apparent_contacts = Vec::new();
     for unit in units(contacts).iter() {
-        let sensors = robot
-            .structure
-            .subtrees()
-            .get(unit)
-            .map(|subtree| &subtree.sensors);
-        let is_own = |b: &OffsetJump| sensors.is_some_and(|sensors| sensors.contains(b.sensor));
         let mut begin = 0;
         for instants in contacts.chunk_by(|a, b| a.contains(unit) == b.contains(unit)) {
             let range = begin..begin + instants.len();
@@ -363,14 +322,10 @@ fn apparent_contacts(
             };
             let is_handed =
                 |load: &&Load| load.units.contains(unit) && is_near(load.span, NEAR_LOAD_CHANGE);
-            let is_jump = |b: &OffsetJump| is_own(b) && is_near((b.t, b.t), NEAR_JUMP);
             let load = loads.iter().position(is_handed);
             let load = load.filter(|&load| lasts <= LONGEST_HANDOVER.max(loads[load].within));
             let cause = match load {
                 Some(number) => Cause::Load(number),
-                None if lasts <= LONGEST_JUMP && log.offset_jumps.iter().any(is_jump) => {
-                    Cause::Jump
-                }
                 None => Cause::Contact,
             };
             apparent_contacts.push(ApparentContact {
@@ -433,9 +388,8 @@ impl Tally {
 }
 
 /// Reports undeclared disturbances of the validation logs, stores them in
-/// [`TrainingLog::disturbed`], and updates which of their offset jumps are real. The figures of
-/// these logs still include all rows: validation data must not be selected by the model that they
-/// validate.
+/// [`TrainingLog::disturbed`]. The figures of these logs still include all rows: validation data
+/// must not be selected by the model that they validate.
 pub(crate) fn report_validation(
     measurement: &MeasurementModel<'_>,
     logs: &mut [TrainingLog],
@@ -450,7 +404,7 @@ pub(crate) fn report_validation(
     });
     let checked = logs.iter_mut().filter(is_checked);
     for (log, contacts) in checked.zip(undeclared.contacts) {
-        let apparent_contacts = apparent_contacts(robot, log, &contacts, &[]);
+        let apparent_contacts = apparent_contacts(log, &contacts, &[]);
         for unit in units(&contacts).iter() {
             let own = apparent_contacts
                 .iter()
@@ -463,8 +417,8 @@ pub(crate) fn report_validation(
                 severity: Severity::Note,
                 code: FindingCode::Disturbance,
                 text: format!(
-                    "{part}: residuals as of an undeclared disturbance (contact or load) {}. The \
-                     figures of this log include these instants",
+                    "{part}: residuals as of an undeclared disturbance (contact, load or a jump of \
+                     a sensor's offset) {}. The figures of this log include these instants",
                     sum.describe(log)
                 ),
                 subject: part,
@@ -476,7 +430,7 @@ pub(crate) fn report_validation(
                 code: FindingCode::DisturbancesNotConverged,
                 subject: String::new(),
                 text: format!(
-                    "undeclared disturbances and offset jumps of this log did not converge in \
+                    "undeclared disturbances of this log did not converge in \
                      {ROUNDS} rounds: those reported are uncertain"
                 ),
             });

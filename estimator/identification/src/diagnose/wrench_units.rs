@@ -250,7 +250,6 @@ fn pairs(measurement: &mut MeasurementModel<'_>, log: &TrainingLog) -> Vec<[Pair
         }
     };
     let mut rows = Rows::new(&unknowns);
-    let mut last = log.span.0;
     for instant in log
         .instants
         .iter()
@@ -259,13 +258,6 @@ fn pairs(measurement: &mut MeasurementModel<'_>, log: &TrainingLog) -> Vec<[Pair
         let made = measurement.make(instant, &mut rows).is_ok();
         let residual = DVector::from_fn(rows.count, |row, _| rows.r(row));
         for (place, &sensor) in unknowns.sensors.iter().enumerate() {
-            if log
-                .offset_jumps
-                .iter()
-                .any(|b| b.sensor == sensor && last < b.t && b.t <= instant.t)
-            {
-                close(&mut pairs[place], &mut open[place]);
-            }
             let Some(map) = made
                 .then(|| attribute_to(&rows, &variances, 6 * place..6 * place + 6))
                 .flatten()
@@ -283,7 +275,6 @@ fn pairs(measurement: &mut MeasurementModel<'_>, log: &TrainingLog) -> Vec<[Pair
                 }
             }
         }
-        last = instant.t;
     }
     pairs
         .iter_mut()

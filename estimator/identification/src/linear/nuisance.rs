@@ -82,26 +82,6 @@ impl NuisanceFilter {
         }
     }
 
-    /// Re-initialises one unknown.
-    pub(crate) fn reset(&mut self, unknown: usize, variance: f64) {
-        let n = self.count;
-        // Its covariance with the unknowns before it moves to them; then it has none.
-        let weight = self.d[unknown];
-        self.work.fill(0.0);
-        self.work[..unknown].copy_from_slice(&self.u[unknown * n..][..unknown]);
-        self.u[unknown * n..][..unknown].fill(0.0);
-        self.u[unknown * n..]
-            .iter_mut()
-            .skip(unknown + n)
-            .step_by(n)
-            .for_each(|u| *u = 0.0);
-        if unknown > 0 {
-            self.add(weight, unknown - 1);
-        }
-        self.d[unknown] = variance;
-        self.x[unknown * self.columns..][..self.columns].fill(0.0);
-    }
-
     /// Absorbs a whitened row. The row becomes its innovation, scaled to unit variance.
     pub(crate) fn update(&mut self, g: &[f64], row: &mut [f64]) {
         let n = self.count;
@@ -171,58 +151,30 @@ pub(crate) struct Block {
     /// Estimates and covariance with the block's rows.
     pub x: DMatrix<f64>,
     pub p: DMatrix<f64>,
-    /// Variances added since the previous block; infinite for a re-initialised unknown.
+    /// Variances added since the previous block.
     pub drift: Vec<f64>,
 }
 
 /// Smooths the estimates of all blocks in place (Rauch, Tung, Striebel).
 pub(crate) fn smooth(blocks: &mut [Block]) {
-    smooth_with(blocks, |_, _, _, _| ());
-}
-
-/// As [`smooth`], and reports on the backward pass, for each block but the first, the gain to the
-/// previous block: `(number, block, gain, continues)`. The covariance of the previous block's
-/// unknowns with those of any later block is `gain` times the rows `continues` (those not
-/// re-initialised) of this block's covariance with it.
-pub(crate) fn smooth_with(
-    blocks: &mut [Block],
-    mut report: impl FnMut(usize, &Block, &DMatrix<f64>, &[usize]),
-) {
     for k in (1..blocks.len()).rev() {
         let (before, after) = blocks.split_at_mut(k);
         let (old, new) = (&mut before[k - 1], &after[0]);
-        // Only unknowns that continue are smoothed. Constant ones need no addition.
         let mut predicted = old.p.clone();
         for (i, variance) in new.drift.iter().enumerate() {
-            if variance.is_finite() {
-                predicted[(i, i)] += variance;
-            }
+            predicted[(i, i)] += variance;
         }
-        let continues: Vec<usize> = (0..new.drift.len())
-            .filter(|&i| new.drift[i].is_finite())
-            .collect();
-        let inner = predicted.select_rows(&continues).select_columns(&continues);
-        let Some(factor) = inner.cholesky().filter(|_| !continues.is_empty()) else {
-            report(k, new, &DMatrix::zeros(new.drift.len(), 0), &[]);
+        let Some(factor) = predicted.clone().cholesky() else {
             continue;
         };
         // P (P + Q)^-1 as 1 - Q (P + Q)^-1, which keeps all digits for unknowns that hardly drift.
-        let mut gain = factor
-            .solve(&old.p.select_columns(&continues).transpose())
-            .transpose();
-        let inverse = factor.inverse();
-        for (place, &i) in continues.iter().enumerate() {
-            for other in 0..continues.len() {
-                gain[(i, other)] =
-                    f64::from(u8::from(place == other)) - new.drift[i] * inverse[(place, other)];
-            }
+        let mut gain = -factor.inverse();
+        for (i, drift) in new.drift.iter().enumerate() {
+            gain.row_mut(i).scale_mut(*drift);
+            gain[(i, i)] += 1.0;
         }
-        report(k, new, &gain, &continues);
-        let ahead = new.x.select_rows(&continues) - old.x.select_rows(&continues);
-        old.x += &gain * ahead;
-        let apart = new.p.select_rows(&continues).select_columns(&continues)
-            - predicted.select_rows(&continues).select_columns(&continues);
-        old.p += &gain * apart * gain.transpose();
+        old.x += &gain * (&new.x - &old.x);
+        old.p += &gain * (&new.p - predicted) * gain.transpose();
     }
 }
 
@@ -333,67 +285,6 @@ mod tests {
         }
     }
 
-    /// Covariances between all blocks, compared with least squares. A re-initialised unknown is
-    /// correlated with its earlier value only through unknowns that continue.
-    #[test]
-    fn covariances_between_blocks_are_those_of_least_squares() {
-        let (s, count) = (2, 5);
-        let (prior, steps) = ([4.0, 9.0], [0.3, 0.1]);
-        let g = |block: usize| [[1.0, 1.0], [0.2 * block as f64, -0.5]];
-        let mut precision = DMatrix::<f64>::zeros(s * count, s * count);
-        let mut nuisance = NuisanceFilter::new(&prior, 1);
-        let mut blocks: Vec<Block> = Vec::new();
-        for block in 0..count {
-            let mut drift = steps.to_vec();
-            if block == 3 {
-                drift[0] = f64::INFINITY;
-            }
-            for i in 0..s {
-                let (now, before) = (s * block + i, (s * block + i).wrapping_sub(s));
-                if block == 0 || drift[i].is_infinite() {
-                    precision[(now, now)] += 1.0 / prior[i];
-                } else {
-                    precision[(now, now)] += 1.0 / drift[i];
-                    precision[(before, before)] += 1.0 / drift[i];
-                    precision[(now, before)] -= 1.0 / drift[i];
-                    precision[(before, now)] -= 1.0 / drift[i];
-                }
-            }
-            if block > 0 {
-                nuisance.drift(&steps);
-            }
-            if block == 3 {
-                nuisance.reset(0, prior[0]);
-            }
-            for row in g(block) {
-                for (i, j) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
-                    precision[(s * block + i, s * block + j)] += row[i] * row[j];
-                }
-                nuisance.update(&row, &mut [0.0]);
-            }
-            blocks.push(Block {
-                x: nuisance.estimates(),
-                p: nuisance.covariance(),
-                drift,
-            });
-        }
-        let expected = precision.try_inverse().expect("regular");
-        let mut carried: Vec<(usize, DMatrix<f64>)> = Vec::new();
-        smooth_with(&mut blocks, |block, state, gain, continues| {
-            carried.push((block, state.p.clone()));
-            for (later, covariance) in &mut carried {
-                *covariance = gain * covariance.select_rows(continues);
-                let expected = expected.view((s * (block - 1), s * *later), (s, s));
-                assert!(
-                    (&*covariance - expected).amax() < 1e-9,
-                    "{} and {later}",
-                    block - 1
-                );
-            }
-        });
-        assert_eq!(carried.len(), count - 1);
-    }
-
     /// An almost unknown offset, and rows as exact as those of a torque sensor, so that every digit
     /// matters. Compared with orthogonal least squares on all unknowns.
     #[test]
@@ -494,41 +385,6 @@ mod tests {
             let own = last[(i, p)] - last.row(i).columns(0, p).transpose().dot(&d);
             let off = (own - all[place[count - 1][i]]).abs() / all.amax();
             assert!(off < 1e-10, "offset {i}: {off:e}");
-        }
-    }
-
-    /// A re-initialised unknown loses its estimate; the others keep theirs and their covariance.
-    #[test]
-    fn re_initialising_one_unknown_leaves_the_others() {
-        let rows = [
-            [1.0, 0.5, -0.3],
-            [0.2, 1.0, 0.7],
-            [0.4, -0.6, 1.0],
-            [0.9, 0.1, 0.2],
-        ];
-        for unknown in 0..3 {
-            let mut nuisance = NuisanceFilter::new(&[4.0, 9.0, 2.0], 1);
-            for (k, g) in rows.iter().enumerate() {
-                nuisance.update(g, &mut [k as f64 - 1.3]);
-            }
-            let (x, p) = (nuisance.estimates(), nuisance.covariance());
-            nuisance.reset(unknown, 5.0);
-            let (other_x, other_p) = (nuisance.estimates(), nuisance.covariance());
-            for i in 0..3 {
-                let expected = if i == unknown { 0.0 } else { x[(i, 0)] };
-                assert!((other_x[(i, 0)] - expected).abs() < 1e-14);
-                for j in 0..3 {
-                    let expected = match (i == unknown, j == unknown) {
-                        (true, true) => 5.0,
-                        (false, false) => p[(i, j)],
-                        _ => 0.0,
-                    };
-                    assert!(
-                        (other_p[(i, j)] - expected).abs() < 1e-14,
-                        "{unknown}: {other_p} {p}"
-                    );
-                }
-            }
         }
     }
 }

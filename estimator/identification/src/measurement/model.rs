@@ -36,18 +36,8 @@ use nalgebra::{DVector, Matrix6, Vector6};
 use proprio_dynamics::calibration::{Kind, Unknown};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::regressor::{Regressor, StackedRegressor, Weighting};
-use proprio_dynamics::spatial::{Motion, Vec3, Wrench};
+use proprio_dynamics::spatial::Wrench;
 use proprio_dynamics::{DynamicsError, JointState, Kinematics};
-
-/// The wrench that a sub-tree needs for structural vibration (motion that its encoders do not
-/// show): [torque; force], zero where none is known.
-fn vibration_of(observation: &Annotated, subtree: usize) -> [f64; 6] {
-    let known = observation
-        .vibration
-        .iter()
-        .find(|(number, _)| *number == subtree);
-    known.map_or([0.0; 6], |(_, wrench)| wrench.torque_first())
-}
 
 /// The representative of a node's set (union-find).
 fn root_of(parent: &mut [usize], mut node: usize) -> usize {
@@ -209,6 +199,11 @@ impl<'a> MeasurementModel<'a> {
             channels: groups_of(&mut channels.into_iter().map(|channel| nodes + channel)),
         };
         Ok(measurement)
+    }
+
+    /// Sets the precisions of the extra parameters' priors.
+    pub(crate) fn set_precision(&mut self, precision: Vec<f64>) {
+        self.unknowns.precision = precision;
     }
 
     /// Makes these parameters of the calibrations of the visible sensors unknown, and no others. A
@@ -429,67 +424,6 @@ impl<'a> MeasurementModel<'a> {
         routes
     }
 
-    /// The wrench that a sub-tree needs for its motion, minus the measured one, for these
-    /// parameters and nuisance parameters, after [`MeasurementModel::make`]: about its top link's
-    /// origin, in that link's axes. None if a sensor has no reading, or an unknown contact acts on
-    /// it.
-    pub(crate) fn balance(
-        &self,
-        observation: &Annotated,
-        d: &[f64],
-        nuisance: &[f64],
-        number: usize,
-    ) -> Option<Wrench> {
-        let subtree = self.stacked.subtrees().get(number)?;
-        let unread = |sensor: usize| {
-            observation
-                .readings
-                .get(sensor)
-                .is_none_or(|r| !r.is_finite())
-        };
-        let is_disturbed = !self.includes_disturbed && observation.disturbed.contains(number);
-        if is_disturbed
-            || subtree.sensors().len() == 0
-            || subtree.sensors().any(unread)
-            || !subtree.contacts().is_empty()
-        {
-            return None;
-        }
-        let mut b = vibration_of(observation, number);
-        for (row, sum) in b.iter_mut().enumerate() {
-            let (links, offsets) = subtree.row(row).split_at(subtree.offset_column());
-            for (values, link) in links.chunks_exact(LINK_PARAMETERS).zip(subtree.links()) {
-                *sum += dot(
-                    values,
-                    &self.cad[LINK_PARAMETERS * link..][..LINK_PARAMETERS],
-                );
-                if let Ok(place) = self.unknowns.links.binary_search(link) {
-                    *sum += dot(values, &d[LINK_PARAMETERS * place..][..LINK_PARAMETERS]);
-                }
-            }
-            for (values, sensor) in offsets.chunks_exact(6).zip(subtree.sensors()) {
-                if let Ok(place) = self.unknowns.sensors.binary_search(&sensor) {
-                    *sum += dot(values, &nuisance[6 * place..][..6]);
-                }
-                *sum += self
-                    .calibration(observation, sensor, values)
-                    .map(|(column, entry)| entry * d[column])
-                    .sum::<f64>();
-            }
-            *sum -= subtree.measured()[row];
-        }
-        Some(Wrench {
-            torque: Vec3::new(b[0], b[1], b[2]),
-            force: Vec3::new(b[3], b[4], b[5]),
-        })
-    }
-
-    /// The sensors at the boundary of each sub-tree.
-    pub(crate) fn sensors_of_subtrees(&self) -> Vec<Vec<usize>> {
-        let each = self.stacked.subtrees().iter();
-        each.map(|subtree| subtree.sensors().collect()).collect()
-    }
-
     /// The channels (places in the layout) that appear in rows of these units.
     pub(crate) fn channels_of(&self, units: &UnitSet) -> Vec<usize> {
         let (unknowns, subtrees) = (self.unknowns(), self.stacked.subtrees());
@@ -506,27 +440,6 @@ impl<'a> MeasurementModel<'a> {
         of_sensors
             .chain(of_joints.filter(|_| units.contains(Observation::TORQUES)))
             .collect()
-    }
-
-    /// The composite inertia of a sub-tree with locked joints, by CAD, after
-    /// [`MeasurementModel::make`]: the wrench for a unit acceleration along each of
-    /// [angular; linear], about its top link's origin and in that link's axes.
-    pub(crate) fn inertia_of_subtree(&self, number: usize) -> Option<[Wrench; 6]> {
-        let subtree = self.stacked.subtrees().get(number)?;
-        let to_top = self.kinematics.pose(subtree.top()).inverse();
-        let mut wrenches = [Wrench::zero(); 6];
-        for &link in subtree.links() {
-            let body = self.robot.model.inertias()[link]
-                .transformed(&(to_top * *self.kinematics.pose(link)));
-            for (k, sum) in wrenches.iter_mut().enumerate() {
-                let unit = |first: usize| Vec3::from_fn(|i, _| f64::from(u8::from(first + i == k)));
-                *sum += body.momentum(&Motion {
-                    angular: unit(0),
-                    linear: unit(3),
-                });
-            }
-        }
-        Some(wrenches)
     }
 
     fn wrench_rows(
@@ -555,13 +468,11 @@ impl<'a> MeasurementModel<'a> {
             if is_disturbed || subtree.sensors().len() == 0 || subtree.sensors().any(unread) {
                 continue;
             }
-            let vibration = vibration_of(observation, unit);
             for number in 0..subtree.remaining() {
                 let from = subtree.projected_row(number);
                 let (links, offsets) = from.split_at(subtree.offset_column());
                 let (a, r, g, n) = rows.push(unit);
-                *r = subtree.projected_measured()[number]
-                    - dot(subtree.projection(number), &vibration);
+                *r = subtree.projected_measured()[number];
                 for (values, link) in links.chunks_exact(LINK_PARAMETERS).zip(subtree.links()) {
                     let cad = &self.cad[LINK_PARAMETERS * link..][..LINK_PARAMETERS];
                     *r -= values.iter().zip(cad).map(|(x, y)| x * y).sum::<f64>();

@@ -72,15 +72,7 @@ pub(crate) fn estimate_noise(
                 let blocks: Vec<(f64, usize)> = segment.ranges.iter().map(mean).collect();
                 used += blocks.iter().map(|b| b.1).sum::<usize>();
                 filled += blocks.iter().filter(|b| b.1 > 0).count();
-                // An offset jump is no step of the random walk: a new segment begins.
-                let mut walk = Vec::new();
-                for ((value, _), block) in blocks.iter().zip(&segment.nuisance) {
-                    if block.drift[unknowns.offset_of(channel)].is_infinite() {
-                        means.push(std::mem::take(&mut walk));
-                    }
-                    walk.push(*value);
-                }
-                means.push(walk);
+                means.push(blocks.iter().map(|block| block.0).collect());
             }
             per_block = used as f64 / filled.max(1) as f64;
             // Noise that is correlated over more than a block looks like a random walk there. Once
@@ -100,6 +92,7 @@ pub(crate) fn estimate_noise(
                     }
                     bound = fastest / (variance + step - fastest);
                 }
+                step = step.min(fastest);
                 (step, variance) = (step / count, variance * count);
                 let mut levels = means
                     .iter()

@@ -1,6 +1,8 @@
 //! The noise of all channels: its white and slow parts, and the drift rates of the offsets.
 
 use crate::measurement::unknowns::Unknowns;
+use proprio_topics::Nanos;
+use std::collections::BTreeMap;
 
 /// Upper limits of the drift rates of offsets (random walk).
 #[derive(Clone, Debug)]
@@ -25,6 +27,8 @@ pub(crate) struct NoiseModel {
     pub block: Vec<f64>,
     /// Per channel: lower limit of its variance.
     pub least: Vec<f64>,
+    /// Factors of the F/T channels' variances, per second of the training logs.
+    pub seconds: Seconds,
 }
 
 impl NoiseModel {
@@ -38,6 +42,7 @@ impl NoiseModel {
             drift: vec![0.0; channels],
             block: start,
             least,
+            seconds: Seconds::default(),
         }
     }
 
@@ -108,10 +113,20 @@ impl NoiseModel {
     }
 
     /// The geometric mean of the ratio of another model's variances to this model's, over these
-    /// channels.
-    pub(crate) fn variance_ratio(&self, other: &Self, channels: &[usize]) -> f64 {
+    /// channels, in the mean of all seconds.
+    pub(crate) fn variance_ratio(
+        &self,
+        other: &Self,
+        unknowns: &Unknowns,
+        channels: &[usize],
+    ) -> f64 {
         let (own, others) = (self.inflated(), other.inflated());
-        let sum: f64 = channels.iter().map(|&c| (others[c] / own[c]).ln()).sum();
+        let of_seconds = (other.seconds.mean() / self.seconds.mean()).ln();
+        let of_channel = |&c: &usize| {
+            let varies = c < 6 * unknowns.sensors.len();
+            (others[c] / own[c]).ln() + if varies { of_seconds } else { 0.0 }
+        };
+        let sum: f64 = channels.iter().map(of_channel).sum();
         (sum / channels.len().max(1) as f64).exp()
     }
 
@@ -123,4 +138,45 @@ impl NoiseModel {
         }
         variances
     }
+}
+
+/// The factor of the F/T channels' variances in each second of the training logs.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Seconds(pub(crate) BTreeMap<(usize, i64), f64>);
+
+impl Seconds {
+    /// The mean of all factors.
+    fn mean(&self) -> f64 {
+        match self.0.len() {
+            0 => 1.0,
+            count => self.0.values().sum::<f64>() / count as f64,
+        }
+    }
+
+    /// The factor at an instant of a training log; 1 elsewhere.
+    pub(crate) fn factor(&self, log: Option<usize>, t: Nanos) -> f64 {
+        let known = log.and_then(|log| self.0.get(&(log, second(t))));
+        known.copied().unwrap_or(1.0)
+    }
+}
+
+impl NoiseModel {
+    /// These variances at an instant: those of the F/T channels times the factor of its second.
+    pub(crate) fn at(
+        &self,
+        unknowns: &Unknowns,
+        variances: &[f64],
+        (log, t): (Option<usize>, Nanos),
+        out: &mut Vec<f64>,
+    ) {
+        let (factor, channels) = (self.seconds.factor(log, t), 6 * unknowns.sensors.len());
+        out.clear();
+        out.extend_from_slice(variances);
+        out[..channels].iter_mut().for_each(|x| *x *= factor);
+    }
+}
+
+/// The second of an instant, as [`Seconds`] counts them.
+pub(crate) fn second(t: Nanos) -> i64 {
+    t.0.div_euclid(1_000_000_000)
 }

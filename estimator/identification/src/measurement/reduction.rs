@@ -2,7 +2,6 @@
 //! given parameters.
 
 use crate::arithmetic::dot;
-use crate::dataset::defects::OffsetJump;
 use crate::dataset::observation::Annotated;
 use crate::linear::information::{Information, Panel};
 use crate::linear::nuisance::{Block, NuisanceFilter, smooth};
@@ -36,8 +35,8 @@ const AT_ONCE: usize = 32;
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Segment<'a> {
     pub instants: &'a [Annotated],
-    /// Where offsets are re-initialised.
-    pub offset_jumps: &'a [OffsetJump],
+    /// The number of the training log; none if its seconds are not weighted.
+    pub log: Option<usize>,
 }
 
 /// Prior variances of the nuisance parameters.
@@ -47,48 +46,17 @@ pub(crate) fn nuisance_prior(unknowns: &Unknowns) -> Vec<f64> {
     prior
 }
 
-/// A block of observations, and the sensors (places in the layout) whose offset jumps at its start.
-pub(crate) type BlockRange = (Range<usize>, Vec<usize>);
-
-/// The blocks of a segment.
-pub(crate) fn blocks(unknowns: &Unknowns, segment: Segment<'_>) -> Vec<BlockRange> {
-    let instants = segment.instants;
-    let mut out = Vec::new();
-    let mut start = 0;
-    let mut jumped_sensors = Vec::new();
-    for i in 1..=instants.len() {
-        let next: Vec<usize> = match instants.get(i) {
-            Some(observation) => segment
-                .offset_jumps
-                .iter()
-                .filter(|b| instants[i - 1].t < b.t && b.t <= observation.t)
-                .filter_map(|b| unknowns.sensors.binary_search(&b.sensor).ok())
-                .collect(),
-            None => Vec::new(),
-        };
-        let ends = instants
-            .get(i)
-            .is_none_or(|observation| (observation.t - instants[start].t).seconds() >= BLOCK);
-        if ends || !next.is_empty() {
-            out.push((start..i, std::mem::replace(&mut jumped_sensors, next)));
-            start = i;
+/// The blocks of consecutive observations.
+pub(crate) fn blocks(instants: &[Annotated]) -> Vec<Range<usize>> {
+    let (mut blocks, mut start) = (Vec::new(), 0);
+    for end in 1..=instants.len() {
+        let is_long = |next: &Annotated| (next.t - instants[start].t).seconds() >= BLOCK;
+        if instants.get(end).is_none_or(is_long) {
+            blocks.push(start..end);
+            start = end;
         }
     }
-    out
-}
-
-/// Advances the filter to the next block. Returns the variances that were added, infinite for
-/// re-initialised offsets.
-fn advance(nuisance: &mut NuisanceFilter, steps: Vec<f64>, jumped_sensors: &[usize]) -> Vec<f64> {
-    let mut added = steps;
-    nuisance.drift(&added);
-    for sensor in jumped_sensors {
-        for (axis, added) in added[6 * sensor..6 * sensor + 6].iter_mut().enumerate() {
-            nuisance.reset(6 * sensor + axis, OFFSET_VARIANCE);
-            *added = f64::INFINITY;
-        }
-    }
-    added
+    blocks
 }
 
 /// The information about the parameters in a segment, and the nuisance parameters at its end.
@@ -164,16 +132,12 @@ pub(crate) fn reduce_with(
     let mut information = Information::new(p);
     let mut panel = Panel::new(p, PANEL);
     let mut line = vec![0.0; p + 1];
-    let mut slopes = Vec::new();
+    let (mut slopes, mut own) = (Vec::new(), Vec::new());
     let mut last = None;
-    for (range, jumped_sensors) in blocks(&unknowns, segment) {
+    for range in blocks(segment.instants) {
         let t = segment.instants[range.start].t;
         if let Some(last) = last.replace(t) {
-            advance(
-                &mut nuisance,
-                noise.steps(&unknowns, (t - last).seconds()),
-                &jumped_sensors,
-            );
+            nuisance.drift(&noise.steps(&unknowns, (t - last).seconds()));
         }
         for number in range {
             if excluded.get(number) == Some(&true)
@@ -186,7 +150,9 @@ pub(crate) fn reduce_with(
             slopes.clear();
             slopes.resize(rows.count * width, 0.0);
             columns(measurement, number, &rows, &mut slopes);
-            rows.whiten_with(&variances, &mut slopes, width);
+            let t = segment.instants[number].t;
+            noise.at(&unknowns, &variances, (segment.log, t), &mut own);
+            rows.whiten_with(&own, &mut slopes, width);
             for row in 0..rows.count {
                 line[..links].copy_from_slice(rows.a(row));
                 line[links..p].copy_from_slice(&slopes[row * width..][..width]);
@@ -216,7 +182,7 @@ pub(crate) struct Residuals {
     /// Per channel, per observation: the prediction by the first set without offsets and friction:
     /// of an F/T sensor's reading, or of a joint's torque.
     pub predicted: Vec<Vec<f64>>,
-    /// The corresponding measurement, minus the known structural vibration.
+    /// The corresponding measurement.
     pub measured: Vec<Vec<f64>>,
     /// Blocks of observations.
     pub ranges: Vec<Range<usize>>,
@@ -235,9 +201,9 @@ impl Residuals {
         self.measured[channel].iter().any(|x| x.is_finite())
     }
 
-    /// The drift of a channel's offset about its mean since the last offset jump, per block. Drifts
-    /// of several sensors that rows mix are shared as their noise is. (Otherwise the sensor with
-    /// the greatest assumed drift rate would get all of it.)
+    /// The drift of a channel's offset about its mean, per block. Drifts of several sensors that
+    /// rows mix are shared as their noise is. (Otherwise the sensor with the greatest assumed drift
+    /// rate would get all of it.)
     pub(crate) fn offset_drift(&self, unknowns: &Unknowns, set: usize, channel: usize) -> Vec<f64> {
         let mut sum = vec![0.0; self.nuisance.len()];
         for other in 0..6 * unknowns.sensors.len() {
@@ -246,18 +212,10 @@ impl Residuals {
                 continue;
             }
             let unknown = unknowns.offset_of(other);
-            let mut start = 0;
-            for end in 1..=self.nuisance.len() {
-                if end < self.nuisance.len() && self.nuisance[end].drift[unknown].is_finite() {
-                    continue;
-                }
-                let own = &self.nuisance[start..end];
-                let mean =
-                    own.iter().map(|block| block.x[(unknown, set)]).sum::<f64>() / own.len() as f64;
-                for (sum, block) in sum[start..end].iter_mut().zip(own) {
-                    *sum += share * (block.x[(unknown, set)] - mean);
-                }
-                start = end;
+            let values = self.nuisance.iter().map(|block| block.x[(unknown, set)]);
+            let mean = values.clone().sum::<f64>() / self.nuisance.len() as f64;
+            for (sum, value) in sum.iter_mut().zip(values) {
+                *sum += share * (value - mean);
             }
         }
         sum
@@ -271,14 +229,14 @@ pub(crate) fn filter_nuisance(
     segment: Segment<'_>,
     noise: &NoiseModel,
     sets: &[DVector<f64>],
-) -> (Vec<BlockRange>, Vec<Block>) {
+) -> (Vec<Range<usize>>, Vec<Block>) {
     let unknowns = measurement.unknowns().clone();
     let k = sets.len();
     let variances = noise.offset_tracking_variances();
     let mut nuisance = NuisanceFilter::new(&nuisance_prior(&unknowns), k);
     let make = || (measurement.clone(), Rows::new(&unknowns));
     let (mut states, mut last) = (Vec::new(), None);
-    let blocks = blocks(&unknowns, segment);
+    let blocks = blocks(segment.instants);
     for some in blocks.chunks(AT_ONCE * BLOCKS_PER_TASK) {
         // Per row: the residual of every set, and the coefficients of the nuisance parameters.
         let width = k + unknowns.nuisance();
@@ -287,13 +245,20 @@ pub(crate) fn filter_nuisance(
             shares.len(),
             make,
             |(measurement, rows), number| -> Vec<Vec<f64>> {
-                let of_block = |(range, _): &BlockRange| {
+                let mut own = Vec::new();
+                let of_block = |range: &Range<usize>| {
                     let mut lines = Vec::new();
                     for observation in &segment.instants[range.clone()] {
                         if measurement.make(observation, rows).is_err() {
                             continue;
                         }
-                        rows.whiten(&variances);
+                        noise.at(
+                            &unknowns,
+                            &variances,
+                            (segment.log, observation.t),
+                            &mut own,
+                        );
+                        rows.whiten(&own);
                         for row in 0..rows.count {
                             lines.extend(
                                 sets.iter()
@@ -307,15 +272,12 @@ pub(crate) fn filter_nuisance(
                 shares[number].iter().map(of_block).collect()
             },
         );
-        for ((range, jumped_sensors), mut lines) in some.iter().zip(lines.into_iter().flatten()) {
+        for (range, mut lines) in some.iter().zip(lines.into_iter().flatten()) {
             let t = segment.instants[range.start].t;
             let mut drift = vec![0.0; unknowns.nuisance()];
             if let Some(last) = last.replace(t) {
-                drift = advance(
-                    &mut nuisance,
-                    noise.steps(&unknowns, (t - last).seconds()),
-                    jumped_sensors,
-                );
+                drift = noise.steps(&unknowns, (t - last).seconds());
+                nuisance.drift(&drift);
             }
             for line in lines.chunks_exact_mut(width) {
                 let (values, g) = line.split_at_mut(k);
@@ -342,8 +304,7 @@ pub(crate) fn residuals(
     let (k, channels, count) = (sets.len(), unknowns.channels(), segment.instants.len());
     let variances = noise.offset_tracking_variances();
     let make = || (measurement.clone(), Rows::new(&unknowns));
-    let (blocks, mut states) = filter_nuisance(measurement, segment, noise, sets);
-    let ranges: Vec<Range<usize>> = blocks.into_iter().map(|(range, _)| range).collect();
+    let (ranges, mut states) = filter_nuisance(measurement, segment, noise, sets);
     smooth(&mut states);
     let mut first = measurement.cad_of_unknowns();
     if let Some(set) = sets.first() {
@@ -442,11 +403,12 @@ pub(crate) mod tests {
     use crate::dataset::observation::Observation;
     use crate::measurement::noise_estimate::estimate_noise;
     use crate::measurement::noise_model::DriftLimits;
+    use crate::measurement::noise_model::Seconds;
     use crate::robot::{IdentificationInput, Robot};
     use nalgebra::{Matrix6, Vector6};
     use proprio_dynamics::model::{MeasurementDirection, MeasurementFrame, Model};
     use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
-    use proprio_dynamics::{ContactKind, ContactSpec, FrameMotion, Noise, SensorCut, SensorSet};
+    use proprio_dynamics::{ContactKind, ContactSpec, FrameMotion, Noise, SensorCut};
     use proprio_topics::{Nanos, Reason};
 
     /// The iteration ends when the model stays, or returns to an earlier one; then with the
@@ -459,6 +421,7 @@ pub(crate) mod tests {
             block: vec![1e-3; 2],
             drift: squares.map(|x| 0.01 * x).to_vec(),
             least: vec![1e-9; 2],
+            seconds: Seconds::default(),
         };
         let far = [[9.0, 9.0], [5.0, 7.0]].map(noise);
         let of = |rounds: &[[f64; 2]]| {
@@ -579,7 +542,6 @@ pub(crate) mod tests {
                     faults: vec![Reason::None; robot.channels.len()],
                     base_fault: Reason::None,
                     temperatures: Vec::new(),
-                    outliers: SensorSet::default(),
                 })
             })
             .collect();
@@ -631,7 +593,7 @@ pub(crate) mod tests {
         let mut noise = NoiseModel::unknown(least.clone());
         let segment = Segment {
             instants,
-            offset_jumps: &[],
+            log: None,
         };
         let zero = DVector::zeros(unknowns.parameters());
         let walks = DriftLimits {

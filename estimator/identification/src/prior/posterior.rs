@@ -5,7 +5,7 @@ mod newton;
 
 use crate::prior::posterior::newton::{Chart, Descent, Newton, State, block};
 use nalgebra::linalg::Cholesky;
-use nalgebra::{DMatrix, DVector, Dyn, Matrix4, Vector4};
+use nalgebra::{DMatrix, DVector, Dyn, Matrix4};
 
 use crate::linear::blocked;
 use crate::prior::{
@@ -27,7 +27,7 @@ const OUTSIDE: f64 = 0.9;
 
 /// Squared Newton decrement, relative to the weight, at which one weight on the central path is
 /// accurate enough for the next.
-pub(crate) const CENTRED: f64 = 0.1;
+const CENTRED: f64 = 0.1;
 
 /// Data and the prior of their links, for fits with any weight.
 #[derive(Clone, Debug)]
@@ -160,11 +160,6 @@ impl Posterior {
         self.data.nrows()
     }
 
-    /// The residual square sum of the data alone, without prior and physical consistency.
-    pub fn residual_square(&self) -> f64 {
-        self.residual_square
-    }
-
     /// The most probable bodies and extra parameters for this weight.
     ///
     /// # Errors
@@ -236,32 +231,6 @@ impl Posterior {
             }
         }
         Ok(fit)
-    }
-
-    /// `1 + U` of every link without the constraints of physical consistency: the minimum with the
-    /// quadratic form of `D` for weight `tau = 1`.
-    pub(crate) fn unbounded(&self) -> Result<Vec<Matrix4<f64>>, PriorError> {
-        let chart = &self.chart;
-        let mut hessian = &chart.v_transposed * &chart.v * 0.5;
-        for (index, scale) in chart.scale.iter().enumerate() {
-            hessian[(index, index)] += scale * scale;
-        }
-        let factor = Cholesky::new(hessian).ok_or(PriorError::Undetermined)?;
-        let u = chart.coordinates(&factor.solve(&chart.scale.component_mul(&chart.right)));
-        Ok((0..self.centres.len())
-            .map(|link| Matrix4::identity() + block(&u, link))
-            .collect())
-    }
-
-    /// The plane of a direction `v` of a link's coordinates: `[a; b]` of the function `a . r + b`
-    /// of the point `r` [m] in link axes whose square, integrated over the body's mass, is `v^T (1
-    /// + U) v`.
-    pub(crate) fn plane(&self, position: usize, direction: &Vector4<f64>) -> Vector4<f64> {
-        let inverse = self.centres[position]
-            .root
-            .try_inverse()
-            .unwrap_or_default();
-        inverse.transpose() * direction
     }
 
     pub(crate) fn start(&self) -> State {
@@ -442,15 +411,8 @@ impl Posterior {
         let mut x = DVector::zeros(u.len());
         let mut bodies = Vec::with_capacity(links);
         let mut divergence_sum = 0.0;
-        let mut inverses = Vec::with_capacity(links);
         for (link, centre) in self.centres.iter().enumerate() {
             let l = &chart.stretch[link];
-            // From the factors, which resolve bodies much thinner than U does.
-            let local = (Matrix4::identity() + block(&u, link)).cholesky();
-            let root = local
-                .and_then(|local| (l * local.l()).try_inverse())
-                .unwrap_or_default();
-            inverses.push(root.transpose() * root);
             // U relative to CAD, not 1 + U: a small one keeps its digits.
             let mut relative =
                 l * block(&u, link) * l.transpose() + (l * l.transpose() - Matrix4::identity());
@@ -501,7 +463,6 @@ impl Posterior {
             iterations: descent.iterations,
             is_converged: descent.is_converged,
             decrement: descent.decrement,
-            inverses,
             maps,
             expected: self.expected,
             units: self.extra.iter().map(|&(unit, _)| unit).collect(),
@@ -537,8 +498,6 @@ pub struct Fit {
     pub is_converged: bool,
     /// Square of the last Newton decrement.
     pub(crate) decrement: f64,
-    /// `(1 + U)^-1`, relative to CAD: the multipliers of the constraints, over the prior's weight.
-    pub(crate) inverses: Vec<Matrix4<f64>>,
     /// `u -> phi` and back, for each link.
     maps: Vec<(Matrix10, Matrix10)>,
     /// The prior of `tau`.

@@ -4,13 +4,11 @@
 use crate::finding::{Finding, FindingCode, Severity};
 use crate::fit::{Identified, per_column};
 use crate::measurement::model::MeasurementModel;
-use crate::prior::feasibility;
 use crate::report::calibration::{calibrations, channels};
 use crate::report::log::log_outcome;
 use crate::report::outcome::both;
 use crate::report::outcome::{
-    Consistency, CovarianceRoot, LogOutcome, ModelComparison, Outcome, Predicted, TimeOffset,
-    Verdict, WeakDirection,
+    CovarianceRoot, LogOutcome, Outcome, Predicted, TimeOffset, Verdict, WeakDirection,
 };
 use crate::report::prediction::{self, Candidate};
 use crate::report::uncertainty::{
@@ -24,11 +22,6 @@ use proprio_topics::Nanos;
 
 /// The outcome without identified parameters: CAD's, and the reason.
 pub(crate) fn nothing(robot: &Robot, logs: &[TrainingLog], reason: String) -> Outcome {
-    let nan = ModelComparison {
-        cad: f64::NAN,
-        cad_fitted: f64::NAN,
-        identified: f64::NAN,
-    };
     let logs = logs.iter().map(|log| LogOutcome {
         file: log.file.clone(),
         role: log.role,
@@ -41,15 +34,13 @@ pub(crate) fn nothing(robot: &Robot, logs: &[TrainingLog], reason: String) -> Ou
             relative_error_with_drift: both([f64::NAN; 2]),
             ..Predicted::default()
         },
-        fitted_error: nan,
         joints: Vec::new(),
         sensors: Vec::new(),
         two_route: Vec::new(),
         offsets: Vec::new(),
         friction: Vec::new(),
-        findings: log.all_findings(),
+        findings: log.findings.clone(),
         curves: Vec::new(),
-        spectra: Vec::new(),
     });
     Outcome {
         robot: robot.name.clone(),
@@ -80,12 +71,6 @@ pub(crate) fn nothing(robot: &Robot, logs: &[TrainingLog], reason: String) -> Ou
         base_parameters: Vec::new(),
         channels: Vec::new(),
         time_offsets: Vec::new(),
-        consistency: Consistency {
-            feasible: None,
-            deviations: 0.0,
-            links: Vec::new(),
-            text: "nothing was identified: the parameters are CAD's".into(),
-        },
         logs: logs.collect(),
         findings: vec![Finding {
             severity: Severity::Refusal,
@@ -173,19 +158,6 @@ pub(crate) fn outcome(
     } = diagnosis;
     findings.extend(encoder_offsets);
     findings.extend(delays);
-    let consistency = consistency(robot, identified);
-    if consistency.feasible != Some(true) {
-        findings.push(Finding {
-            severity: Severity::Warning,
-            code: if consistency.feasible.is_none() {
-                FindingCode::FeasibilityUndecided
-            } else {
-                FindingCode::NotPhysical
-            },
-            subject: consistency.links.join(", "),
-            text: consistency.text.clone(),
-        });
-    }
     findings.extend(identified.findings.iter().cloned());
     let (calibrations, calibration_findings) = calibrations(robot, measurement, identified, &root);
     findings.extend(calibration_findings);
@@ -228,44 +200,8 @@ pub(crate) fn outcome(
         base_parameters,
         channels: channels(robot, identified, training),
         time_offsets,
-        consistency,
         logs,
         findings,
-    }
-}
-
-/// Physical consistency of the parameters that the data determine.
-fn consistency(robot: &Robot, identified: &Identified) -> Consistency {
-    let (r, z) = identified.information.to_triangle();
-    match feasibility::nearest(
-        &identified.prior,
-        &identified.unknowns.links,
-        &r,
-        &z,
-        &identified.unknowns.precision,
-    ) {
-        Ok(nearest) => Consistency {
-            feasible: match &nearest.verdict {
-                feasibility::Verdict::Feasible => Some(true),
-                feasibility::Verdict::Infeasible(_) => Some(false),
-                feasibility::Verdict::Undecided => None,
-            },
-            deviations: nearest.deviations(),
-            links: match &nearest.verdict {
-                feasibility::Verdict::Infeasible(violations) => violations
-                    .iter()
-                    .map(|v| robot.model.link_name(v.link).to_owned())
-                    .collect(),
-                _ => Vec::new(),
-            },
-            text: nearest.describe(|link| robot.model.link_name(link)),
-        },
-        Err(e) => Consistency {
-            feasible: None,
-            deviations: f64::NAN,
-            links: Vec::new(),
-            text: e.to_string(),
-        },
     }
 }
 

@@ -12,12 +12,12 @@ use crate::measurement::unknowns::{FRICTION, Unknowns, friction_row};
 use crate::report::comparison::{
     Compared, STILL, TorqueSeries, cases, configured_nuisance, covered, three,
 };
+use crate::report::curves::{EDGE, Places, RAW_RATE, curves, mean};
 use crate::report::outcome::{
     FrictionOutcome, JointOutcome, LogOutcome, OffsetOutcome, Predicted, SensorOutcome,
     TwoRouteOutcome, both,
 };
 use crate::report::prediction::{Candidate, PredictionError};
-use crate::report::spectra::{EDGE, Places, RAW_RATE, curves, mean, spectra};
 use crate::robot::{AXES, Robot};
 use crate::training::{MIN_FOLD, TrainingLog};
 use nalgebra::{DMatrix, DVector};
@@ -65,7 +65,7 @@ pub(crate) fn log_outcome(
         measurement,
         Segment {
             instants,
-            offset_jumps: &log.offset_jumps,
+            log: None,
         },
         &identified.noise,
         sets,
@@ -169,7 +169,6 @@ pub(crate) fn log_outcome(
 
     let mut sensors = Vec::new();
     let mut findings = Vec::new();
-    let mut wrench_share = Vec::new();
     for (place, &sensor) in unknowns.sensors.iter().enumerate() {
         let name = sensor_name(robot, sensor);
         let mut values = [[f64::NAN; 6]; 3];
@@ -186,22 +185,6 @@ pub(crate) fn log_outcome(
             for (value, errors) in values.iter_mut().zip(errors) {
                 value[axis] = rms(errors.iter().copied());
             }
-            let scale = if axis < 3 {
-                Structure::LENGTH_SCALE
-            } else {
-                1.0
-            };
-            let load = &compared.load[channel];
-            let (centre, raw_mean) = (mean(load), mean(errors[0]));
-            let errors: Vec<Vec<f64>> = (errors.iter().zip([raw_mean, 0.0, 0.0]))
-                .map(|(errors, mean)| errors.iter().map(|x| (x - mean) * scale).collect())
-                .collect();
-            wrench_share.push((
-                errors,
-                load.iter()
-                    .map(|x| (x - centre) * scale)
-                    .collect::<Vec<_>>(),
-            ));
         }
         sensors.push(SensorOutcome {
             name,
@@ -209,16 +192,10 @@ pub(crate) fn log_outcome(
             coverage: std::array::from_fn(|axis| coverage[channel_of(place, axis)]),
         });
     }
-    let is_of_torque = !torque_share.is_empty();
-    let share = if is_of_torque {
-        &torque_share
-    } else {
-        &wrench_share
-    };
-    let relative = |which: usize| {
+    let relative = |set: usize| {
         let (mut above, mut below) = (0.0, 0.0);
-        for (errors, measured) in share {
-            for (e, m) in errors[which].iter().zip(measured) {
+        for (errors, measured) in &torque_share {
+            for (e, m) in errors[set].iter().zip(measured) {
                 if e.is_finite() && m.is_finite() {
                     above += e * e;
                     below += m * m;
@@ -239,10 +216,10 @@ pub(crate) fn log_outcome(
         |prediction_error| prediction_error.predicted(unknowns, candidates),
     );
     predicted.joints = torques_predicted;
-    if is_of_torque {
+    if !torque_share.is_empty() {
         predicted.relative_error = both([3, 4].map(relative));
     }
-    let deviations = nuisance_deviations(measurement, log, instants, identified, root);
+    let deviations = nuisance_deviations(measurement, instants, identified, root);
     LogOutcome {
         file: log.file.clone(),
         role: log.role,
@@ -251,13 +228,12 @@ pub(crate) fn log_outcome(
         excluded: log.excluded.clone(),
         onset: onset(instants),
         predicted,
-        fitted_error: three([0, 1, 2].map(relative)),
         joints,
         sensors,
         two_route: two_route(measurement, instants, &residuals, sets),
-        offsets: offsets(robot, unknowns, log, identified, &residuals, &deviations),
+        offsets: offsets(robot, unknowns, identified, &residuals, &deviations),
         friction: friction(robot, unknowns, &residuals, &deviations),
-        findings: log.all_findings().into_iter().chain(findings).collect(),
+        findings: log.findings.iter().cloned().chain(findings).collect(),
         curves: curves(
             measurement,
             instants,
@@ -267,7 +243,6 @@ pub(crate) fn log_outcome(
             root,
             &torque_series,
         ),
-        spectra: spectra(robot, unknowns, places.as_ref(), &residuals),
     }
 }
 
@@ -288,7 +263,7 @@ pub(crate) fn undisturbed(
     }
     let segment = Segment {
         instants: &instants,
-        offset_jumps: &log.offset_jumps,
+        log: None,
     };
     let residuals = residuals(measurement, segment, &identified.noise, sets);
     Some(Compared::new(
@@ -455,7 +430,6 @@ pub(crate) fn two_route(
 /// known parameters, and the contribution of the parameters' covariance.
 pub(crate) fn nuisance_deviations(
     measurement: &mut MeasurementModel<'_>,
-    log: &TrainingLog,
     instants: &[Annotated],
     identified: &Identified,
     root: &DMatrix<f64>,
@@ -466,7 +440,7 @@ pub(crate) fn nuisance_deviations(
         instants: &instants[instants
             .len()
             .saturating_sub(crate::training::SEGMENT_INSTANTS)..],
-        offset_jumps: &log.offset_jumps,
+        log: None,
     };
     let reduced = reduce(measurement, segment, &identified.noise);
     let moved = &reduced.slope * root;
@@ -479,7 +453,6 @@ pub(crate) fn nuisance_deviations(
 pub(crate) fn offsets(
     robot: &Robot,
     unknowns: &Unknowns,
-    log: &TrainingLog,
     identified: &Identified,
     residuals: &Residuals,
     deviations: &[f64],
@@ -501,12 +474,6 @@ pub(crate) fn offsets(
             end: of(place, &|channel| last.x[(channel, 1)]),
             deviation: of(place, &|channel| deviations[channel]),
             rate: of(place, &|channel| identified.noise.drift[channel].sqrt()),
-            offset_jumps: log
-                .offset_jumps
-                .iter()
-                .filter(|b| b.sensor == sensor)
-                .map(|b| b.t)
-                .collect(),
         })
         .collect()
 }

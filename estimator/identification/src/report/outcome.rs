@@ -185,20 +185,6 @@ pub struct ChannelNoise {
     pub drift: f64,
 }
 
-/// Physical consistency: whether rigid bodies exist with the parameters that the data determine.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Consistency {
-    /// Whether they exist, within the uncertainty of the data; none if that was not decided.
-    pub feasible: Option<bool>,
-    /// Distance of the data from the nearest consistent parameters, in standard deviations (0:
-    /// none).
-    pub deviations: f64,
-    /// Names of links at the limit of physical consistency.
-    pub links: Vec<String>,
-    /// In words.
-    pub text: String,
-}
-
 /// Calibration of one F/T sensor, the robot's: the same in all logs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CalibrationOutcome {
@@ -234,8 +220,6 @@ pub struct OffsetOutcome {
     pub deviation: [f64; 6],
     /// Rate of its random walk [N, Nm per square root of second].
     pub rate: [f64; 6],
-    /// Times at which it was re-initialised because of an offset jump.
-    pub offset_jumps: Vec<Nanos>,
 }
 
 /// Friction of one joint through a log.
@@ -329,21 +313,6 @@ pub struct Curve {
     pub sigma: Vec<f64>,
 }
 
-/// Power spectrum of a channel's residual, one-sided.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Spectrum {
-    /// As in [`ChannelNoise::name`].
-    pub name: String,
-    /// The unit of the channel.
-    pub unit: &'static str,
-    /// Frequencies \[Hz\].
-    pub frequency: Vec<f64>,
-    /// Density with CAD fitted [`unit`^2/Hz].
-    pub cad_fitted: Vec<f64>,
-    /// Density with the identified parameters.
-    pub identified: Vec<f64>,
-}
-
 /// The result for one log.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LogOutcome {
@@ -361,14 +330,6 @@ pub struct LogOutcome {
     pub onset: Option<Nanos>,
     /// Prediction errors, by which the parameters are judged.
     pub predicted: Predicted,
-    /// Relative error with drifting offsets and friction fitted to the log; [`LogOutcome`]'s fields
-    /// `joints` and `sensors` give the parts.
-    ///
-    /// Joint torques: `|tau_hat - tau| / |tau|` over all joints and samples, edges cut. F/T
-    /// sensors: the same over all channels of all sensors, means removed, each force multiplied by
-    /// [`proprio_dynamics::Structure::LENGTH_SCALE`]; of the reading with the fitted offset
-    /// removed. NaN where there is nothing to compare.
-    pub fitted_error: ModelComparison<f64>,
     /// Per joint with a measured torque.
     pub joints: Vec<JointOutcome>,
     /// Per F/T sensor of a contact-free sub-tree.
@@ -383,8 +344,6 @@ pub struct LogOutcome {
     pub findings: Vec<Finding>,
     /// For plots: measured joint torques, then F/T channels.
     pub curves: Vec<Curve>,
-    /// For plots: spectra of the residuals.
-    pub spectra: Vec<Spectrum>,
 }
 
 /// The result of identification from recorded logs.
@@ -432,8 +391,6 @@ pub struct Outcome {
     pub channels: Vec<ChannelNoise>,
     /// Time offsets of streams relative to the encoders: reported, not corrected.
     pub time_offsets: Vec<TimeOffset>,
-    /// Physical consistency of the parameters that the data determine.
-    pub consistency: Consistency,
     /// Per log, in the order given.
     pub logs: Vec<LogOutcome>,
     /// Findings that concern no single log: signs, frames, encoder offsets, inconsistent CAD links.

@@ -19,13 +19,6 @@ pub(crate) struct State {
     pub(crate) centred: Option<f64>,
 }
 
-impl State {
-    /// The excess of the data's square sum over its minimum.
-    pub(crate) fn excess(&self) -> f64 {
-        self.chart.excess(&self.y)
-    }
-}
-
 /// A Newton step, and the change of the cost along it.
 pub(crate) struct Newton {
     pub(crate) step: DVector<f64>,

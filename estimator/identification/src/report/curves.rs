@@ -1,18 +1,13 @@
-//! Curves and power spectra of readings and residuals, for a report.
+//! Curves of readings and predictions for a report, and the low-pass filter of raw torques.
 
 use crate::dataset::observation::Annotated;
 use crate::fit::Identified;
-use crate::measurement::channels::{channel_name, channel_of, sensor_name};
+use crate::measurement::channels::{channel_of, sensor_name};
 use crate::measurement::model::MeasurementModel;
-use crate::measurement::reduction::Residuals;
-use crate::measurement::unknowns::Unknowns;
 use crate::report::comparison::{Compared, TorqueSeries, predicted_deviations};
-use crate::report::outcome::{Curve, Spectrum};
-use crate::robot::{AXES, Robot};
+use crate::report::outcome::Curve;
+use crate::robot::AXES;
 use nalgebra::DMatrix;
-use rustfft::num_complex::Complex;
-use rustfft::{Fft, FftPlanner};
-use std::sync::Arc;
 
 /// Most points of a curve.
 pub(crate) const POINTS: usize = 2000;
@@ -30,9 +25,6 @@ pub(crate) const CUT_OFF: f64 = 5.0;
 
 /// Longest gap that is interpolated \[s\]: it has no effect below [`CUT_OFF`].
 pub(crate) const INTERPOLATED: f64 = 0.02;
-
-/// Samples of a spectrum's window.
-pub(crate) const SPECTRUM: usize = 256;
 
 pub(crate) fn mean(values: &[f64]) -> f64 {
     let finite = values.iter().filter(|x| x.is_finite());
@@ -110,77 +102,8 @@ pub(crate) fn curves(
     out
 }
 
-/// Power spectra of the residuals: means over segments of 256 instants that overlap by half, each
-/// with a Hann window (Welch 1967).
-pub(crate) fn spectra(
-    robot: &Robot,
-    unknowns: &Unknowns,
-    places: Option<&Places>,
-    residuals: &Residuals,
-) -> Vec<Spectrum> {
-    let Some(places) = places.filter(|places| places.at.len() >= SPECTRUM) else {
-        return Vec::new();
-    };
-    let (rate, welch) = (places.rate, Welch::new());
-    let density = |values: &[f64]| welch.density(&places.spread(values), rate);
-    (0..unknowns.channels())
-        .map(|channel| (channel, channel_name(robot, unknowns, channel)))
-        .map(|(channel, (name, unit))| Spectrum {
-            name,
-            unit,
-            frequency: (1..=SPECTRUM / 2)
-                .map(|k| k as f64 * rate / SPECTRUM as f64)
-                .collect(),
-            cad_fitted: density(&residuals.noise[0][channel]),
-            identified: density(&residuals.noise[1][channel]),
-        })
-        .collect()
-}
-
-/// Power spectral densities as means over Hann windows of [`SPECTRUM`] samples that overlap by half
-/// (Welch 1967).
-pub(crate) struct Welch {
-    pub(crate) window: Vec<f64>,
-    pub(crate) transform: Arc<dyn Fft<f64>>,
-}
-
-impl Welch {
-    pub(crate) fn new() -> Self {
-        let turn = std::f64::consts::PI / SPECTRUM as f64;
-        Self {
-            window: (0..SPECTRUM)
-                .map(|i| (turn * (i as f64 + 0.5)).sin().powi(2))
-                .collect(),
-            transform: FftPlanner::new().plan_fft_forward(SPECTRUM),
-        }
-    }
-
-    /// One-sided density \[unit^2/Hz\] of a series with `rate` samples per second, at the multiples
-    /// 1 to [`SPECTRUM`] / 2 of `rate / SPECTRUM`. Windows with a missing sample are omitted; NaN
-    /// if no window is complete.
-    pub(crate) fn density(&self, series: &[f64], rate: f64) -> Vec<f64> {
-        let power: f64 = self.window.iter().map(|w| w * w).sum();
-        let (mut sums, mut segments) = (vec![0.0; SPECTRUM / 2], 0.0);
-        let mut values = vec![Complex::default(); SPECTRUM];
-        for segment in series.windows(SPECTRUM).step_by(SPECTRUM / 2) {
-            if segment.iter().any(|x| !x.is_finite()) {
-                continue;
-            }
-            segments += 1.0;
-            for ((value, x), w) in values.iter_mut().zip(segment).zip(&self.window) {
-                *value = Complex::from(x * w);
-            }
-            self.transform.process(&mut values);
-            for (sum, value) in sums.iter_mut().zip(&values[1..]) {
-                *sum += 2.0 * value.norm_sqr() / (power * rate);
-            }
-        }
-        sums.iter().map(|sum| sum / segments).collect()
-    }
-}
-
-/// Places of a log's instants on an equally spaced time grid: filters and spectra must take gaps of
-/// the log into account.
+/// Places of a log's instants on an equally spaced time grid: filters must take gaps of the log
+/// into account.
 pub(crate) struct Places {
     pub(crate) at: Vec<usize>,
     /// \[Hz\].
@@ -311,54 +234,6 @@ pub(crate) fn zero_phase(values: &[f64], rate: f64) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// Its integral is the variance (Parseval), it is flat for white noise, and a sine appears at
-    /// its frequency.
-    #[test]
-    fn a_spectrum_integrates_to_the_variance() {
-        let rate = 100.0;
-        let wave = |i: usize| 2.0 * (2.0 * std::f64::consts::PI * 12.5 * i as f64 / rate).sin();
-        let mut series: Vec<f64> = crate::arithmetic::normals(3, 50_000);
-        series
-            .iter_mut()
-            .enumerate()
-            .for_each(|(i, x)| *x += wave(i));
-        series[7000] = f64::NAN;
-        let density = Welch::new().density(&series, rate);
-        let step = rate / SPECTRUM as f64;
-        // The window spreads the sine's power over two neighbours.
-        let peak = (12.5 / step) as usize - 1;
-        let share: f64 = density[peak - 2..=peak + 2].iter().sum::<f64>() * step;
-        assert!((share - 2.04).abs() < 0.03, "{share}");
-        let rest = density[..peak - 2].iter().chain(&density[peak + 3..]);
-        assert!(
-            rest.clone().all(|x| (x / 0.02 - 1.0).abs() < 0.35),
-            "{density:?}"
-        );
-        assert!((rest.sum::<f64>() * step - 0.96).abs() < 0.05);
-    }
-
-    /// A log with gaps, with stamps rounded to a millisecond: a sine appears at its frequency and
-    /// is as narrow as without gaps.
-    #[test]
-    fn a_spectrum_accounts_for_gaps() {
-        let period = 0.0103;
-        let bursts = (0..20_000).filter(|i| i % 1000 < 350);
-        let times: Vec<f64> = bursts
-            .map(|i| (1e3 * period * f64::from(i)).round() / 1e3)
-            .collect();
-        let places = Places::new(&times).expect("a period");
-        assert!((places.rate * period - 1.0).abs() < 1e-3, "{}", places.rate);
-        let wave = |t: &f64| (std::f64::consts::TAU * 12.5 * t).sin();
-        let values: Vec<f64> = times.iter().map(wave).collect();
-        let density = Welch::new().density(&places.spread(&values), places.rate);
-        let step = places.rate / SPECTRUM as f64;
-        let peak = (12.5 / step).round() as usize - 1;
-        let share: f64 = density[peak - 2..=peak + 2].iter().sum::<f64>() * step;
-        assert!((share - 0.5).abs() < 0.02, "{share}");
-        let all: f64 = density.iter().sum::<f64>() * step;
-        assert!((all - 0.5).abs() < 0.02, "{all}");
-    }
 
     /// A gap of days takes as little memory as one of a second, and is still a gap.
     #[test]
