@@ -572,7 +572,7 @@ fn derivatives_that_are_noise_are_not_used() {
         row.push(if row[0].is_nan() { f64::NAN } else { given });
     }
     let instants = table.dataset(&robot);
-    let [Defect::NoisyDerivative { joint, given, off }] = &instants.defects()[..] else {
+    let [Defect::NoisyDerivative { joint, given, off }] = instants.defects() else {
         panic!("{:?}", instants.defects());
     };
     assert_eq!((joint.as_str(), *given), ("elbow", "acceleration"));
