@@ -10,8 +10,20 @@ use proprio_estimator::config::ConfigError;
 use proprio_estimator::export;
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::setup::{Setup, frame};
-use proprio_identification::{Options, Payload, Role, Severity, Verdict, identify, payload};
+use proprio_identification::{
+    Dataset, Options, Payload, Role, Severity, Verdict, identify, payload,
+};
 use std::path::{Path, PathBuf};
+
+/// The components of a tensor of inertia, the diagonal first.
+const COMPONENTS: [(&str, (usize, usize)); 6] = [
+    ("xx", (0, 0)),
+    ("yy", (1, 1)),
+    ("zz", (2, 2)),
+    ("xy", (0, 1)),
+    ("xz", (0, 2)),
+    ("yz", (1, 2)),
+];
 
 /// Identifies a payload, and prints it.
 pub(super) fn run(
@@ -43,7 +55,7 @@ pub(super) fn run(
 
     setup.robot = setup.robot_as_identified();
     let known = export::known(&parameters, &setup.robot);
-    let datasets = datasets(samples, Role::Train, config_file, &setup)?;
+    let datasets = datasets(samples, config_file, &setup)?;
     let found = payload(&setup.robot, &known, &frame, datasets, &options)?;
     for finding in found
         .findings
@@ -86,7 +98,7 @@ fn without_payload(
             bail!("the reference is one file of parameters, or tables of samples, not both")
         }
         logs => {
-            let datasets = datasets(logs, Role::Train, config, setup)?;
+            let datasets = datasets(logs, config, setup)?;
             let outcome = identify(&setup.robot, datasets, options, &mut |_| ())?;
             // Without better parameters, the CAD's are known as well as CAD's are.
             let advice = Advice::of(&outcome);
@@ -104,13 +116,8 @@ fn load(file: &Path) -> anyhow::Result<Parameters> {
 }
 
 /// Reads logs.
-fn datasets(
-    files: &[PathBuf],
-    role: Role,
-    config: &Path,
-    setup: &Setup,
-) -> anyhow::Result<Vec<proprio_identification::Dataset>> {
-    let files: Vec<(&PathBuf, Role)> = files.iter().map(|file| (file, role)).collect();
+fn datasets(files: &[PathBuf], config: &Path, setup: &Setup) -> anyhow::Result<Vec<Dataset>> {
+    let files: Vec<(&PathBuf, Role)> = files.iter().map(|file| (file, Role::Train)).collect();
     let names = names(&files);
     let all = files.iter().zip(names).map(|((file, role), name)| {
         let mut table = open(file, config, setup)?;
@@ -122,7 +129,7 @@ fn datasets(
 fn json(name: &str, found: &Payload) -> serde_json::Value {
     let (mass, mass_std) = found.mass();
     let ((centre, centre_std), (tensor, tensor_std)) = (found.centre(), found.about_centre());
-    let six = |m: &Mat3| [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)].map(|place| m[place]);
+    let six = |m: &Mat3| COMPONENTS.map(|(_, place)| m[place]);
     let told = |value: serde_json::Value| {
         if found.is_significant() {
             value
@@ -156,15 +163,7 @@ fn print(name: &str, found: &Payload) {
     for (axis, label) in ["x", "y", "z"].into_iter().enumerate() {
         print_line!("  {label}  {:+.4} +- {:.4}", centre[axis], centre_std[axis]);
     }
-    for (row, column, label) in [
-        (0, 0, "xx"),
-        (1, 1, "yy"),
-        (2, 2, "zz"),
-        (0, 1, "xy"),
-        (0, 2, "xz"),
-        (1, 2, "yz"),
-    ] {
-        let place = (row, column);
+    for (label, place) in COMPONENTS {
         print_line!(
             "  {label} {:+.5} +- {:.5}",
             tensor[place],

@@ -22,7 +22,7 @@ use crate::training::training_logs;
 use nalgebra::{DMatrix, SMatrix, SVector};
 use proprio_dynamics::model::Frame;
 use proprio_dynamics::regressor::LINK_PARAMETERS;
-use proprio_dynamics::spatial::{Mat3, RigidInertia, Vec3};
+use proprio_dynamics::spatial::{Mat3, Pose, RigidInertia, Vec3};
 use std::ops::ControlFlow;
 
 /// Standard deviation of a payload's mass \[kg\] and its size \[m\], before any data.
@@ -109,13 +109,8 @@ pub fn payload(
     let tau = estimate.fit.tau.max(estimate.prior.expected_tau());
     all.add_prior(&estimate.prior, unknowns, tau, &is_known);
     let precision = precision(known, &unknowns.links).ok_or(PayloadError::Singular)?;
-    for (i, mut column) in all.matrix.column_iter_mut().enumerate() {
-        for (j, value) in column.iter_mut().enumerate() {
-            if i < precision.ncols() && j < precision.ncols() {
-                *value += precision[(j, i)];
-            }
-        }
-    }
+    let mut of_links = all.matrix.view_mut((0, 0), precision.shape());
+    of_links += &precision;
     let factor = all.matrix.cholesky().ok_or(PayloadError::Singular)?;
     let x = factor.solve(&all.right);
     let prior = Square::from_diagonal(&SVector::from_fn(|i, _| match i {
@@ -231,9 +226,11 @@ impl Payload {
     #[must_use]
     pub fn about_centre(&self) -> (Mat3, Mat3) {
         let of = |inertia: RigidInertia| {
-            let c = inertia.first_moment / inertia.mass;
-            let shift = Mat3::from_diagonal_element(c.dot(&c)) - c * c.transpose();
-            let tensor = inertia.inertia - shift * inertia.mass;
+            let to_centre = Pose {
+                rotation: Mat3::identity(),
+                translation: -inertia.first_moment / inertia.mass,
+            };
+            let tensor = inertia.transformed(&to_centre).inertia;
             std::array::from_fn(|i| tensor[i])
         };
         let (value, deviation) = self.function::<9>(&of);
