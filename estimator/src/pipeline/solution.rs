@@ -3,10 +3,10 @@
 
 use super::Pipeline;
 use super::motion::OperatingPoint;
-use super::residuals::{self, SubtreeResidual};
+use super::residuals;
 use crate::pipeline::validity::ValidityCheck;
 use proprio_dynamics::spatial::Pose;
-use proprio_dynamics::{Certainty, ContactSet, FrameMotion, JointState};
+use proprio_dynamics::{Certainty, ContactSet, Dependence, DofSet, FrameMotion, JointState};
 use proprio_identification::robot::ChannelRole;
 use proprio_topics::{ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Nanos, Reason, Residual};
 
@@ -168,40 +168,19 @@ impl Pipeline {
                 _ => None,
             }
         };
-        let is_any_disturbed = self.residuals.subtrees().any(SubtreeResidual::is_disturbed);
-        let is_disturbed = |link: &usize| {
-            let own = structure.subtree_of(*link).and_then(residual);
-            own.is_some_and(SubtreeResidual::is_disturbed)
-        };
-        let joints = self.setup.robot.model.joints();
-        let is_beyond = |mut link: usize, dof: usize| {
-            while let Some(joint) = link.checked_sub(1).and_then(|joint| joints.get(joint)) {
-                if joint.dof == Some(dof) {
-                    return true;
-                }
-                link = joint.parent;
-            }
-            false
-        };
         // An encoder that stands before a residual may be stuck: then no contact explains it.
-        let stuck = |dof: usize| {
-            if !is_any_disturbed {
-                return None;
-            }
-            let own = structure.moved_by(dof);
-            let channels = &self.setup.robot.channels;
-            channels
-                .iter()
-                .zip(&self.sanity)
-                .position(|(channel, sanity)| {
-                    let ChannelRole::Joint(other) = channel.role else {
-                        return false;
-                    };
-                    let is_before = |link: &usize| is_beyond(*link, other);
-                    sanity.is_still()
-                        && (1..=joints.len()).any(|link| is_before(&link) && is_disturbed(&link))
-                        && own.iter().any(is_before)
-                })
+        let channels = &self.setup.robot.channels;
+        let balances = self.residuals.subtrees().zip(&self.dependences.subtrees);
+        let balances = balances.filter(|(residual, _)| residual.is_disturbed());
+        let before = balances.fold(DofSet::EMPTY, |all, (_, own)| all.union(&own.dofs));
+        let stuck = |dependence: &Dependence| {
+            let mut encoders = channels.iter().zip(&self.sanity);
+            encoders.position(|(channel, sanity)| match channel.role {
+                ChannelRole::Joint(dof) => {
+                    before.contains(dof) && dependence.dofs.contains(dof) && sanity.is_still()
+                }
+                _ => false,
+            })
         };
         let moved = |dof: usize| structure.moved_by(dof).iter().copied();
         let identification = self.identification.as_ref();
@@ -240,7 +219,7 @@ impl Pipeline {
                 reason = moved(dof).find_map(doubted).unwrap_or_default();
             }
             if reason == Reason::None
-                && let Some(channel) = stuck(dof)
+                && let Some(channel) = stuck(dependence)
             {
                 let number = u32::try_from(channel).unwrap_or(NO_CAUSE);
                 (reason, cause) = (Reason::Frozen, number);
