@@ -7,7 +7,6 @@ use proprio_tests::truth::{Outcome, Run, TROUBLES};
 const OPEN: &[&str] = &[
     "push where no contact is",
     "payload taken",
-    "gravity 20 deg off",
     "F/T gain 8 % off",
     "F/T late 100 ms",
     "F/T saturated",
@@ -17,7 +16,6 @@ const OPEN: &[&str] = &[
     "encoder in degrees",
     "encoder gear 20 % off",
     "encoder drifts",
-    "IMU turned 5 deg",
 ];
 
 /// The runs of `name` with these seeds; a robot without such a channel has none.
@@ -80,6 +78,26 @@ fn what_is_off_is_named() {
         (share("stale:l0_j1") - 10.0 / 45.0).abs() < 0.01,
         "{outcome:#?}"
     );
+}
+
+/// An encoder before the sensor turns what every joint before it carries: no torque that depends on
+/// it is valid while it is stuck, also of the joints before it.
+#[test]
+fn a_stuck_encoder_withholds_what_depends_on_it() {
+    for (seed, outcome) in runs("encoder stuck", 1..5) {
+        assert!(!outcome.is_broken(), "seed {seed}: {outcome:#?}");
+    }
+}
+
+/// An error of the gear is estimated, and named where it matters.
+#[test]
+fn a_wrong_gear_is_named() {
+    let all = runs("encoder gear 20 % off", 2..6);
+    let is_named = |(_, outcome): &&(u64, Outcome)| outcome.named() > 0.5;
+    assert!(all.iter().filter(is_named).count() >= 2, "{all:#?}");
+    for (seed, outcome) in all {
+        assert!(!outcome.is_broken(), "seed {seed}: {outcome:#?}");
+    }
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Hypotheses about what may be other than stated: an encoder reversed, a sensor turned, a contact
+//! Hypotheses about what may be other than stated: an encoder reversed, a sensor shifted, a contact
 //! that has been there since the start. Their evidence says which of them the readings refute.
 //!
 //! ```text
@@ -33,10 +33,10 @@ mod unit;
 
 pub use hypothesis::{Hypothesis, Sight, View};
 
-use crate::online::solution::{Doubt, OnlineError, Solution};
+use crate::online::solution::{Change, Doubt, OnlineError, Solution};
 use crate::prior::cad_root;
 use crate::robot::BaseMotion;
-use evidence::{Columns, Posterior, Rows, dot};
+use evidence::{Columns, Fit, Posterior, Rows, SMALL, dot};
 use hypothesis::Motion;
 use proprio_dynamics::model::Model;
 use proprio_dynamics::regressor::{EstimateRows, LINK_PARAMETERS, StackedRegressor, Weighting};
@@ -44,7 +44,7 @@ use proprio_dynamics::spatial::{RigidInertia, Wrench};
 use proprio_dynamics::{ContactSet, FrameMotion, JointState, Kinematics, Solver, Structure};
 use proprio_topics::Nanos;
 use std::collections::VecDeque;
-use unit::Unit;
+use unit::{CONTACT, Unit};
 
 /// Deviations within which the torque of a hypothesis lies that is not refuted. At four, the
 /// promise, almost half of the room remains for the uncertainty of that torque itself.
@@ -56,6 +56,8 @@ const APART: usize = 5;
 const SHOWN: usize = 20;
 /// Ticks that wait for the gate, at most: those of 3 s.
 const MOST_WAITING: usize = 30;
+/// Iterations in which the noise of other offsets, or of a contact, converges.
+const NOISE_ITERATIONS: usize = 10;
 /// Period of the ticks.
 pub(crate) const TICK: Nanos = Nanos::from_millis(100);
 
@@ -127,6 +129,8 @@ pub(crate) struct Bank {
     /// The stated variances of each sensor's channels, [torque; force].
     variances: Vec<[f64; 6]>,
     waiting: Vec<Tick>,
+    /// The last ticks, waiting or not.
+    latest: Vec<Tick>,
     /// The last [`POSTURES`], and the ticks since then.
     recent: VecDeque<Tick>,
     since_last: usize,
@@ -194,6 +198,7 @@ impl Bank {
                 structure: structure.clone(),
             },
             waiting: Vec::new(),
+            latest: Vec::new(),
             recent: VecDeque::with_capacity(POSTURES),
             since_last: APART,
         })
@@ -202,6 +207,9 @@ impl Bank {
     /// Adds ticks. `decided` is the newest slot that each component has decided on, and the slots
     /// that it has learnt.
     pub(crate) fn learn(&mut self, ticks: &[Tick], decided: &[(i64, Vec<i64>)]) {
+        self.latest.extend_from_slice(ticks);
+        let old = self.latest.len().saturating_sub(MOST_WAITING);
+        self.latest.drain(..old);
         let newest = decided
             .iter()
             .map(|(newest, _)| *newest)
@@ -235,17 +243,16 @@ impl Bank {
             }
             while let Some(view) = views.pop() {
                 views.retain(|other| *other != view);
+                let shifted = place.shifted(&tick, view, units);
                 if !place.update(&tick, view) {
                     continue;
                 }
-                for unit in units.iter_mut().filter(|unit| is_learnt(unit.component)) {
-                    let rows = Rows {
-                        rows: &place.stacked.subtrees()[unit.subtree],
-                        structure: &place.structure,
-                        kinematics: &place.kinematics,
-                        readings: &tick.readings,
-                        variances,
-                    };
+                for (number, unit) in units.iter_mut().enumerate() {
+                    if !is_learnt(unit.component) {
+                        continue;
+                    }
+                    let shifted = shifted.get(number).map_or(&[][..], Vec::as_slice);
+                    let rows = place.rows(unit, &tick, shifted, variances);
                     for fit in unit.fits.iter_mut().filter(|fit| fit.view == view) {
                         fit.add(&unit.columns, &rows);
                     }
@@ -263,6 +270,40 @@ impl Bank {
             }
         }
         self.weigh();
+    }
+
+    /// Whether a contact that has begun lately explains the last ticks, these included, better than
+    /// other offsets: a steady force along the axes of the base. A push is more usual than a jump
+    /// of an offset, as much as no contact at the start than one.
+    pub(crate) fn is_rather_a_contact(&mut self, component: usize, ticks: &[Tick]) -> bool {
+        let Self {
+            place,
+            units,
+            variances,
+            latest,
+            ..
+        } = self;
+        let last: Vec<&Tick> = latest.iter().chain(ticks).collect();
+        let last = &last[last.len().saturating_sub(MOST_WAITING)..];
+        let mut own = units.iter().filter(|unit| unit.component == component);
+        own.any(|unit| {
+            let mut changes = unit.changes(&unit.changing(Change::Offset, &place.model));
+            for tick in last {
+                if place.update(tick, View::AsStated) {
+                    let rows = place.rows(unit, tick, &[], variances);
+                    changes
+                        .iter_mut()
+                        .for_each(|fit| fit.add(&unit.columns, &rows));
+                }
+            }
+            let evidence = |fit: &mut Fit| {
+                (0..NOISE_ITERATIONS).for_each(|_| fit.weigh(&unit.columns));
+                fit.branches[0].log_evidence
+            };
+            let mut evidence = changes.iter_mut().map(evidence);
+            let changed = evidence.next().unwrap_or_default();
+            evidence.any(|contact| contact > changed + CONTACT.ln())
+        })
     }
 
     /// Weighs all hypotheses. What is wrong with the robot, rather than with one sub-tree, must be
@@ -345,27 +386,17 @@ impl Bank {
         }
     }
 
-    /// Drops everything that was learnt about a component.
-    pub(crate) fn begin_anew(&mut self, component: usize) {
-        self.of(component).for_each(Unit::begin_anew);
-    }
-
-    /// Forgets the offsets of a component.
-    pub(crate) fn forget_offsets(&mut self, component: usize) {
-        self.of(component).for_each(Unit::forget_offsets);
-    }
-
-    /// Forgets the parameters of the links at the ends of the limbs of a component.
-    pub(crate) fn forget_loads(&mut self, component: usize) {
-        let model = self.place.model.clone();
-        self.of(component)
-            .for_each(|unit| unit.forget_loads(&model));
-    }
-
-    fn of(&mut self, component: usize) -> impl Iterator<Item = &mut Unit> {
-        self.units
+    /// Forgets what a change of a component concerns.
+    pub(crate) fn forget(&mut self, component: usize, change: Change) {
+        let model = &self.place.model;
+        let own = self
+            .units
             .iter_mut()
-            .filter(move |unit| unit.component == component)
+            .filter(|unit| unit.component == component);
+        own.for_each(|unit| match change {
+            Change::Anew => unit.begin_anew(),
+            Change::Offset | Change::Load => unit.forget(&unit.changing(change, model)),
+        });
     }
 
     /// Whether a contact may have been there since the start.
@@ -387,6 +418,42 @@ impl Place {
             self.stacked.eliminate_contacts(Weighting::Noise);
         }
         is_updated
+    }
+
+    /// The rows of a unit at a tick, to which the regressor is set.
+    fn rows<'a>(
+        &'a self,
+        unit: &Unit,
+        tick: &'a Tick,
+        shifted: &'a [Vec<f64>],
+        variances: &'a [[f64; 6]],
+    ) -> Rows<'a> {
+        Rows {
+            rows: &self.stacked.subtrees()[unit.subtree],
+            structure: &self.structure,
+            kinematics: &self.kinematics,
+            readings: &tick.readings,
+            shifted,
+            variances,
+        }
+    }
+
+    /// Of each unit, what its reference leaves of its rows, if what a view estimates is a little
+    /// off, each in turn.
+    fn shifted(&mut self, tick: &Tick, view: View, units: &[Unit]) -> Vec<Vec<Vec<f64>>> {
+        let mut shifted = vec![Vec::new(); units.len()];
+        let unknowns = view.freedom().len();
+        for place in 0..unknowns {
+            let mut values = vec![0.0; unknowns];
+            values[place] = SMALL;
+            if !self.update(tick, view.at(&values)) {
+                return Vec::new();
+            }
+            for (unit, shifted) in units.iter().zip(&mut shifted) {
+                shifted.push(unit.columns.rest(&self.stacked.subtrees()[unit.subtree]));
+            }
+        }
+        shifted
     }
 
     fn look(&mut self, tick: &Tick, view: View) -> bool {

@@ -173,6 +173,7 @@ impl Part {
         data: Nanos,
         solution: &mut ComponentSolution,
         may_end: bool,
+        is_rather_a_contact: impl FnOnce() -> bool,
     ) {
         // A new load is in the information by now, but not in the parameters in use.
         let is_replaced = std::mem::take(&mut self.is_replaced);
@@ -182,7 +183,7 @@ impl Part {
             self.is_replaced = true;
             Ok(())
         } else {
-            self.test_change(prior)
+            self.test_change(prior, is_rather_a_contact)
         };
         self.update_noise();
         self.judge_candidates();
@@ -491,9 +492,14 @@ impl Part {
     /// Tests whether a change explains the rejected rows: an offset jump of the tilted sensors, or
     /// another load.
     ///
-    /// A push explains any reading, so it is the alternative unless a change fits in many postures.
-    /// It also does no harm: nothing is learnt from its rows.
-    pub(crate) fn test_change(&mut self, prior: &Prior) -> Result<(), PriorError> {
+    /// A push explains any reading, so it is the alternative unless a change fits in many postures,
+    /// an offset jump better than a steady push. It also does no harm: nothing is learnt from its
+    /// rows.
+    pub(crate) fn test_change(
+        &mut self,
+        prior: &Prior,
+        is_rather_a_contact: impl FnOnce() -> bool,
+    ) -> Result<(), PriorError> {
         if !self.is_disturbed {
             self.rejected_information.clear();
             self.rejected_time = 0.0;
@@ -538,7 +544,10 @@ impl Part {
                 (best, least) = (Some((change, fresh)), increase);
             }
         }
-        if let Some((change, information)) = best {
+        // A load looks like a steady force, so only its inertia tells it from a push.
+        if let Some((change, information)) = best
+            && (change == Change::Load || !is_rather_a_contact())
+        {
             // The parameters in use do not include the load; an offset jump does not affect them.
             self.is_replaced = change == Change::Load;
             self.change = Some((change, information));
@@ -613,7 +622,9 @@ impl Job {
             (self.parts.iter_mut().zip(&mut self.solution.components)).enumerate()
         {
             let may_end = part.is_disturbed && self.bank.may_have_begun_in_contact(number);
-            part.run(&self.prior, self.data, solution, may_end);
+            let (bank, ticks) = (&mut self.bank, &self.ticks[..self.tick_count]);
+            let is_push = || bank.is_rather_a_contact(number, ticks);
+            part.run(&self.prior, self.data, solution, may_end, is_push);
         }
         self.weigh_hypotheses();
     }
@@ -635,11 +646,8 @@ impl Job {
         let ticks = &self.ticks[..self.tick_count];
         self.bank.learn(ticks, &decided);
         for (number, part) in self.parts.iter().enumerate() {
-            match part.change {
-                Some((Change::Offset, _)) => self.bank.forget_offsets(number),
-                Some((Change::Load, _)) => self.bank.forget_loads(number),
-                Some((Change::Anew, _)) => self.bank.begin_anew(number),
-                None => {}
+            if let Some((change, _)) = part.change {
+                self.bank.forget(number, change);
             }
         }
         let disturbed = (self.parts.iter().enumerate()).filter(|(_, part)| part.is_disturbed);

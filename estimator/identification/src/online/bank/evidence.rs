@@ -19,6 +19,8 @@ use proprio_dynamics::{Kinematics, Structure};
 
 /// Standard deviation of each component of a steady force \[N\].
 pub(super) const FORCE: f64 = 25.0;
+/// A share of [`View::freedom`] whose effect is linear.
+pub(super) const SMALL: f64 = 1e-3;
 
 /// The unknowns of a sub-tree, `[d | s]`: ten per link, six per sensor.
 #[derive(Clone, Debug)]
@@ -34,6 +36,14 @@ pub(super) struct Columns {
 impl Columns {
     pub(super) fn count(&self) -> usize {
         self.reference.len()
+    }
+
+    /// What the reference leaves of each row.
+    pub(super) fn rest(&self, rows: &SubTreeRegressor) -> Vec<f64> {
+        let measured = rows.projected_measured().iter().enumerate();
+        measured
+            .map(|(i, y)| y - dot(rows.projected_row(i), &self.reference))
+            .collect()
     }
 
     fn first_offset(&self) -> usize {
@@ -145,6 +155,8 @@ pub(super) struct Rows<'a> {
     pub(super) structure: &'a Structure,
     pub(super) kinematics: &'a Kinematics,
     pub(super) readings: &'a [Wrench],
+    /// What CAD and configured offsets leave of each row if one unknown of the view is [`SMALL`].
+    pub(super) shifted: &'a [Vec<f64>],
     /// The stated variances of each sensor's channels, [torque; force].
     pub(super) variances: &'a [[f64; 6]],
 }
@@ -174,7 +186,9 @@ impl Fit {
         Self {
             view,
             contact,
-            unknowns: columns.count() + if contact.is_some() { 3 } else { 0 },
+            unknowns: columns.count()
+                + view.freedom().len()
+                + if contact.is_some() { 3 } else { 0 },
             branches,
             gram: DMatrix::zeros(0, 0),
             rows: 0.0,
@@ -196,6 +210,23 @@ impl Fit {
         }
     }
 
+    /// What is stated, from the same readings; with this contact from now on.
+    pub(super) fn from_now_on(&self, columns: &Columns, contact: Option<usize>) -> Self {
+        let branches = self.branches[..1].to_vec();
+        let mut with = Self::new(self.view, contact, columns, branches);
+        if !self.gram.is_empty() {
+            let own = (0..self.unknowns).map(Some);
+            let own = own.chain((self.unknowns..with.unknowns).map(|_| None));
+            let from: Vec<Option<usize>> = own.chain([Some(self.unknowns)]).collect();
+            with.gram = DMatrix::from_fn(from.len(), from.len(), |i, j| match (from[i], from[j]) {
+                (Some(i), Some(j)) => self.gram[(i, j)],
+                _ => 0.0,
+            });
+        }
+        (with.rows, with.ticks, with.forgotten) = (self.rows, self.ticks, self.forgotten);
+        with
+    }
+
     /// Adds the rows of a sub-tree at one time.
     pub(super) fn add(&mut self, columns: &Columns, now: &Rows<'_>) {
         let rows = now.rows;
@@ -203,14 +234,14 @@ impl Fit {
         let mut all = DMatrix::zeros(count, width);
         let mut covariance = DMatrix::zeros(count, count);
         let mut scaled = vec![0.0; columns.count()];
+        let rest = columns.rest(rows);
         for i in 0..count {
             let (of_links, offsets) = rows.projected_row(i).split_at(rows.offset_column());
             columns.scale(rows.projected_row(i), &mut scaled);
             for (column, value) in scaled.iter().enumerate() {
                 all[(i, column)] = *value;
             }
-            let right =
-                rows.projected_measured()[i] - dot(rows.projected_row(i), &columns.reference);
+            let right = rest[i];
             for (number, branch) in self.branches.iter().enumerate() {
                 let changes = (columns.sensors.iter().enumerate()).map(|(place, &sensor)| {
                     let reading = now.readings[sensor];
@@ -249,6 +280,11 @@ impl Fit {
                 for i in 0..count {
                     all[(i, columns.count() + axis)] = -FORCE * dot(rows.projection(i), wrench);
                 }
+            }
+        }
+        for (place, shifted) in now.shifted.iter().enumerate() {
+            for (i, (shifted, own)) in shifted.iter().zip(&rest).enumerate() {
+                all[(i, columns.count() + place)] = (own - shifted) / SMALL;
             }
         }
         let Some(factor) = Cholesky::new(covariance) else {
@@ -321,8 +357,9 @@ impl Fit {
         }
     }
 
-    /// The root mean square of the force of the contact, its largest component \[N\].
-    pub(super) fn force(&self, columns: &Columns) -> f64 {
+    /// The root mean square of what is estimated beside `[d | s]`, the largest: a share of
+    /// [`FORCE`], or of [`View::freedom`].
+    pub(super) fn extent(&self, columns: &Columns) -> f64 {
         let Some((factor, right)) = self.system(columns, 0) else {
             return f64::INFINITY;
         };
@@ -333,16 +370,20 @@ impl Fit {
             let _ = factor.l_dirty().solve_lower_triangular_mut(&mut unit);
             mean[axis].hypot(unit.norm() * self.branches[0].noise.sqrt())
         });
-        FORCE * axes.fold(0.0, f64::max)
+        axes.fold(0.0, f64::max)
     }
 
     /// What the parameters are if a branch holds.
     pub(super) fn posterior(&self, columns: &Columns, number: usize) -> Option<Posterior> {
         let (factor, right) = self.system(columns, number)?;
         let branch = &self.branches[number];
-        let mean = columns.unscale(&factor.solve(&right).as_slice()[..columns.count()]);
+        let solution = factor.solve(&right);
+        let (own, extra) = solution.as_slice().split_at(columns.count());
+        let mean = columns.unscale(own);
+        let mut hypothesis = self.hypothesis(branch);
+        hypothesis.view = self.view.at(extra);
         let mut all = Posterior {
-            hypothesis: self.hypothesis(branch),
+            hypothesis,
             mean,
             // The offset is in the sensor's own unit.
             offset_factors: (columns.sensors.iter())
@@ -538,6 +579,47 @@ mod tests {
         let of_forgotten = log_density(&all, &right, 1.0);
         assert!(noise > 1.0 && of_forgotten < expected, "{noise}");
         assert!((evidence - expected).abs() < 0.1 * (expected - of_forgotten).abs());
+    }
+
+    /// What begins now has said nothing yet, and explains only what comes.
+    #[test]
+    fn a_contact_from_now_on_explains_later_rows_alone() {
+        let ((a, y), (b, z)) = (rows(61, 40, 0.3), rows(71, 40, 0.3));
+        let mut before = Fit::new(
+            View::AsStated,
+            None,
+            &columns(),
+            [Sight::AsStated, Sight::Unit(0, 4.0)]
+                .map(|sight| Branch::new(sight, 1.0, &[0]))
+                .to_vec(),
+        );
+        let all = DMatrix::from_fn(40, UNKNOWNS + 2, |i, j| {
+            if j < UNKNOWNS { a[(i, j)] } else { y[i] }
+        });
+        before.gram = all.tr_mul(&all);
+        before.rows = 40.0;
+        let mut with = before.from_now_on(&columns(), Some(0));
+        let without = weighed(&mut before);
+        let own = weighed(&mut with);
+        assert!((own.0 - without.0).abs() < 1e-9 && (own.1 - without.1).abs() < 1e-9);
+        assert!((with.extent(&columns()) - 1.0).abs() < 1e-9);
+        // Later rows have columns of the force.
+        let force = DMatrix::from_vec(40, 3, normals(81, 120));
+        let later = DMatrix::from_fn(40, UNKNOWNS + 4, |i, j| match j {
+            0..UNKNOWNS => b[(i, j)],
+            UNKNOWNS..19 => force[(i, j - UNKNOWNS)],
+            _ => z[i],
+        });
+        with.gram += later.tr_mul(&later);
+        with.rows += 40.0;
+        let every = DMatrix::from_fn(80, UNKNOWNS + 3, |i, j| match (i < 40, j < UNKNOWNS) {
+            (true, true) => a[(i, j)],
+            (true, false) => 0.0,
+            (false, _) => later[(i - 40, j)],
+        });
+        let right = DVector::from_iterator(80, y.iter().chain(z.iter()).copied());
+        let (evidence, noise) = weighed(&mut with);
+        assert!((evidence - log_density(&every, &right, noise)).abs() < 1e-6);
     }
 
     #[test]

@@ -27,6 +27,38 @@ pub enum View {
     ImuTurned(Mat3),
     /// The IMU's accelerations are in g.
     ImuInG,
+    /// The base is tilted, or its IMU mounted askew: this rotation vector turns the motion of the
+    /// base, in axes of the base link. It is estimated; zero before.
+    BaseTurned(Vec3),
+    /// This encoder has another zero and another gain: this offset, in the joint's unit, and
+    /// relative error. Both are estimated; zero before.
+    Encoder(usize, [f64; 2]),
+}
+
+impl View {
+    /// The standard deviations of what is estimated: floors and mountings are askew by up to a few
+    /// tens of degrees \[rad\]; zeros and gears are off by as much.
+    pub(crate) const fn freedom(&self) -> &'static [f64] {
+        match self {
+            Self::BaseTurned(_) => &[0.3; 3],
+            Self::Encoder(..) => &[0.2; 2],
+            _ => &[],
+        }
+    }
+
+    /// With these values of what is estimated, in units of [`View::freedom`].
+    pub(crate) fn at(self, values: &[f64]) -> Self {
+        let scaled: Vec<f64> = values
+            .iter()
+            .zip(self.freedom())
+            .map(|(x, std)| x * std)
+            .collect();
+        match (self, scaled.as_slice()) {
+            (Self::BaseTurned(_), &[x, y, z]) => Self::BaseTurned(Vec3::new(x, y, z)),
+            (Self::Encoder(dof, _), &[zero, gain]) => Self::Encoder(dof, [zero, gain]),
+            (other, _) => other,
+        }
+    }
 }
 
 /// How the readings of the F/T sensors are to be taken.
@@ -65,10 +97,16 @@ impl Hypothesis {
     #[must_use]
     pub const fn role(&self) -> Option<ChannelRole> {
         match (self.view, self.sight) {
-            (View::Reversed(dof) | View::Degrees(dof) | View::Swapped(dof, _), _) => {
-                Some(ChannelRole::Joint(dof))
+            (
+                View::Reversed(dof)
+                | View::Degrees(dof)
+                | View::Swapped(dof, _)
+                | View::Encoder(dof, _),
+                _,
+            ) => Some(ChannelRole::Joint(dof)),
+            (View::Upright(_) | View::ImuTurned(_) | View::ImuInG | View::BaseTurned(_), _) => {
+                Some(ChannelRole::Base)
             }
-            (View::Upright(_) | View::ImuTurned(_) | View::ImuInG, _) => Some(ChannelRole::Base),
             (View::AsStated, Sight::AsStated) => None,
             (_, Sight::Axes(sensor, _) | Sight::Unit(sensor, _) | Sight::Swapped(sensor, _)) => {
                 Some(ChannelRole::Sensor(sensor))
@@ -117,6 +155,18 @@ impl fmt::Display for Described<'_> {
             View::Upright(_) => return f.write_str("gravity has another direction than stated"),
             View::ImuTurned(_) => return f.write_str("the IMU is mounted in another direction"),
             View::ImuInG => return f.write_str("the IMU reads accelerations in g"),
+            View::Encoder(dof, [zero, gain]) => {
+                return write!(
+                    f,
+                    "the encoder of {} is off by {zero:.2} and {:.0} %",
+                    joint(dof),
+                    100.0 * gain
+                );
+            }
+            View::BaseTurned(turn) => {
+                let degrees = turn.norm().to_degrees();
+                return write!(f, "the base, or its IMU, is tilted by {degrees:.0} degrees");
+            }
         }
         match self.hypothesis.sight {
             Sight::AsStated => {}
@@ -199,13 +249,21 @@ impl Motion {
                 .for_each(|values| values[dof] *= PI / 180.0),
             View::Swapped(a, b) => each.into_iter().for_each(|values| values.swap(a, b)),
             View::Upright(axis) => self.base.proper_acceleration = axis * GRAVITY,
-            View::ImuTurned(turn) => {
-                self.base.proper_acceleration = turn * self.base.proper_acceleration;
-                self.base.angular_velocity = turn * self.base.angular_velocity;
-                self.base.angular_acceleration = turn * self.base.angular_acceleration;
-            }
+            View::ImuTurned(turn) => self.turn_base(&turn),
             View::ImuInG => self.base.proper_acceleration *= GRAVITY,
+            View::BaseTurned(turn) => self.turn_base(Rotation3::new(turn).matrix()),
+            View::Encoder(dof, [zero, gain]) => {
+                each.into_iter()
+                    .for_each(|values| values[dof] *= 1.0 + gain);
+                self.position[dof] += zero;
+            }
         }
+    }
+
+    fn turn_base(&mut self, turn: &Mat3) {
+        self.base.proper_acceleration = turn * self.base.proper_acceleration;
+        self.base.angular_velocity = turn * self.base.angular_velocity;
+        self.base.angular_acceleration = turn * self.base.angular_acceleration;
     }
 }
 
@@ -266,6 +324,41 @@ pub(crate) fn sights(sensor: usize) -> Vec<Sight> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_estimated_has_its_own_unit() {
+        let turn = View::BaseTurned(Vec3::zeros()).at(&[1.0, 0.0, -0.5]);
+        assert_eq!(turn, View::BaseTurned(Vec3::new(0.3, 0.0, -0.15)));
+        let encoder = View::Encoder(2, [0.0; 2]).at(&[0.5, -1.0]);
+        assert_eq!(encoder, View::Encoder(2, [0.1, -0.2]));
+        assert_eq!(View::Reversed(1).at(&[]), View::Reversed(1));
+    }
+
+    #[test]
+    fn an_encoder_with_another_zero_and_gain_moves_in_proportion() {
+        let state = JointState {
+            position: &[1.0, 2.0],
+            velocity: &[3.0, 4.0],
+            acceleration: &[5.0, 6.0],
+        };
+        let mut motion = Motion::new(2);
+        motion.copy_from(state, &FrameMotion::standing(&Vec3::zeros()));
+        motion.see(View::Encoder(1, [0.5, 0.25]));
+        assert_eq!(motion.position, [1.0, 3.0]);
+        assert_eq!(motion.velocity, [3.0, 5.0]);
+        assert_eq!(motion.acceleration, [5.0, 7.5]);
+    }
+
+    #[test]
+    fn a_base_that_is_tilted_moves_in_other_axes() {
+        let turn = Vec3::new(0.0, 0.0, 0.5 * PI);
+        let mut motion = Motion::new(0);
+        motion.base.proper_acceleration = Vec3::x();
+        motion.base.angular_velocity = Vec3::y();
+        motion.see(View::BaseTurned(turn));
+        assert!((motion.base.proper_acceleration - Vec3::y()).norm() < 1e-12);
+        assert!((motion.base.angular_velocity + Vec3::x()).norm() < 1e-12);
+    }
 
     #[test]
     fn the_quarter_turns_are_twenty_three_rotations() {

@@ -1,7 +1,8 @@
 //! One sub-tree that can be free of contacts, and all hypotheses about it.
 
-use crate::online::bank::evidence::{Branch, Columns, FORCE, Fit, Posterior};
+use crate::online::bank::evidence::{Branch, Columns, Fit, Posterior};
 use crate::online::bank::hypothesis::{Hypothesis, Sight, View, quarter_turns, sights};
+use crate::online::solution::Change;
 use crate::robot::BaseMotion;
 use proprio_dynamics::model::{JointKind, Model};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
@@ -9,20 +10,26 @@ use proprio_dynamics::spatial::Vec3;
 use proprio_dynamics::{ContactSet, Structure};
 
 /// Prior odds of a contact since the start.
-const CONTACT: f64 = 0.1;
+pub(super) const CONTACT: f64 = 0.1;
 /// Prior odds of each hypothesis about the setup. It takes evidence of 6.4 to need cover, and 16 to
 /// be the likeliest. Errors of a model are not among the hypotheses, and look like them: those of a
 /// real leg, with F/T errors of ten times the stated noise, are worth up to 8 for the likeliest
 /// one.
 const STRUCTURAL: f64 = 1e-7;
+/// The same where something is estimated, which adapts to errors of a model: on that leg it gains
+/// up to 6.9.
+const ESTIMATED: f64 = 1e-8;
 /// Odds below which a hypothesis needs no cover: it is no likelier than an error of more than four
 /// deviations.
 const UNLIKELY: f64 = 6.3e-5;
 /// Evidence below which a hypothesis is refuted: one in ten thousand. That is how often at most a
 /// true one is ever refuted, however long it is observed (Ville's inequality).
 const REFUTED: f64 = 1e-4;
-/// Force of a contact since the start that does not matter \[N\]: a tenth of the expected one.
-const LITTLE: f64 = 0.1 * FORCE;
+/// Force of a contact since the start that does not matter, as a share of the expected one.
+const LITTLE: f64 = 0.1;
+/// Share of [`View::freedom`] that is covered, where more is withheld: few floors, mountings and
+/// zeros are more precise than 0.1 rad.
+const USUAL: f64 = 1.0 / 3.0;
 /// Ticks in which a misfit lasts: the 3 s of a movement, for it depends on the posture. In them it
 /// counts as one.
 const LASTING: f64 = 30.0;
@@ -65,27 +72,38 @@ impl Unit {
         self.fits.clone_from(&self.at_start);
     }
 
-    pub(super) fn forget_offsets(&mut self) {
-        let first = LINK_PARAMETERS * self.columns.links.len();
-        self.forget(&(first..self.columns.count()).collect::<Vec<_>>());
+    /// What is stated, but for other values of these unknowns from now on; then each contact that
+    /// may begin now.
+    pub(super) fn changes(&self, unknowns: &[usize]) -> Vec<Fit> {
+        let contacts = self.at_start.iter().filter_map(|fit| fit.contact).map(Some);
+        let from_now_on = |contact| self.fits[0].from_now_on(&self.columns, contact);
+        let mut fits: Vec<Fit> = [None]
+            .into_iter()
+            .chain(contacts)
+            .map(from_now_on)
+            .collect();
+        fits[0].forget(unknowns);
+        fits
     }
 
-    /// Forgets the parameters of links without children.
-    pub(super) fn forget_loads(&mut self, model: &Model) {
+    /// The unknowns that a change concerns: offsets, or the parameters of links without children.
+    pub(super) fn changing(&self, change: Change, model: &Model) -> Vec<usize> {
         let has_child = |link: usize| model.joints().iter().any(|joint| joint.parent == link);
-        let ends = self
-            .columns
-            .links
-            .iter()
-            .enumerate()
-            .filter(|(_, link)| !has_child(**link));
-        let columns =
-            ends.flat_map(|(place, _)| LINK_PARAMETERS * place..LINK_PARAMETERS * (place + 1));
-        self.forget(&columns.collect::<Vec<_>>());
+        let links = self.columns.links.iter().enumerate();
+        let ends = links.filter(|(_, link)| !has_child(**link));
+        let of_links = LINK_PARAMETERS * self.columns.links.len();
+        match change {
+            Change::Offset => (of_links..self.columns.count()).collect(),
+            Change::Load => ends
+                .flat_map(|(place, _)| LINK_PARAMETERS * place..LINK_PARAMETERS * (place + 1))
+                .collect(),
+            Change::Anew => (0..self.columns.count()).collect(),
+        }
     }
 
-    fn forget(&mut self, columns: &[usize]) {
-        self.fits.iter_mut().for_each(|fit| fit.forget(columns));
+    /// Forgets these unknowns: they have other values from now on.
+    pub(super) fn forget(&mut self, unknowns: &[usize]) {
+        self.fits.iter_mut().for_each(|fit| fit.forget(unknowns));
     }
 
     /// Finds the evidence of all hypotheses from the ticks so far.
@@ -147,14 +165,23 @@ impl Unit {
         });
     }
 
-    /// The odds of what is stated, or differs from it by a contact with next to no force.
+    /// The odds of what is stated, or differs from it by something harmless.
     fn stated(&self) -> f64 {
         let odds = |fit: &Fit| fit.branches[0].log_odds;
         let own = odds(&self.fits[0]);
-        let contacts = self.fits.iter().filter(|fit| fit.contact.is_some());
-        let likelier = contacts.filter(|fit| odds(fit) > own);
-        let harmless = likelier.filter(|fit| fit.force(&self.columns) <= LITTLE);
+        let likelier = self.fits.iter().filter(|fit| odds(fit) > own);
+        let harmless = likelier.filter(|fit| self.is_harmless(fit));
         harmless.map(odds).fold(own, f64::max)
+    }
+
+    /// Whether it is a contact with next to no force, a small tilt of the base, or a small error of
+    /// an encoder.
+    fn is_harmless(&self, fit: &Fit) -> bool {
+        match (fit.contact, fit.view.freedom()) {
+            (Some(_), _) => fit.extent(&self.columns) <= LITTLE,
+            (None, []) => false,
+            (None, _) => fit.extent(&self.columns) <= USUAL,
+        }
     }
 
     /// Whether another hypothesis is likelier than what is stated.
@@ -179,19 +206,21 @@ impl Unit {
 
     /// Whether everything is as stated, as far as is known.
     pub(super) fn is_settled(&self) -> bool {
-        let mut structural = self.fits.iter().flat_map(|fit| {
-            let of_fit = fit.branches.iter();
-            of_fit.filter(|branch| fit.view != View::AsStated || branch.sight != Sight::AsStated)
-        });
-        !structural.any(Branch::needs_cover) && !self.may_have_begun_in_contact()
+        let is_open = |fit: &Fit| {
+            let mut structural = fit
+                .branches
+                .iter()
+                .filter(|branch| fit.view != View::AsStated || branch.sight != Sight::AsStated);
+            structural.any(Branch::needs_cover) && !self.is_harmless(fit)
+        };
+        !self.fits.iter().any(is_open) && !self.may_have_begun_in_contact()
     }
 
     /// Whether there may have been a contact since the start, with a force that matters. One with
     /// next to no force is never refuted, and does no harm.
     pub(super) fn may_have_begun_in_contact(&self) -> bool {
-        self.fits
-            .iter()
-            .any(|fit| fit.contact.is_some() && fit.force(&self.columns) > LITTLE)
+        let mut contacts = self.fits.iter().filter(|fit| fit.contact.is_some());
+        contacts.any(|fit| !self.is_harmless(fit))
     }
 
     /// All hypotheses that need cover, but the stated one.
@@ -263,6 +292,8 @@ fn hypotheses(
         let concerned = limb.filter(|a| dofs.contains(a) || dofs.contains(&b));
         views.extend(concerned.map(|a| View::Swapped(a.min(b), a.max(b))));
     }
+    views.extend(dofs.iter().map(|&dof| View::Encoder(dof, [0.0; 2])));
+    views.push(View::BaseTurned(Vec3::zeros()));
     match base {
         BaseMotion::Imu(pose) => {
             let to_base = |turn| pose.rotation * turn * pose.rotation.transpose();
@@ -286,12 +317,11 @@ fn hypotheses(
         BaseMotion::Stance(_) => {}
     }
     fits.extend(views.into_iter().map(|view| {
-        Fit::new(
-            view,
-            None,
-            columns,
-            vec![branch(Sight::AsStated, STRUCTURAL)],
-        )
+        let prior = match view.freedom() {
+            [] => STRUCTURAL,
+            _ => ESTIMATED,
+        };
+        Fit::new(view, None, columns, vec![branch(Sight::AsStated, prior)])
     }));
     fits
 }
