@@ -383,7 +383,8 @@ impl Pipeline {
             if !(self.contacts).is_elsewhere(&self.setup.robot, &active, instant) {
                 identification.observe(instant, &self.setup, &self.buffers, &active, base);
             }
-            if identification.apply(&mut self.setup, &mut self.propagation) {
+            let touched = self.residuals.touched(&self.setup.robot.structure);
+            if identification.apply(&mut self.setup, &mut self.propagation, &touched) {
                 self.residuals.restart_means();
             }
         }

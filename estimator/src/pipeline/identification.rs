@@ -20,7 +20,7 @@ use crate::inertial::{PosteriorBlock, set_noise};
 use crate::propagation::{Covariance, Propagation};
 use crate::setup::Setup;
 use proprio_dynamics::spatial::{RigidInertia, Vec3, Wrench};
-use proprio_dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics};
+use proprio_dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics, SensorSet};
 use proprio_identification::online::state::{SensorFingerprint, StateError};
 use proprio_identification::online::{
     Job as SolverJob, Observation, Online, OnlineError, Solution,
@@ -450,13 +450,20 @@ impl OnlineIdentification {
         });
     }
 
-    /// Puts a solution in use if its stamp has been reached; whether it did.
-    pub(super) fn apply(&mut self, setup: &mut Setup, propagation: &mut Propagation) -> bool {
+    /// Puts a solution in use if its stamp has been reached; whether it did. The noise of the
+    /// sensors that are `touched` does not grow: a push that lasts would look like noise, and end
+    /// for the residual test.
+    pub(super) fn apply(
+        &mut self,
+        setup: &mut Setup,
+        propagation: &mut Propagation,
+        touched: &SensorSet,
+    ) -> bool {
         // A solution to apply implies that its job, and so the workspace, was given back.
         if !self.online.apply() {
             return false;
         }
-        self.put_in_use(setup, propagation);
+        self.put_in_use(setup, propagation, touched);
         true
     }
 
@@ -478,12 +485,17 @@ impl OnlineIdentification {
             workspace.propagation = new;
             write_inertia(setup, self.online.solution(), &mut workspace.inertia);
         }
-        self.put_in_use(setup, propagation);
+        self.put_in_use(setup, propagation, &SensorSet::EMPTY);
         Ok(())
     }
 
     /// Copies the last solution to the setup and the propagation of the pipeline.
-    fn put_in_use(&mut self, setup: &mut Setup, propagation: &mut Propagation) {
+    fn put_in_use(
+        &mut self,
+        setup: &mut Setup,
+        propagation: &mut Propagation,
+        touched: &SensorSet,
+    ) {
         for component in &self.online.solution().components {
             for (&link, body) in component.links.iter().zip(&component.bodies) {
                 // No error: a link of the model, and finite.
@@ -495,12 +507,15 @@ impl OnlineIdentification {
                 }
             }
             for (&sensor, found) in component.sensors.iter().zip(&component.noise) {
-                set_noise(
-                    &mut setup.state.excess_variance,
-                    &setup.robot.structure,
-                    sensor,
-                    *found,
-                );
+                let most = match setup.state.excess_variance.get(sensor) {
+                    Some(before) if touched.contains(sensor) => *before,
+                    _ => [f64::INFINITY; 6],
+                };
+                let all = &mut setup.state.excess_variance;
+                set_noise(all, &setup.robot.structure, sensor, *found);
+                if let Some(excess) = all.get_mut(sensor) {
+                    *excess = std::array::from_fn(|i| excess[i].min(most[i]));
+                }
             }
         }
         if let Some(workspace) = &mut self.workspace {

@@ -159,6 +159,14 @@ impl ResidualMonitor {
             .fold(SensorSet::EMPTY, |all, (own, _)| all.union(&own.sensors))
     }
 
+    /// The sensors whose noise can not be told from a contact: one is, or may be, on a sub-tree
+    /// whose model has been confirmed without it.
+    pub(super) fn touched(&self, structure: &Structure) -> SensorSet {
+        let both = structure.subtrees().iter().zip(&self.subtrees);
+        both.filter(|(_, state)| state.lingering.is_some() && state.free >= FREE)
+            .fold(SensorSet::EMPTY, |all, (own, _)| all.union(&own.sensors))
+    }
+
     /// The detected contacts.
     pub(super) fn detected(&self) -> ContactSet {
         let mut detected = ContactSet::EMPTY;
