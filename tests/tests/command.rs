@@ -2622,6 +2622,14 @@ fn demo_of(joints: usize, place: &Place, seconds: f64, more: &[&str]) -> Json {
     );
     let rows = table(&place.read("d/estimates.csv"))["t"].len();
     assert_eq!(summary["estimates"], rows, "the table holds them all");
+    // Where a push begins and ends, an estimate or two; that is less than one of a thousand.
+    let untrue = summary["untrue_estimates"].as_object().unwrap();
+    let sum: u64 = untrue.values().map(|count| count.as_u64().unwrap()).sum();
+    assert_eq!(untrue.len(), joints, "{summary}");
+    assert!(
+        1000 * sum <= (rows * joints) as u64,
+        "valid torques are true: {summary}"
+    );
     summary
 }
 

@@ -7,6 +7,7 @@
 //! | `verdict`, `worked` | one sentence, and true, false, or null if it cannot be told |
 //! | `torque_rms_error_nm` | per joint, RMS of estimated minus true torque \[Nm\] (1, 4) |
 //! | `valid_estimates` | per joint, the number of estimates in that figure: the valid ones (1) |
+//! | `untrue_estimates` | per joint, how many valid torques of the run break the promise (6) |
 //! | `valid_share` | fraction of the torques that were not withheld (1) |
 //! | `identification.cad_error` | relative error of masses and first moments of `cad.urdf` (2) |
 //! | `identification.refused` | why nothing was identified; null if something was |
@@ -30,6 +31,7 @@
 //! (4) Null if nothing can be computed: withheld torques enter no figure.
 //! (5) Those whose true value is within twice the stated standard deviation of the last solution;
 //! null without a solution.
+//! (6) They are more than four stated deviations, and 1 % of the joint's range, off the truth.
 //!
 //! Each of the three phases contains, over the valid estimates, `cad` and `identified`: per joint
 //! the RMS error \[Nm\] with the CAD's inertial parameters and with those identified on-line, both

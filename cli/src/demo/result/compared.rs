@@ -147,6 +147,24 @@ impl Compared {
         (t - self.first).seconds()
     }
 
+    /// Per joint, the number of torques that break the promise: valid, but more than four stated
+    /// deviations and 1 % of the joint's range off the truth.
+    pub(super) fn untrue(&self) -> Vec<usize> {
+        let untrue = |instants: &Vec<Instant>| {
+            let truths = || instants.iter().map(|i| i.truth).filter(|x| x.is_finite());
+            let (least, most) = (
+                truths().fold(f64::INFINITY, f64::min),
+                truths().fold(f64::NEG_INFINITY, f64::max),
+            );
+            let is_untrue = |i: &&Instant| {
+                let promised = (4.0 * i.estimate.standard_deviation).max(0.01 * (most - least));
+                i.estimate.valid == 1 && i.error().abs() > promised
+            };
+            instants.iter().filter(is_untrue).count()
+        };
+        self.joints.iter().map(untrue).collect()
+    }
+
     /// The accuracy of the torques from `from` until before `until`; `None` without an estimate
     /// that has a truth.
     pub(super) fn phase(&self, from: Nanos, until: Nanos) -> Option<Phase> {
@@ -308,6 +326,16 @@ mod tests {
                 .phase(Nanos::from_seconds(20.0), Nanos::MAX)
                 .is_none()
         );
+        // Two torques are 2 Nm off: four deviations, but with a smaller deviation more. 1 % of the
+        // range always counts as true.
+        assert_eq!(compared.untrue(), [0]);
+        let mut compared = compared;
+        for instant in &mut compared.joints[0] {
+            instant.estimate.standard_deviation = 0.4;
+        }
+        assert_eq!(compared.untrue(), [2]);
+        compared.joints[0][0].truth = 202.0;
+        assert_eq!(compared.untrue(), [0]);
         assert_eq!(Phase::json(None, &[]), Json::Null);
     }
 }

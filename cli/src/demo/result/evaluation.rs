@@ -171,6 +171,10 @@ impl<'a> Evaluation<'a> {
         let seconds = |t: Nanos| (t <= self.last).then(|| self.compared.time(t));
         let errors = (self.judged).each(&watched.joints, |joint| joint.identified.into());
         let valid = (self.judged).each(&watched.joints, |joint| joint.valid.into());
+        let untrue = watched.joints.iter().zip(self.compared.untrue());
+        let untrue: serde_json::Map<_, _> = untrue
+            .map(|(joint, count)| (joint.clone(), count.into()))
+            .collect();
         json!({
             "verdict": self.verdict.sentence(),
             "worked": self.verdict.worked,
@@ -193,6 +197,7 @@ impl<'a> Evaluation<'a> {
             },
             "torque_rms_error_nm": errors,
             "valid_estimates": valid,
+            "untrue_estimates": untrue,
             "identification": {
                 "cad_error": args.cad_error,
                 "refused": self.experiment.refused,
