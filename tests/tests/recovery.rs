@@ -146,11 +146,13 @@ fn the_chain_recovers_from_kills_at_any_instant() {
             "{left} segments after kill {kill} instead of {segments}"
         );
     }
-    // A reader releases the files of dead writers when it reads.
+    // A reader releases the files of dead writers when it reads; but a connection that a writer
+    // made as it was killed may be left until the reader ends (one in some thousand kills).
+    let most = segments + kills.div_ceil(200) as usize;
     let settled = until(PATIENCE, || {
         health.get();
         let _ = valid_since(&mut torques, Nanos::MAX, Nanos::ZERO);
-        (rig.segments().len() <= segments).then_some(())
+        (rig.segments().len() <= most).then_some(())
     });
     assert!(
         settled.is_some(),
