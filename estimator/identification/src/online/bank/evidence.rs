@@ -211,7 +211,7 @@ impl Fit {
     }
 
     /// What is stated, from the same readings; with this contact from now on.
-    pub(super) fn from_now_on(&self, columns: &Columns, contact: Option<usize>) -> Self {
+    pub(super) fn continued(&self, columns: &Columns, contact: Option<usize>) -> Self {
         let branches = self.branches[..1].to_vec();
         let mut with = Self::new(self.view, contact, columns, branches);
         if !self.gram.is_empty() {
@@ -583,7 +583,7 @@ mod tests {
 
     /// What begins now has said nothing yet, and explains only what comes.
     #[test]
-    fn a_contact_from_now_on_explains_later_rows_alone() {
+    fn a_contact_continued_explains_later_rows_alone() {
         let ((a, y), (b, z)) = (rows(61, 40, 0.3), rows(71, 40, 0.3));
         let mut before = Fit::new(
             View::AsStated,
@@ -598,7 +598,7 @@ mod tests {
         });
         before.gram = all.tr_mul(&all);
         before.rows = 40.0;
-        let mut with = before.from_now_on(&columns(), Some(0));
+        let mut with = before.continued(&columns(), Some(0));
         let without = weighed(&mut before);
         let own = weighed(&mut with);
         assert!((own.0 - without.0).abs() < 1e-9 && (own.1 - without.1).abs() < 1e-9);

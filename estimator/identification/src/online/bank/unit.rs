@@ -76,12 +76,8 @@ impl Unit {
     /// may begin now.
     pub(super) fn changes(&self, unknowns: &[usize]) -> Vec<Fit> {
         let contacts = self.at_start.iter().filter_map(|fit| fit.contact).map(Some);
-        let from_now_on = |contact| self.fits[0].from_now_on(&self.columns, contact);
-        let mut fits: Vec<Fit> = [None]
-            .into_iter()
-            .chain(contacts)
-            .map(from_now_on)
-            .collect();
+        let continued = |contact| self.fits[0].continued(&self.columns, contact);
+        let mut fits: Vec<Fit> = [None].into_iter().chain(contacts).map(continued).collect();
         fits[0].forget(unknowns);
         fits
     }
