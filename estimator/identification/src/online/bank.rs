@@ -9,7 +9,9 @@
 //! # Evidence
 //! Each hypothesis takes the readings in its own way ([`Hypothesis`]). Then the six equations of a
 //! sub-tree are linear in its parameters and offsets, and, for a contact since the start, in its
-//! steady force along the axes of the base. So the evidence has a closed form (`evidence.rs`).
+//! steady force along the axes of the base. What else is estimated, a tilt of the base or an error
+//! of an encoder, has columns by differences at CAD. So the evidence has a closed form
+//! (`evidence.rs`).
 //!
 //! Ticks count in which something moves, for at rest nothing separates the hypotheses, and whose
 //! rows are learnt. Residuals beyond the stated noise are a misfit, which lasts: a second of them
