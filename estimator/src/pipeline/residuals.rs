@@ -154,16 +154,25 @@ impl ResidualMonitor {
 
     /// The sensors of the sub-trees whose model has not been confirmed without a contact.
     pub(super) fn unconfirmed(&self, structure: &Structure) -> SensorSet {
-        let both = structure.subtrees().iter().zip(self.subtrees());
-        both.filter(|(_, residual)| residual.is_unconfirmed)
-            .fold(SensorSet::EMPTY, |all, (own, _)| all.union(&own.sensors))
+        self.sensors_where(structure, |state| state.residual.is_unconfirmed)
     }
 
     /// The sensors whose noise can not be told from a contact: one is, or may be, on a sub-tree
     /// whose model has been confirmed without it.
     pub(super) fn touched(&self, structure: &Structure) -> SensorSet {
+        self.sensors_where(structure, |state| {
+            state.lingering.is_some() && state.free >= FREE
+        })
+    }
+
+    /// The sensors of these sub-trees.
+    fn sensors_where(
+        &self,
+        structure: &Structure,
+        is_one: impl Fn(&SubtreeState) -> bool,
+    ) -> SensorSet {
         let both = structure.subtrees().iter().zip(&self.subtrees);
-        both.filter(|(_, state)| state.lingering.is_some() && state.free >= FREE)
+        both.filter(|(_, state)| is_one(state))
             .fold(SensorSet::EMPTY, |all, (own, _)| all.union(&own.sensors))
     }
 

@@ -172,8 +172,8 @@ impl<'a> Evaluation<'a> {
         let errors = (self.judged).each(&watched.joints, |joint| joint.identified.into());
         let valid = (self.judged).each(&watched.joints, |joint| joint.valid.into());
         let untrue = watched.joints.iter().zip(self.compared.untrue());
-        let untrue: serde_json::Map<_, _> = untrue
-            .map(|(joint, count)| (joint.clone(), count.into()))
+        let untrue: Json = untrue
+            .map(|(joint, count)| (joint.clone(), count))
             .collect();
         json!({
             "verdict": self.verdict.sentence(),

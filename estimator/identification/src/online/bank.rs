@@ -1,4 +1,4 @@
-//! Hypotheses about what may be other than stated: an encoder reversed, a sensor shifted, a contact
+//! Hypotheses about what may be other than stated: an encoder reversed, a sensor turned, a contact
 //! that has been there since the start. Their evidence says which of them the readings refute.
 //!
 //! ```text
@@ -58,8 +58,8 @@ const APART: usize = 5;
 const SHOWN: usize = 20;
 /// Ticks that wait for the gate, at most: those of 3 s.
 const MOST_WAITING: usize = 30;
-/// Iterations in which the noise of other offsets, or of a contact, converges.
-const NOISE_ITERATIONS: usize = 10;
+/// Times that a change is weighed, in which its noise converges.
+const WEIGHINGS: usize = 10;
 /// Period of the ticks.
 pub(crate) const TICK: Nanos = Nanos::from_millis(100);
 
@@ -289,7 +289,7 @@ impl Bank {
         let last = &last[last.len().saturating_sub(MOST_WAITING)..];
         let mut own = units.iter().filter(|unit| unit.component == component);
         own.any(|unit| {
-            let mut changes = unit.changes(&unit.changing(Change::Offset, &place.model));
+            let mut changes = unit.changes();
             for tick in last {
                 if place.update(tick, View::AsStated) {
                     let rows = place.rows(unit, tick, &[], variances);
@@ -299,7 +299,7 @@ impl Bank {
                 }
             }
             let evidence = |fit: &mut Fit| {
-                (0..NOISE_ITERATIONS).for_each(|_| fit.weigh(&unit.columns));
+                (0..WEIGHINGS).for_each(|_| fit.weigh(&unit.columns));
                 fit.branches[0].log_evidence
             };
             let mut evidence = changes.iter_mut().map(evidence);
@@ -397,7 +397,8 @@ impl Bank {
             .filter(|unit| unit.component == component);
         own.for_each(|unit| match change {
             Change::Anew => unit.begin_anew(),
-            Change::Offset | Change::Load => unit.forget(&unit.changing(change, model)),
+            Change::Offset => unit.forget(&unit.offsets()),
+            Change::Load => unit.forget(&unit.loads(model)),
         });
     }
 
@@ -444,7 +445,7 @@ impl Place {
     /// off, each in turn.
     fn shifted(&mut self, tick: &Tick, view: View, units: &[Unit]) -> Vec<Vec<Vec<f64>>> {
         let mut shifted = vec![Vec::new(); units.len()];
-        let unknowns = view.freedom().len();
+        let unknowns = view.unknowns();
         for place in 0..unknowns {
             let mut values = vec![0.0; unknowns];
             values[place] = SMALL;

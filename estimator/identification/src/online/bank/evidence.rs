@@ -19,7 +19,7 @@ use proprio_dynamics::{Kinematics, Structure};
 
 /// Standard deviation of each component of a steady force \[N\].
 pub(super) const FORCE: f64 = 25.0;
-/// A share of [`View::freedom`] whose effect is linear.
+/// An unknown of a view, as in [`View::at`], whose effect is linear.
 pub(super) const SMALL: f64 = 1e-3;
 
 /// The unknowns of a sub-tree, `[d | s]`: ten per link, six per sensor.
@@ -186,9 +186,7 @@ impl Fit {
         Self {
             view,
             contact,
-            unknowns: columns.count()
-                + view.freedom().len()
-                + if contact.is_some() { 3 } else { 0 },
+            unknowns: columns.count() + view.unknowns() + if contact.is_some() { 3 } else { 0 },
             branches,
             gram: DMatrix::zeros(0, 0),
             rows: 0.0,
@@ -358,7 +356,7 @@ impl Fit {
     }
 
     /// The root mean square of what is estimated beside `[d | s]`, the largest: a share of
-    /// [`FORCE`], or of [`View::freedom`].
+    /// [`FORCE`], or what [`View::at`] takes.
     pub(super) fn extent(&self, columns: &Columns) -> f64 {
         let Some((factor, right)) = self.system(columns, 0) else {
             return f64::INFINITY;

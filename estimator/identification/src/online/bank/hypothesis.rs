@@ -10,6 +10,11 @@ use std::fmt;
 /// Standard gravity \[m/s^2\].
 const GRAVITY: f64 = 9.80665;
 
+/// Standard deviation of each component of a turn of the base \[rad\].
+const TURN: f64 = 0.3;
+/// The same of what corrects an encoder: an offset \[rad or m\], and a relative gain.
+const ENCODER: f64 = 0.2;
+
 /// How the readings of joints and base are to be taken.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum View {
@@ -30,32 +35,28 @@ pub enum View {
     /// The base is tilted, or its IMU mounted askew: this rotation vector turns the motion of the
     /// base, in axes of the base link. It is estimated; zero before.
     BaseTurned(Vec3),
-    /// This encoder has another zero and another gain: this offset, in the joint's unit, and
-    /// relative error. Both are estimated; zero before.
+    /// This encoder has another zero and another gain: its readings are to be raised by the second,
+    /// a share, then by the first \[rad or m\]. Both are estimated; zero before.
     Encoder(usize, [f64; 2]),
 }
 
 impl View {
-    /// The standard deviations of what is estimated: floors and mountings are askew by up to a few
-    /// tens of degrees \[rad\]; zeros and gears are off by as much.
-    pub(crate) const fn freedom(&self) -> &'static [f64] {
+    /// The number of unknowns that are estimated.
+    pub(crate) const fn unknowns(&self) -> usize {
         match self {
-            Self::BaseTurned(_) => &[0.3; 3],
-            Self::Encoder(..) => &[0.2; 2],
-            _ => &[],
+            Self::BaseTurned(_) => 3,
+            Self::Encoder(..) => 2,
+            _ => 0,
         }
     }
 
-    /// With these values of what is estimated, in units of [`View::freedom`].
+    /// With these values of its unknowns, in units of their standard deviations.
     pub(crate) fn at(self, values: &[f64]) -> Self {
-        let scaled: Vec<f64> = values
-            .iter()
-            .zip(self.freedom())
-            .map(|(x, std)| x * std)
-            .collect();
-        match (self, scaled.as_slice()) {
-            (Self::BaseTurned(_), &[x, y, z]) => Self::BaseTurned(Vec3::new(x, y, z)),
-            (Self::Encoder(dof, _), &[zero, gain]) => Self::Encoder(dof, [zero, gain]),
+        match (self, values) {
+            (Self::BaseTurned(_), &[x, y, z]) => Self::BaseTurned(TURN * Vec3::new(x, y, z)),
+            (Self::Encoder(dof, _), &[offset, gain]) => {
+                Self::Encoder(dof, [ENCODER * offset, ENCODER * gain])
+            }
             (other, _) => other,
         }
     }
@@ -155,18 +156,10 @@ impl fmt::Display for Described<'_> {
             View::Upright(_) => return f.write_str("gravity has another direction than stated"),
             View::ImuTurned(_) => return f.write_str("the IMU is mounted in another direction"),
             View::ImuInG => return f.write_str("the IMU reads accelerations in g"),
-            View::Encoder(dof, [zero, gain]) => {
-                return write!(
-                    f,
-                    "the encoder of {} is off by {zero:.2} and {:.0} %",
-                    joint(dof),
-                    100.0 * gain
-                );
+            View::Encoder(dof, _) => {
+                return write!(f, "the encoder of {} has another zero or gain", joint(dof));
             }
-            View::BaseTurned(turn) => {
-                let degrees = turn.norm().to_degrees();
-                return write!(f, "the base, or its IMU, is tilted by {degrees:.0} degrees");
-            }
+            View::BaseTurned(_) => return f.write_str("the base, or its IMU, is tilted"),
         }
         match self.hypothesis.sight {
             Sight::AsStated => {}
@@ -252,10 +245,10 @@ impl Motion {
             View::ImuTurned(turn) => self.turn_base(&turn),
             View::ImuInG => self.base.proper_acceleration *= GRAVITY,
             View::BaseTurned(turn) => self.turn_base(Rotation3::new(turn).matrix()),
-            View::Encoder(dof, [zero, gain]) => {
+            View::Encoder(dof, [offset, gain]) => {
                 each.into_iter()
                     .for_each(|values| values[dof] *= 1.0 + gain);
-                self.position[dof] += zero;
+                self.position[dof] += offset;
             }
         }
     }

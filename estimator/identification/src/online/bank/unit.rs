@@ -2,7 +2,6 @@
 
 use crate::online::bank::evidence::{Branch, Columns, Fit, Posterior};
 use crate::online::bank::hypothesis::{Hypothesis, Sight, View, quarter_turns, sights};
-use crate::online::solution::Change;
 use crate::robot::BaseMotion;
 use proprio_dynamics::model::{JointKind, Model};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
@@ -27,8 +26,8 @@ const UNLIKELY: f64 = 6.3e-5;
 const REFUTED: f64 = 1e-4;
 /// Force of a contact since the start that does not matter, as a share of the expected one.
 const LITTLE: f64 = 0.1;
-/// Share of [`View::freedom`] that is covered, where more is withheld: few floors, mountings and
-/// zeros are more precise than 0.1 rad.
+/// Share of the expected tilt, or error of an encoder, that is covered, where more is withheld:
+/// floors and mountings are usually level to 0.1 rad, zeros and gears right to 0.07.
 const USUAL: f64 = 1.0 / 3.0;
 /// Ticks in which a misfit lasts: the 3 s of a movement, for it depends on the posture. In them it
 /// counts as one.
@@ -72,29 +71,28 @@ impl Unit {
         self.fits.clone_from(&self.at_start);
     }
 
-    /// What is stated, but for other values of these unknowns from now on; then each contact that
-    /// may begin now.
-    pub(super) fn changes(&self, unknowns: &[usize]) -> Vec<Fit> {
+    /// What is stated, but for other offsets from now on; then each contact that may begin now.
+    pub(super) fn changes(&self) -> Vec<Fit> {
         let contacts = self.at_start.iter().filter_map(|fit| fit.contact).map(Some);
         let continued = |contact| self.fits[0].continued(&self.columns, contact);
         let mut fits: Vec<Fit> = [None].into_iter().chain(contacts).map(continued).collect();
-        fits[0].forget(unknowns);
+        fits[0].forget(&self.offsets());
         fits
     }
 
-    /// The unknowns that a change concerns: offsets, or the parameters of links without children.
-    pub(super) fn changing(&self, change: Change, model: &Model) -> Vec<usize> {
+    /// The columns of the offsets.
+    pub(super) fn offsets(&self) -> Vec<usize> {
+        (LINK_PARAMETERS * self.columns.links.len()..self.columns.count()).collect()
+    }
+
+    /// Those of the links without children.
+    pub(super) fn loads(&self, model: &Model) -> Vec<usize> {
         let has_child = |link: usize| model.joints().iter().any(|joint| joint.parent == link);
         let links = self.columns.links.iter().enumerate();
-        let ends = links.filter(|(_, link)| !has_child(**link));
-        let of_links = LINK_PARAMETERS * self.columns.links.len();
-        match change {
-            Change::Offset => (of_links..self.columns.count()).collect(),
-            Change::Load => ends
-                .flat_map(|(place, _)| LINK_PARAMETERS * place..LINK_PARAMETERS * (place + 1))
-                .collect(),
-            Change::Anew => (0..self.columns.count()).collect(),
-        }
+        links
+            .filter(|(_, link)| !has_child(**link))
+            .flat_map(|(place, _)| LINK_PARAMETERS * place..LINK_PARAMETERS * (place + 1))
+            .collect()
     }
 
     /// Forgets these unknowns: they have other values from now on.
@@ -173,9 +171,9 @@ impl Unit {
     /// Whether it is a contact with next to no force, a small tilt of the base, or a small error of
     /// an encoder.
     fn is_harmless(&self, fit: &Fit) -> bool {
-        match (fit.contact, fit.view.freedom()) {
+        match (fit.contact, fit.view.unknowns()) {
             (Some(_), _) => fit.extent(&self.columns) <= LITTLE,
-            (None, []) => false,
+            (None, 0) => false,
             (None, _) => fit.extent(&self.columns) <= USUAL,
         }
     }
@@ -313,8 +311,8 @@ fn hypotheses(
         BaseMotion::Stance(_) => {}
     }
     fits.extend(views.into_iter().map(|view| {
-        let prior = match view.freedom() {
-            [] => STRUCTURAL,
+        let prior = match view.unknowns() {
+            0 => STRUCTURAL,
             _ => ESTIMATED,
         };
         Fit::new(view, None, columns, vec![branch(Sight::AsStated, prior)])
