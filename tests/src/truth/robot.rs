@@ -33,7 +33,8 @@ impl Robot {
         match seed % 6 {
             1 => Self::shipped("six_axis_arm"),
             4 => Self::shipped("icub_left_arm"),
-            _ => Self::tree(seed),
+            5 => Self::tree(seed, true),
+            _ => Self::tree(seed, false),
         }
     }
 
@@ -69,14 +70,14 @@ impl Robot {
         Self::told(name.into(), config, &read("model.urdf"), tips)
     }
 
-    /// One or two limbs of three to six joints.
-    fn tree(seed: u64) -> Self {
+    /// One or two limbs of three to six joints; of two the first may be the one it stands on.
+    fn tree(seed: u64, stands: bool) -> Self {
         let random = &mut Random::new(seed, "robot");
         let mut urdf = String::from("<robot name=\"tree\">\n");
         link(&mut urdf, "base", 2.0, random);
         let mut config = Table::new();
         let mut tips = Vec::new();
-        let limbs = 1 + usize::from(random.happens(0.35));
+        let limbs = 1 + usize::from(stands || random.happens(0.35));
         let mut places = Vec::new();
         for limb in 0..limbs {
             let joints = 3 + random.below(4);
@@ -112,24 +113,35 @@ impl Robot {
             let mass = random.uniform(0.3, 1.0);
             link(&mut urdf, &hand, mass, random);
             fixed(&mut urdf, &format!("l{limb}_wrist"), &parent, &hand, random);
+            let is_foot = stands && limb == 0;
             let mut tip = Table::new();
             tip.insert("name".into(), hand.clone().into());
             tip.insert("link".into(), hand.clone().into());
-            tip.insert("presence".into(), "possible".into());
+            let presence = if is_foot { "always" } else { "possible" };
+            tip.insert("presence".into(), presence.into());
             tables_mut(&mut config, "contact").push(tip.into());
-            tips.push(hand);
+            if !is_foot {
+                tips.push(hand);
+            }
         }
         urdf.push_str("</robot>\n");
         let mut base = Table::new();
-        base.insert("link".into(), "base".into());
         let is_fixed = random.happens(0.6);
-        if is_fixed {
+        if stands {
+            let mut foot = Table::new();
+            foot.insert("link".into(), "l0_hand".into());
+            foot.insert("contact".into(), "l0_hand".into());
+            base.insert("kind".into(), "stance".into());
+            base.insert("foot".into(), vec![foot].into());
+        } else if is_fixed {
+            base.insert("link".into(), "base".into());
             base.insert("kind".into(), "fixed".into());
             if random.happens(0.4) {
                 let gravity = random.direction() * 9.80665;
                 base.insert("gravity_mps2".into(), numbers(gravity));
             }
         } else {
+            base.insert("link".into(), "base".into());
             base.insert("kind".into(), "imu".into());
             base.insert("sensor".into(), "imu".into());
             let turned: [f64; 3] = std::array::from_fn(|_| random.uniform(-1.5, 1.5));
@@ -141,7 +153,11 @@ impl Robot {
             tables_mut(&mut config, "contact").push(stand.into());
         }
         config.insert("base".into(), base.into());
-        let base = if is_fixed { "fixed" } else { "on an IMU" };
+        let base = match (stands, is_fixed) {
+            (true, _) => "standing on the first",
+            (false, true) => "fixed",
+            (false, false) => "on an IMU",
+        };
         Self::told(
             format!("{}, {base}", places.join("; ")),
             config,
