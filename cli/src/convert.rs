@@ -483,6 +483,14 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
             from.saturating_sub(to)
         );
     }
+    for (t, likelier) in &report.likelier {
+        eprintln!(
+            "{}: from {t} s on the readings contradict {}: more likely, {likelier}; torques that \
+             depend on it are withheld",
+            args.samples.display(),
+            args.config.display()
+        );
+    }
     let withheld: u64 = report.withheld.values().sum();
     let assessment = assessor.map(Assessor::finish);
     if args.json {
@@ -491,6 +499,9 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
             "withheld_by_reason": report.withheld,
             "rows": report.log.rows, "bad_rows": report.log.bad_rows, "late": late,
             "backward": backward, "not_finite": not_finite,
+            "likelier": report.likelier.iter().map(|(t, text)| json!({
+                "t": t.seconds(), "likelier": text,
+            })).collect::<Vec<_>>(),
         });
         if let Some(assessment) = &assessment {
             summary["assessment"] = assessment_json(assessment);

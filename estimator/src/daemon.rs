@@ -563,7 +563,8 @@ impl DataPlane {
                 }
                 let likelier = online.solution().components.get(component);
                 let likelier = likelier.and_then(|own| own.leading);
-                if std::mem::replace(leading, likelier) != likelier {
+                let kind = likelier.map(Hypothesis::without_estimate);
+                if std::mem::replace(leading, kind) != kind {
                     report_leading(group, likelier, &self.pipeline.setup().robot);
                 }
             }

@@ -30,6 +30,7 @@ use crate::assessment::Assessor;
 use crate::pipeline::{Estimate, Pipeline};
 use crate::reading::{MissingChannels, Target, check_columns, check_skins, targets};
 use crate::setup::Setup;
+use proprio_identification::online::Hypothesis;
 use proprio_topics::csv::{Item, Reader, Report, Row, Value, What};
 use proprio_topics::{ContactWrench, JointTorque, Kind, NO_CAUSE, Nanos, Reason, Residual};
 use std::collections::BTreeMap;
@@ -70,14 +71,35 @@ pub struct EstimateReport {
     pub step_back: Option<(u64, Nanos, Nanos)>,
     /// Channels of the log that the configuration does not name.
     pub unused_channels: Vec<String>,
+    /// What was found likelier than the configuration, and when.
+    pub likelier: Vec<(Nanos, String)>,
 }
 
 /// Runs a job of on-line identification if one is due. It runs immediately, so that its solution is
-/// always in time.
-fn run_due_job(pipeline: &mut Pipeline) {
-    if let Some(mut job) = pipeline.take_job() {
-        job.run();
-        pipeline.give_back(job);
+/// always in time. What is likelier then than the configuration is added to `likelier`, each kind
+/// with the instant when it was found, and as estimated last.
+fn run_due_job(pipeline: &mut Pipeline, t: Nanos, likelier: &mut Vec<(Nanos, Hypothesis)>) {
+    let Some(mut job) = pipeline.take_job() else {
+        return;
+    };
+    job.run();
+    pipeline.give_back(job);
+    let components = pipeline
+        .identification()
+        .map(|own| &own.solution().components);
+    for found in components
+        .into_iter()
+        .flatten()
+        .filter_map(|own| own.leading)
+    {
+        let kind = found.without_estimate();
+        match likelier
+            .iter_mut()
+            .find(|(_, other)| other.without_estimate() == kind)
+        {
+            Some((_, newest)) => *newest = found,
+            None => likelier.push((t, found)),
+        }
     }
 }
 
@@ -117,15 +139,16 @@ pub fn estimate(
         pipeline.setup().robot.max_silence + pipeline.setup().robot.max_silence + Nanos(1);
     let (mut row, mut pseudo) = (Row::default(), Nanos::ZERO);
     let (mut stamped, mut newest) = (true, Nanos::MIN);
+    let mut likelier = Vec::new();
     let mut write = |pipeline: &mut Pipeline, stamped: bool| -> Result<(), OfflineError> {
         while let Some(estimate) = pipeline.poll() {
+            let t = estimate.t;
             table.write(estimate, stamped)?;
             if let Some(assessor) = &mut assessor {
                 assessor.estimate(estimate);
-                let t = estimate.t;
                 assessor.parameters(t, pipeline);
             }
-            run_due_job(pipeline);
+            run_due_job(pipeline, t, &mut likelier);
         }
         Ok(())
     };
@@ -158,6 +181,11 @@ pub fn estimate(
     }
     pipeline.finish();
     write(&mut pipeline, stamped)?;
+    let robot = &pipeline.setup().robot;
+    let described = likelier
+        .into_iter()
+        .map(|(t, found)| (t, found.describe(robot).to_string()));
+    report.likelier = described.collect();
     (report.estimates, report.withheld) = (table.rows, table.withheld);
     table.out.flush()?;
     let counts = pipeline.counts();

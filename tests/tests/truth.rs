@@ -49,7 +49,8 @@ fn torques_are_valid_where_nothing_is_wrong() {
         "push in the middle",
         "offsets stated",
     ] {
-        for (seed, outcome) in runs(name, 2..5) {
+        // Of seed 24 both sensors of a limb move together, and that of 5 stands on one.
+        for (seed, outcome) in runs(name, [2, 3, 4, 5, 24].into_iter()) {
             assert!(
                 outcome.use_of() >= 0.95,
                 "{name}, seed {seed}: {outcome:#?}"

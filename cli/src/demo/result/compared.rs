@@ -158,7 +158,9 @@ impl Compared {
             );
             let is_untrue = |i: &&Instant| {
                 let promised = (4.0 * i.estimate.standard_deviation).max(0.01 * (most - least));
-                i.estimate.valid == 1 && i.error().abs() > promised
+                // A torque that is no number is untrue; without a truth it is not known.
+                let is_kept = i.error().abs() <= promised || i.truth.is_nan();
+                i.estimate.valid == 1 && !is_kept
             };
             instants.iter().filter(is_untrue).count()
         };
@@ -334,6 +336,10 @@ mod tests {
             instant.estimate.standard_deviation = 0.4;
         }
         assert_eq!(compared.untrue(), [2]);
+        let torque = std::mem::replace(&mut compared.joints[0][1].estimate.torque, f64::NAN);
+        compared.joints[0][1].estimate.valid = 1;
+        assert_eq!(compared.untrue(), [3]);
+        compared.joints[0][1].estimate.torque = torque;
         compared.joints[0][0].truth = 202.0;
         assert_eq!(compared.untrue(), [0]);
         assert_eq!(Phase::json(None, &[]), Json::Null);

@@ -40,6 +40,7 @@ use crate::prior::cad_root;
 use crate::robot::BaseMotion;
 use evidence::{Columns, Fit, Posterior, Rows, SMALL, dot};
 use hypothesis::Motion;
+use nalgebra::Vector6;
 use proprio_dynamics::model::Model;
 use proprio_dynamics::regressor::{EstimateRows, LINK_PARAMETERS, StackedRegressor, Weighting};
 use proprio_dynamics::spatial::{RigidInertia, Wrench};
@@ -58,6 +59,8 @@ const APART: usize = 5;
 const SHOWN: usize = 20;
 /// Ticks that wait for the gate, at most: those of 3 s.
 const MOST_WAITING: usize = 30;
+/// The last ticks that are kept, those of 6 s: of them, the ones that a change is found in.
+const LATEST: usize = 60;
 /// Times that a change is weighed, in which its noise converges.
 const WEIGHINGS: usize = 10;
 /// Period of the ticks.
@@ -131,7 +134,7 @@ pub(crate) struct Bank {
     /// The stated variances of each sensor's channels, [torque; force].
     variances: Vec<[f64; 6]>,
     waiting: Vec<Tick>,
-    /// The last ticks, waiting or not.
+    /// The last [`LATEST`], waiting or not.
     latest: Vec<Tick>,
     /// The last [`POSTURES`], and the ticks since then.
     recent: VecDeque<Tick>,
@@ -210,7 +213,7 @@ impl Bank {
     /// that it has learnt.
     pub(crate) fn learn(&mut self, ticks: &[Tick], decided: &[(i64, Vec<i64>)]) {
         self.latest.extend_from_slice(ticks);
-        let old = self.latest.len().saturating_sub(MOST_WAITING);
+        let old = self.latest.len().saturating_sub(LATEST);
         self.latest.drain(..old);
         let newest = decided
             .iter()
@@ -245,7 +248,9 @@ impl Bank {
             }
             while let Some(view) = views.pop() {
                 views.retain(|other| *other != view);
-                let shifted = place.shifted(&tick, view, units);
+                let Some(shifted) = place.shifted(&tick, view, units) else {
+                    continue;
+                };
                 if !place.update(&tick, view) {
                     continue;
                 }
@@ -253,8 +258,7 @@ impl Bank {
                     if !is_learnt(unit.component) {
                         continue;
                     }
-                    let shifted = shifted.get(number).map_or(&[][..], Vec::as_slice);
-                    let rows = place.rows(unit, &tick, shifted, variances);
+                    let rows = place.rows(unit, &tick, &shifted[number], variances);
                     for fit in unit.fits.iter_mut().filter(|fit| fit.view == view) {
                         fit.add(&unit.columns, &rows);
                     }
@@ -274,10 +278,17 @@ impl Bank {
         self.weigh();
     }
 
-    /// Whether a contact that has begun lately explains the last ticks, these included, better than
-    /// other offsets: a steady force along the axes of the base. A push is more usual than a jump
-    /// of an offset, as much as no contact at the start than one.
-    pub(crate) fn is_rather_a_contact(&mut self, component: usize, ticks: &[Tick]) -> bool {
+    /// Whether a contact explains the readings of these slots better than other offsets do: a steady
+    /// force along the axes of the base. `ticks` are the newest. A push is more usual than a jump of
+    /// an offset, as much as no contact at the start than one.
+    ///
+    /// A jump concerns some sub-trees of the component, a contact one; the others are as before.
+    pub(crate) fn is_rather_a_contact(
+        &mut self,
+        component: usize,
+        slots: &[i64],
+        ticks: &[Tick],
+    ) -> bool {
         let Self {
             place,
             units,
@@ -285,16 +296,15 @@ impl Bank {
             latest,
             ..
         } = self;
-        let last: Vec<&Tick> = latest.iter().chain(ticks).collect();
-        let last = &last[last.len().saturating_sub(MOST_WAITING)..];
-        let mut own = units.iter().filter(|unit| unit.component == component);
-        own.any(|unit| {
-            let mut changes = unit.changes();
-            for tick in last {
+        let all = latest.iter().chain(ticks);
+        let rejected: Vec<&Tick> = all.filter(|tick| slots.contains(&tick.slot)).collect();
+        let (mut jump, mut contact) = (0.0, f64::NEG_INFINITY);
+        for unit in units.iter().filter(|unit| unit.component == component) {
+            let mut fits = unit.changes();
+            for tick in &rejected {
                 if place.update(tick, View::AsStated) {
                     let rows = place.rows(unit, tick, &[], variances);
-                    changes
-                        .iter_mut()
+                    fits.iter_mut()
                         .for_each(|fit| fit.add(&unit.columns, &rows));
                 }
             }
@@ -302,26 +312,29 @@ impl Bank {
                 (0..WEIGHINGS).for_each(|_| fit.weigh(&unit.columns));
                 fit.branches[0].log_evidence
             };
-            let mut evidence = changes.iter_mut().map(evidence);
-            let changed = evidence.next().unwrap_or_default();
-            evidence.any(|contact| contact > changed + CONTACT.ln())
-        })
+            let mut evidence = fits.iter_mut().map(evidence);
+            let [unchanged, jumped] = [(); 2].map(|()| evidence.next().unwrap_or_default());
+            // Against what is unchanged, so that the sum over sub-trees is that of the component.
+            jump += (jumped - unchanged).max(0.0);
+            contact = evidence.fold(contact, |most, own| most.max(own - unchanged));
+        }
+        contact > jump + CONTACT.ln()
     }
 
     /// Weighs all hypotheses. What is wrong with the robot, rather than with one sub-tree, must be
     /// compatible with the others, too.
     fn weigh(&mut self) {
         self.units.iter_mut().for_each(Unit::weigh);
-        let before = self.units.clone();
+        let evidence: Vec<_> = self.units.iter().map(Unit::evidence).collect();
         for (number, unit) in self.units.iter_mut().enumerate() {
             unit.decide(|view, sight| {
-                let others = before
-                    .iter()
-                    .enumerate()
-                    .filter(|(other, _)| *other != number);
-                others
-                    .filter_map(|(_, other)| other.evidence(view, sight))
-                    .sum()
+                let others = evidence.iter().enumerate();
+                let others = others.filter(|(other, _)| *other != number);
+                let own = |(_, of_unit): (usize, &Vec<(View, Sight, f64)>)| {
+                    let mut same = of_unit.iter().filter(|own| (own.0, own.1) == (view, sight));
+                    same.next().map(|own| own.2)
+                };
+                others.filter_map(own).sum()
             });
         }
     }
@@ -353,13 +366,16 @@ impl Bank {
                 doubt.deviation = doubt.deviation.max(deviation);
                 doubt.leading = doubt.leading.or(leading);
             };
-            // The first postures of a motion do not show yet how far apart the torques will be.
-            let is_shown = unit.fits[0].ticks() >= SHOWN && disturbed & bit(unit.component) == 0;
-            if is_doubtful || !is_settled {
+            // The first postures of a motion do not show yet what is wrong, nor how far apart the
+            // torques will be.
+            let ticks = unit.fits[0].ticks();
+            let is_begun = ticks > 0 && ticks < SHOWN;
+            let is_shown = ticks >= SHOWN && disturbed & bit(unit.component) == 0;
+            if is_doubtful || is_begun || !is_settled {
                 let beyond = place.dofs(&measured_with(unit, units), None);
                 beyond.iter().for_each(|&dof| add(dof, f64::INFINITY));
             }
-            if is_doubtful || !is_settled && !is_shown {
+            if is_doubtful || is_begun || !is_settled && !is_shown {
                 dofs.iter().for_each(|&dof| add(dof, f64::INFINITY));
                 continue;
             }
@@ -428,7 +444,7 @@ impl Place {
         &'a self,
         unit: &Unit,
         tick: &'a Tick,
-        shifted: &'a [Vec<f64>],
+        shifted: &'a [Vector6<f64>],
         variances: &'a [[f64; 6]],
     ) -> Rows<'a> {
         Rows {
@@ -441,22 +457,28 @@ impl Place {
         }
     }
 
-    /// Of each unit, what its reference leaves of its rows, if what a view estimates is a little
-    /// off, each in turn.
-    fn shifted(&mut self, tick: &Tick, view: View, units: &[Unit]) -> Vec<Vec<Vec<f64>>> {
+    /// Of each unit, the wrench that its reference leaves if what a view estimates is a little off,
+    /// each in turn; none if it can not be computed.
+    fn shifted(
+        &mut self,
+        tick: &Tick,
+        view: View,
+        units: &[Unit],
+    ) -> Option<Vec<Vec<Vector6<f64>>>> {
         let mut shifted = vec![Vec::new(); units.len()];
         let unknowns = view.unknowns();
         for place in 0..unknowns {
             let mut values = vec![0.0; unknowns];
             values[place] = SMALL;
             if !self.update(tick, view.at(&values)) {
-                return Vec::new();
+                return None;
             }
             for (unit, shifted) in units.iter().zip(&mut shifted) {
-                shifted.push(unit.columns.rest(&self.stacked.subtrees()[unit.subtree]));
+                let rows = &self.stacked.subtrees()[unit.subtree];
+                shifted.push(unit.columns.wrench_left(rows)?);
             }
         }
-        shifted
+        Some(shifted)
     }
 
     fn look(&mut self, tick: &Tick, view: View) -> bool {
@@ -538,13 +560,29 @@ impl Place {
             parameters[place] = *value;
         }
         let torques = self.torques(tick, &other.hypothesis, &parameters, dofs);
-        let with_deviation = |(torque, row): (f64, Vec<f64>)| {
+        let shifted: Vec<_> = (0..other.of_view.len())
+            .map(|place| {
+                let (mut values, mut hypothesis) = (other.of_view.clone(), other.hypothesis);
+                values[place] += SMALL;
+                hypothesis.view = hypothesis.view.at(&values);
+                self.torques(tick, &hypothesis, &parameters, dofs)
+            })
+            .collect();
+        let with_deviation = |(number, own): (usize, Option<(f64, Vec<f64>)>)| {
+            let (torque, row) = own?;
             let sensitivity: Vec<f64> = places.iter().map(|&place| row[place]).collect();
-            (torque, other.deviation(columns, &sensitivity))
+            let to_view = |all: &Vec<Option<(f64, Vec<f64>)>>| {
+                all[number]
+                    .as_ref()
+                    .map(|(other, _)| (other - torque) / SMALL)
+            };
+            let of_view = shifted.iter().map(to_view).collect::<Option<Vec<f64>>>()?;
+            Some((torque, other.deviation(columns, &sensitivity, &of_view)))
         };
         torques
             .into_iter()
-            .map(|torque| torque.map(with_deviation))
+            .enumerate()
+            .map(with_deviation)
             .collect()
     }
 
@@ -597,16 +635,24 @@ impl Place {
     }
 }
 
-/// The sensors whose offsets follow from those of a unit: no other sub-tree weighs them alone.
+/// The sensors whose offsets follow from those of a unit, from sub-tree to sub-tree: no other one
+/// weighs them alone.
 fn measured_with(unit: &Unit, units: &[Unit]) -> Vec<usize> {
-    let sensors = |unit: &Unit| unit.columns.sensors.clone();
-    let is_alone = |sensor: &usize| units.iter().any(|other| sensors(other) == [*sensor]);
-    let shares = |other: &&Unit| {
-        let mut own = other.columns.sensors.iter();
-        own.any(|sensor| unit.columns.sensors.contains(sensor))
-    };
-    let found = units.iter().filter(shares).flat_map(sensors);
-    found.filter(|sensor| !is_alone(sensor)).collect()
+    let others = || units.iter().filter(|other| other.subtree != unit.subtree);
+    let is_alone = |sensor: &usize| others().any(|other| other.columns.sensors == [*sensor]);
+    let mut found = unit.columns.sensors.clone();
+    found.retain(|sensor| !is_alone(sensor));
+    let mut checked = 0;
+    while let Some(&sensor) = found.get(checked) {
+        checked += 1;
+        let with = others().filter(|other| other.columns.sensors.contains(&sensor));
+        for &next in with.flat_map(|other| &other.columns.sensors) {
+            if !is_alone(&next) && !found.contains(&next) {
+                found.push(next);
+            }
+        }
+    }
+    found
 }
 
 /// The row of a torque over the columns of the robot.
@@ -617,4 +663,220 @@ fn row(rows: &EstimateRows<'_>, dof: usize, columns: usize) -> Option<Vec<f64>> 
     let mut all = vec![0.0; columns];
     rows.expand(subtree, &own, &mut all).ok()?;
     Some(all)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::arithmetic::normals;
+    use proprio_dynamics::model::{Frame, MeasurementDirection, MeasurementFrame};
+    use proprio_dynamics::spatial::{Pose, Vec3};
+    use proprio_dynamics::{
+        ContactKind, ContactSpec, ExternalWrench, InverseDynamics, Noise, SensorCut,
+    };
+    use std::f64::consts::PI;
+
+    const GRAVITY: f64 = 9.80665;
+
+    /// An arm of three moving links on a sensor, that can be touched at its tip.
+    struct Arm {
+        model: Model,
+        structure: Structure,
+        tip: Frame,
+    }
+
+    impl Arm {
+        fn new() -> Self {
+            let mut text = String::from("<robot name=\"r\"><link name=\"l0\"/>");
+            let joints = [("continuous", "1 0 0"), ("fixed", "0 0 1")];
+            let more = [("continuous", "0 1 0"), ("continuous", "1 0 0")];
+            for (number, (kind, axis)) in joints.into_iter().chain(more).enumerate() {
+                let own = number + 1;
+                text += &format!(
+                    "<link name=\"l{own}\"><inertial><origin xyz=\"0.01 0.02 0.1\"/>\
+                     <mass value=\"1\"/><inertia ixx=\"0.01\" ixy=\"0\" ixz=\"0\" iyy=\"0.012\" \
+                     iyz=\"0\" izz=\"0.005\"/></inertial></link><joint name=\"j{own}\" \
+                     type=\"{kind}\"><parent link=\"l{number}\"/><child link=\"l{own}\"/>\
+                     <origin xyz=\"0.02 0 0.2\"/><axis xyz=\"{axis}\"/></joint>"
+                );
+            }
+            let model = Model::from_urdf(&(text + "</robot>"), &["j2"]).unwrap();
+            let (frame, direction) = (MeasurementFrame::Child, MeasurementDirection::ChildToParent);
+            let noise = Noise {
+                force: [0.1; 3],
+                torque: [0.005; 3],
+            };
+            let cut =
+                SensorCut::new(&model, "j2", frame, direction, &Pose::identity(), &noise).unwrap();
+            let tip = Frame {
+                link: model.inertias().len() - 1,
+                pose: Pose::identity(),
+            };
+            let contact = ContactSpec {
+                frame: tip,
+                kind: ContactKind::Force,
+                position: Vec3::new(0.0, 0.0, 0.2),
+            };
+            let structure =
+                Structure::new(&model, &[cut], &[contact], Structure::LENGTH_SCALE).unwrap();
+            Self {
+                model,
+                structure,
+                tip,
+            }
+        }
+
+        fn bank(&self) -> Bank {
+            let upright = FrameMotion::standing(&Vec3::new(0.0, 0.0, -GRAVITY));
+            let beyond = self.structure.subtree_of(self.tip.link).unwrap();
+            let mut intermittent = ContactSet::EMPTY;
+            intermittent.insert(0);
+            let share = Share {
+                subtrees: &[beyond],
+                intermittent,
+            };
+            let base = (0, &BaseMotion::Standing(upright));
+            let (cad, offsets) = (self.model.inertias(), [Wrench::zero()]);
+            Bank::new(
+                &self.model,
+                &self.structure,
+                base,
+                cad,
+                &offsets,
+                &[share],
+                0.2,
+            )
+            .unwrap()
+        }
+
+        /// The readings of the truth in this slot, and what encoders and base tell of it: joint 1
+        /// and the base are taken as `told`. A force acts at the tip, and the offset is another.
+        fn tick(&self, slot: i64, told: View, force: Vec3, offset: Wrench) -> Tick {
+            let phase = 0.1 * slot as f64;
+            let sines = |derivative: u8| -> Vec<f64> {
+                let sine = |joint: i32| {
+                    let (rate, shift) = (0.6 + 0.37 * f64::from(joint), f64::from(joint));
+                    let angle = rate * phase + shift + 0.5 * PI * f64::from(derivative);
+                    0.8 * rate.powi(i32::from(derivative)) * angle.sin()
+                };
+                (0..3).map(sine).collect()
+            };
+            let mut truth = Motion::new(3);
+            (truth.position, truth.velocity, truth.acceleration) = (sines(0), sines(1), sines(2));
+            truth.base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -GRAVITY));
+            let mut kinematics = Kinematics::new(&self.model, 0).unwrap();
+            kinematics
+                .update(&self.model, truth.state(), &truth.base)
+                .unwrap();
+            let pose = *kinematics.pose(self.tip.link);
+            let point = Frame {
+                link: self.tip.link,
+                pose: Pose {
+                    translation: Vec3::new(0.0, 0.0, 0.2),
+                    ..Pose::identity()
+                },
+            };
+            let wrench = Wrench {
+                torque: Vec3::zeros(),
+                force: pose.rotation.transpose() * force,
+            };
+            let mut dynamics = InverseDynamics::new(&self.model);
+            let external = [ExternalWrench {
+                frame: point,
+                wrench,
+            }];
+            dynamics
+                .update(&self.model, &kinematics, &external)
+                .unwrap();
+            let cut = &self.structure.sensors()[0];
+            let noise = normals(slot as u64, 6);
+            let noise = Wrench::from_parts(
+                [0, 1, 2].map(|i| 0.1 * noise[i]),
+                [3, 4, 5].map(|i| 0.005 * noise[i]),
+            );
+            let reading = cut.reading(&dynamics.transmitted(&kinematics, cut.joint()));
+            let mut seen = truth.clone();
+            seen.see(told);
+            let mut tick = Tick::new(3, 1);
+            let readings = [reading + offset + noise];
+            let state = (seen.state(), &seen.base, 0);
+            tick.copy_from(slot, state, &readings, &ContactSet::EMPTY);
+            tick.moving = 1;
+            tick
+        }
+
+        /// A bank that has learnt 20 s of this.
+        fn learnt(&self, told: View) -> Bank {
+            let mut bank = self.bank();
+            for second in 0..20 {
+                let slots: Vec<i64> = (10 * second..10 * second + 10).collect();
+                let tick = |slot: &i64| self.tick(*slot, told, Vec3::zeros(), Wrench::zero());
+                let ticks: Vec<Tick> = slots.iter().map(tick).collect();
+                bank.learn(&ticks, &[(*slots.last().unwrap(), slots)]);
+            }
+            bank
+        }
+    }
+
+    /// What a bank makes of a view that has unknowns.
+    fn estimate(bank: &Bank, is_it: impl Fn(&View) -> bool) -> View {
+        let unit = &bank.units[0];
+        let fit = unit.fits.iter().find(|fit| is_it(&fit.view)).unwrap();
+        fit.posterior(&unit.columns, 0).unwrap().hypothesis.view
+    }
+
+    #[test]
+    fn the_zero_and_the_gain_of_an_encoder_are_estimated() {
+        for (off, is_small) in [([-0.03, -0.02], true), ([-0.15, -0.1], false)] {
+            let bank = Arm::new().learnt(View::Encoder(1, off));
+            let found = estimate(&bank, |view| matches!(view, View::Encoder(1, _)));
+            let View::Encoder(_, [offset, gain]) = found else {
+                panic!("{found:?}");
+            };
+            // Right is (reading - off[0]) / (1 + off[1]). The columns are those without an error.
+            let right = [-off[0] / (1.0 + off[1]), 1.0 / (1.0 + off[1]) - 1.0];
+            let tolerance = if is_small { 0.1 } else { 0.3 };
+            assert!((offset / right[0] - 1.0).abs() < tolerance, "{offset}");
+            assert!((gain / right[1] - 1.0).abs() < tolerance, "{gain}");
+            let leading = bank.units[0].leading().map(|own| own.view);
+            assert_eq!(leading, (!is_small).then_some(found));
+        }
+    }
+
+    #[test]
+    fn the_tilt_of_the_base_is_estimated_and_harmless_if_small() {
+        for (tilt, is_small) in [(0.03, true), (0.2, false)] {
+            let bank = Arm::new().learnt(View::BaseTurned(Vec3::new(0.0, -tilt, 0.0)));
+            let is_it = |view: &View| matches!(view, View::BaseTurned(_));
+            let View::BaseTurned(turn) = estimate(&bank, is_it) else {
+                panic!();
+            };
+            assert!((turn.y - tilt).abs() < 0.05 * tilt, "{turn}");
+            assert!(turn.x.abs() < 0.05 * tilt, "{turn}");
+            // The turn about gravity is not seen, and does not count.
+            let unit = &bank.units[0];
+            assert_eq!(unit.is_doubtful(), !is_small, "{tilt}");
+            if !is_small {
+                let leading = unit.leading().unwrap();
+                assert!(is_it(&leading.view), "{leading:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_steady_push_is_told_from_an_offset_that_jumps() {
+        let arm = Arm::new();
+        let push = (Vec3::new(8.0, 3.0, -5.0), Wrench::zero());
+        let jump = Wrench::from_parts([8.0, 3.0, -5.0], [0.5, 0.2, -0.3]);
+        for ((force, offset), is_contact) in [(push, true), ((Vec3::zeros(), jump), false)] {
+            let mut bank = arm.learnt(View::AsStated);
+            let slots: Vec<i64> = (200..230).collect();
+            let tick = |slot: &i64| arm.tick(*slot, View::AsStated, force, offset);
+            let rejected: Vec<Tick> = slots.iter().map(tick).collect();
+            // They wait, for nothing is decided about them; only one second is new.
+            bank.learn(&rejected[..20], &[(199, Vec::new())]);
+            let found = bank.is_rather_a_contact(0, &slots, &rejected[20..]);
+            assert_eq!(found, is_contact, "{force} {offset:?}");
+        }
+    }
 }

@@ -87,6 +87,8 @@ pub(crate) struct Part {
     /// The information in the rejected rows, and the time over which they were collected \[s\].
     pub(crate) rejected_information: Information,
     pub(crate) rejected_time: f64,
+    /// Their slots.
+    pub(crate) rejected_slots: Vec<i64>,
     pub(crate) change: Option<(Change, Information)>,
 }
 
@@ -163,6 +165,7 @@ impl Part {
             last_valid,
             rejected_information: Information::new(component.information.unknowns()),
             rejected_time: 0.0,
+            rejected_slots: Vec::new(),
             change: None,
         }
     }
@@ -173,7 +176,7 @@ impl Part {
         data: Nanos,
         solution: &mut ComponentSolution,
         may_end: bool,
-        is_rather_a_contact: impl FnOnce() -> bool,
+        is_rather_a_contact: impl FnOnce(&[i64]) -> bool,
     ) {
         // A new load is in the information by now, but not in the parameters in use.
         let is_replaced = std::mem::take(&mut self.is_replaced);
@@ -498,11 +501,10 @@ impl Part {
     pub(crate) fn test_change(
         &mut self,
         prior: &Prior,
-        is_rather_a_contact: impl FnOnce() -> bool,
+        is_rather_a_contact: impl FnOnce(&[i64]) -> bool,
     ) -> Result<(), PriorError> {
         if !self.is_disturbed {
-            self.rejected_information.clear();
-            self.rejected_time = 0.0;
+            self.drop_rejected();
             return Ok(());
         }
         // Nothing is rejected under a declared contact, or without a sensor: that time does not
@@ -520,6 +522,7 @@ impl Part {
                 spread(kind, row, &mut dense);
                 let _ = panel.push_row(&dense, right);
             }
+            self.rejected_slots.extend(rows.slots());
         }
         let _ = self.rejected_information.absorb(&mut panel);
         self.rejected_time += SOLVE.seconds();
@@ -546,7 +549,7 @@ impl Part {
         }
         // A load looks like a steady force, so only its inertia tells it from a push.
         if let Some((change, information)) = best
-            && (change == Change::Load || !is_rather_a_contact())
+            && (change == Change::Load || !is_rather_a_contact(&self.rejected_slots))
         {
             // The parameters in use do not include the load; an offset jump does not affect them.
             self.is_replaced = change == Change::Load;
@@ -554,9 +557,14 @@ impl Part {
         }
         // A load that is being picked up fits no hypothesis yet. Unexplained rows are dropped, and
         // the test is repeated with new ones.
+        self.drop_rejected();
+        Ok(())
+    }
+
+    fn drop_rejected(&mut self) {
         self.rejected_information.clear();
         self.rejected_time = 0.0;
-        Ok(())
+        self.rejected_slots.clear();
     }
 
     /// The squared residual of the most probable bodies for these data, plus twice their cost under
@@ -623,7 +631,7 @@ impl Job {
         {
             let may_end = part.is_disturbed && self.bank.may_have_begun_in_contact(number);
             let (bank, ticks) = (&mut self.bank, &self.ticks[..self.tick_count]);
-            let is_push = || bank.is_rather_a_contact(number, ticks);
+            let is_push = |slots: &[i64]| bank.is_rather_a_contact(number, slots, ticks);
             part.run(&self.prior, self.data, solution, may_end, is_push);
         }
         self.weigh_hypotheses();

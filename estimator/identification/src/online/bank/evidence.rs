@@ -11,7 +11,7 @@
 //! not below the stated one.
 
 use crate::online::bank::hypothesis::{Hypothesis, Sight, View};
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SMatrix};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SMatrix, Vector6};
 use proprio_dynamics::calibration::UNKNOWN_OFFSET;
 use proprio_dynamics::regressor::{LINK_PARAMETERS, SubTreeRegressor};
 use proprio_dynamics::spatial::{Vec3, Wrench};
@@ -19,6 +19,9 @@ use proprio_dynamics::{Kinematics, Structure};
 
 /// Standard deviation of each component of a steady force \[N\].
 pub(super) const FORCE: f64 = 25.0;
+/// Ticks in which a misfit lasts: the 3 s of a movement, for it depends on the posture. In them it
+/// counts as one.
+pub(super) const LASTING: f64 = 30.0;
 /// An unknown of a view, as in [`View::at`], whose effect is linear.
 pub(super) const SMALL: f64 = 1e-3;
 
@@ -44,6 +47,16 @@ impl Columns {
         measured
             .map(|(i, y)| y - dot(rows.projected_row(i), &self.reference))
             .collect()
+    }
+
+    /// The smallest wrench on the sub-tree that is what the reference leaves of its rows. Unlike the
+    /// rows, it does not depend on how the contacts were eliminated.
+    pub(super) fn wrench_left(&self, rows: &SubTreeRegressor) -> Option<Vector6<f64>> {
+        let projections = projections(rows);
+        let square = &projections * projections.transpose();
+        let weights = Cholesky::new(square)?.solve(&DVector::from_vec(self.rest(rows)));
+        let wrench = projections.tr_mul(&weights);
+        Some(Vector6::from_column_slice(wrench.as_slice()))
     }
 
     fn first_offset(&self) -> usize {
@@ -155,8 +168,9 @@ pub(super) struct Rows<'a> {
     pub(super) structure: &'a Structure,
     pub(super) kinematics: &'a Kinematics,
     pub(super) readings: &'a [Wrench],
-    /// What CAD and configured offsets leave of each row if one unknown of the view is [`SMALL`].
-    pub(super) shifted: &'a [Vec<f64>],
+    /// The wrench that CAD and configured offsets leave if one unknown of the view is [`SMALL`],
+    /// each in turn.
+    pub(super) shifted: &'a [Vector6<f64>],
     /// The stated variances of each sensor's channels, [torque; force].
     pub(super) variances: &'a [[f64; 6]],
 }
@@ -172,6 +186,8 @@ pub(super) struct Fit {
     gram: DMatrix<f64>,
     rows: f64,
     ticks: usize,
+    /// The number of ticks from which on it is weighed again.
+    weigh_from: usize,
     /// The log-evidence of unknowns that were forgotten.
     forgotten: f64,
 }
@@ -191,6 +207,7 @@ impl Fit {
             gram: DMatrix::zeros(0, 0),
             rows: 0.0,
             ticks: 0,
+            weigh_from: 1,
             forgotten: 0.0,
         }
     }
@@ -280,7 +297,8 @@ impl Fit {
                 }
             }
         }
-        for (place, shifted) in now.shifted.iter().enumerate() {
+        for (place, wrench) in now.shifted.iter().enumerate() {
+            let shifted = projections(rows) * wrench;
             for (i, (shifted, own)) in shifted.iter().zip(&rest).enumerate() {
                 all[(i, columns.count() + place)] = (own - shifted) / SMALL;
             }
@@ -296,6 +314,15 @@ impl Fit {
             self.gram.gemm_tr(1.0, &all, &all, 1.0);
             self.rows += count as f64;
             self.ticks += 1;
+            let takes_less = |branch: &Branch| branch.of_sensors.iter().any(|s| *s < 1.0);
+            if self.branches.iter().any(takes_less) {
+                let parts = noise_parts(columns, now, &factor);
+                for (number, branch) in self.branches.iter().enumerate() {
+                    let terms = branch.of_sensors.iter().zip(&parts);
+                    let less: f64 = terms.map(|(s, part)| (1.0 - s * s).max(0.0) * part).sum();
+                    self.gram[(self.unknowns + number, self.unknowns + number)] += less;
+                }
+            }
         }
     }
 
@@ -304,10 +331,8 @@ impl Fit {
         if self.gram.is_empty() || columns.is_empty() {
             return;
         }
-        let likeliest = self
-            .branches
-            .iter()
-            .max_by(|a, b| a.log_odds.total_cmp(&b.log_odds));
+        let open = self.branches.iter().filter(|branch| !branch.is_refuted);
+        let likeliest = open.max_by(|a, b| a.log_odds.total_cmp(&b.log_odds));
         let noise = likeliest.map_or(1.0, |branch| branch.noise);
         let own = DMatrix::from_fn(columns.len(), columns.len(), |i, j| {
             self.gram[(columns[i], columns[j])] + if i == j { noise } else { 0.0 }
@@ -325,6 +350,16 @@ impl Fit {
             self.gram.column_mut(column).fill(0.0);
         }
         self.forgotten -= 0.5 * log_det(&factor, noise);
+        self.weigh_from = 0;
+    }
+
+    /// Finds each branch's most likely noise, and its evidence, if a twentieth more is known than
+    /// the last time, or [`LASTING`] ticks.
+    pub(super) fn weigh_news(&mut self, columns: &Columns) {
+        if self.ticks >= self.weigh_from {
+            self.weigh(columns);
+            self.weigh_from = self.ticks + (self.ticks / 20).clamp(1, LASTING as usize);
+        }
     }
 
     /// Finds each branch's most likely noise, and its evidence.
@@ -333,14 +368,14 @@ impl Fit {
             return;
         }
         for number in 0..self.branches.len() {
-            // Two iterations a second: the noise converges while ticks come in.
+            // Two iterations: the noise converges while ticks come in.
             for _ in 0..if self.branches[number].is_refuted {
                 0
             } else {
                 2
             } {
                 let Some((factor, mut right)) = self.system(columns, number) else {
-                    return;
+                    continue;
                 };
                 factor.l_dirty().solve_lower_triangular_mut(&mut right);
                 let column = self.unknowns + number;
@@ -355,18 +390,26 @@ impl Fit {
         }
     }
 
-    /// The root mean square of what is estimated beside `[d | s]`, the largest: a share of
-    /// [`FORCE`], or what [`View::at`] takes.
+    /// What is estimated beside `[d | s]`, along the axis where it is largest: a share of [`FORCE`],
+    /// or what [`View::at`] takes.
+    ///
+    /// Of a force it is the root mean square. How uncertain a view is counts in the deviation of
+    /// torques instead: the turn of a standing base about gravity is never known, and matters to
+    /// none.
     pub(super) fn extent(&self, columns: &Columns) -> f64 {
         let Some((factor, right)) = self.system(columns, 0) else {
             return f64::INFINITY;
         };
         let mean = factor.solve(&right);
-        let axes = (columns.count()..self.unknowns).map(|axis| {
+        let deviation = |axis: usize| {
             let mut unit = DVector::zeros(self.unknowns);
             unit[axis] = 1.0;
             let _ = factor.l_dirty().solve_lower_triangular_mut(&mut unit);
-            mean[axis].hypot(unit.norm() * self.branches[0].noise.sqrt())
+            unit.norm() * self.branches[0].noise.sqrt()
+        };
+        let axes = (columns.count()..self.unknowns).map(|axis| match self.contact {
+            Some(_) => mean[axis].hypot(deviation(axis)),
+            None => mean[axis].abs(),
         });
         axes.fold(0.0, f64::max)
     }
@@ -383,6 +426,7 @@ impl Fit {
         let mut all = Posterior {
             hypothesis,
             mean,
+            of_view: extra[..self.view.unknowns()].to_vec(),
             // The offset is in the sensor's own unit.
             offset_factors: (columns.sensors.iter())
                 .map(|&sensor| match branch.sight {
@@ -423,6 +467,8 @@ pub(super) struct Posterior {
     pub(super) hypothesis: Hypothesis,
     /// `[d | s]`, in SI units.
     pub(super) mean: Vec<f64>,
+    /// What [`View::at`] takes.
+    pub(super) of_view: Vec<f64>,
     offset_factors: Vec<f64>,
     factor: Cholesky<f64, Dyn>,
     noise: f64,
@@ -436,20 +482,43 @@ impl Posterior {
         }
     }
 
-    /// The standard deviation of a number with this sensitivity to `[d | s]`.
-    pub(super) fn deviation(&self, columns: &Columns, sensitivity: &[f64]) -> f64 {
+    /// The standard deviation of a number with these sensitivities to `[d | s]`, and to what
+    /// [`View::at`] takes.
+    pub(super) fn deviation(&self, columns: &Columns, sensitivity: &[f64], of_view: &[f64]) -> f64 {
         let mut scaled = DVector::zeros(self.factor.l_dirty().nrows());
         columns.scale(sensitivity, &mut scaled.as_mut_slice()[..columns.count()]);
         let offsets = scaled.as_mut_slice()[columns.first_offset()..columns.count()].chunks_mut(6);
         for (six, factor) in offsets.zip(&self.offset_factors) {
             six.iter_mut().for_each(|value| *value *= factor);
         }
+        scaled.as_mut_slice()[columns.count()..][..of_view.len()].copy_from_slice(of_view);
         let _ = self
             .factor
             .l_dirty()
             .solve_lower_triangular_mut(&mut scaled);
         scaled.norm() * self.noise.sqrt()
     }
+}
+
+/// Per sensor, the expected square of its noise in the whitened rows: together, their number. To
+/// read a sensor in a larger unit takes its noise for less, and must not look like a better fit.
+fn noise_parts(columns: &Columns, now: &Rows<'_>, factor: &Cholesky<f64, Dyn>) -> Vec<f64> {
+    let first = now.rows.offset_column();
+    let part = |(place, &sensor): (usize, &usize)| {
+        let variances = &now.variances[sensor];
+        let mut own = DMatrix::from_fn(now.rows.remaining(), 6, |row, channel| {
+            let value = now.rows.projected_row(row)[first + 6 * place + channel];
+            value * variances[channel].sqrt()
+        });
+        let _ = factor.l_dirty().solve_lower_triangular_mut(&mut own);
+        own.norm_squared()
+    };
+    columns.sensors.iter().enumerate().map(part).collect()
+}
+
+/// The combinations of the six equations that give the rows.
+fn projections(rows: &SubTreeRegressor) -> DMatrix<f64> {
+    DMatrix::from_fn(rows.remaining(), 6, |row, i| rows.projection(row)[i])
 }
 
 /// The wrenches of forces of 1 N at a contact along the axes of the base, at and in the axes of the
@@ -646,7 +715,7 @@ mod tests {
         let before = fit
             .posterior(&columns, 0)
             .unwrap()
-            .deviation(&columns, &sensitivity);
+            .deviation(&columns, &sensitivity, &[]);
         assert!((before - expected.norm()).abs() < 1e-9, "{before}");
         add(&mut fit, &a, &y);
         let (_, noise) = weighed(&mut fit);
@@ -655,7 +724,7 @@ mod tests {
             .unwrap();
         let after = fit.posterior(&columns, 0).unwrap();
         let deviation = expected.dot(&(&covariance * &expected)).sqrt();
-        assert!((after.deviation(&columns, &sensitivity) - deviation).abs() < 1e-9);
+        assert!((after.deviation(&columns, &sensitivity, &[]) - deviation).abs() < 1e-9);
         let mean = covariance * a.tr_mul(&y) / noise;
         for (number, value) in after.mean.iter().enumerate() {
             let scale = number

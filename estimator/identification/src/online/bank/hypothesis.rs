@@ -94,6 +94,13 @@ impl Hypothesis {
         contact: None,
     };
 
+    /// The same, before anything is estimated.
+    #[must_use]
+    pub fn without_estimate(mut self) -> Self {
+        self.view = self.view.at(&vec![0.0; self.view.unknowns()]);
+        self
+    }
+
     /// The channel whose readings are other than stated; none for a contact.
     #[must_use]
     pub const fn role(&self) -> Option<ChannelRole> {
@@ -156,10 +163,19 @@ impl fmt::Display for Described<'_> {
             View::Upright(_) => return f.write_str("gravity has another direction than stated"),
             View::ImuTurned(_) => return f.write_str("the IMU is mounted in another direction"),
             View::ImuInG => return f.write_str("the IMU reads accelerations in g"),
-            View::Encoder(dof, _) => {
-                return write!(f, "the encoder of {} has another zero or gain", joint(dof));
+            View::Encoder(dof, [offset, gain]) => {
+                return write!(
+                    f,
+                    "the encoder of {} has another zero or gain (right is {:.3} times its reading \
+                     {offset:+.3})",
+                    joint(dof),
+                    1.0 + gain,
+                );
             }
-            View::BaseTurned(_) => return f.write_str("the base, or its IMU, is tilted"),
+            View::BaseTurned(turn) => {
+                let angle = turn.norm().to_degrees();
+                return write!(f, "the base, or its IMU, is tilted by {angle:.0} degrees");
+            }
         }
         match self.hypothesis.sight {
             Sight::AsStated => {}
@@ -169,8 +185,13 @@ impl fmt::Display for Described<'_> {
             Sight::Axes(number, _) => {
                 return write!(f, "the F/T sensor {} has other axes", sensor(number));
             }
-            Sight::Unit(number, _) => {
-                return write!(f, "the F/T sensor {} reads in another unit", sensor(number));
+            Sight::Unit(number, factor) => {
+                return write!(
+                    f,
+                    "the F/T sensor {} reads in another unit (right is {factor:.4} times its \
+                     reading)",
+                    sensor(number)
+                );
             }
             Sight::Swapped(a, b) => {
                 let (a, b) = (sensor(a), sensor(b));

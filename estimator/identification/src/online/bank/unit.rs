@@ -1,6 +1,6 @@
 //! One sub-tree that can be free of contacts, and all hypotheses about it.
 
-use crate::online::bank::evidence::{Branch, Columns, Fit, Posterior};
+use crate::online::bank::evidence::{Branch, Columns, Fit, LASTING, Posterior};
 use crate::online::bank::hypothesis::{Hypothesis, Sight, View, quarter_turns, sights};
 use crate::robot::BaseMotion;
 use proprio_dynamics::model::{JointKind, Model};
@@ -29,9 +29,6 @@ const LITTLE: f64 = 0.1;
 /// Share of the expected tilt, or error of an encoder, that is covered, where more is withheld:
 /// floors and mountings are usually level to 0.1 rad, zeros and gears right to 0.07.
 const USUAL: f64 = 1.0 / 3.0;
-/// Ticks in which a misfit lasts: the 3 s of a movement, for it depends on the posture. In them it
-/// counts as one.
-const LASTING: f64 = 30.0;
 
 /// See the [module](self).
 #[derive(Clone, Debug)]
@@ -42,6 +39,8 @@ pub(super) struct Unit {
     /// The first branch of the first one is that everything is as stated.
     pub(super) fits: Vec<Fit>,
     at_start: Vec<Fit>,
+    /// How much a tick counts: what exceeds the stated noise is a misfit, which lasts.
+    share: f64,
 }
 
 impl Unit {
@@ -63,6 +62,7 @@ impl Unit {
             columns,
             fits: at_start.clone(),
             at_start,
+            share: 1.0,
         }
     }
 
@@ -71,12 +71,13 @@ impl Unit {
         self.fits.clone_from(&self.at_start);
     }
 
-    /// What is stated, but for other offsets from now on; then each contact that may begin now.
+    /// What is stated; with other offsets from now on; then with each contact that may begin now.
     pub(super) fn changes(&self) -> Vec<Fit> {
         let contacts = self.at_start.iter().filter_map(|fit| fit.contact).map(Some);
         let continued = |contact| self.fits[0].continued(&self.columns, contact);
-        let mut fits: Vec<Fit> = [None].into_iter().chain(contacts).map(continued).collect();
-        fits[0].forget(&self.offsets());
+        let all = [None, None].into_iter().chain(contacts);
+        let mut fits: Vec<Fit> = all.map(continued).collect();
+        fits[1].forget(&self.offsets());
         fits
     }
 
@@ -100,39 +101,41 @@ impl Unit {
         self.fits.iter_mut().for_each(|fit| fit.forget(unknowns));
     }
 
-    /// Finds the evidence of all hypotheses from the ticks so far.
+    /// Brings the evidence of all hypotheses up to date.
     pub(super) fn weigh(&mut self) {
         let Self { columns, fits, .. } = self;
-        fits.iter_mut().for_each(|fit| fit.weigh(columns));
+        fits.iter_mut().for_each(|fit| fit.weigh_news(columns));
+        let of_all = fits.iter().flat_map(|fit| &fit.branches);
+        let likeliest = of_all
+            .filter(|branch| !branch.is_refuted)
+            .max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence));
+        let noise = likeliest.map_or(1.0, |branch| branch.noise);
+        self.share = 1.0 / (1.0 + (LASTING - 1.0) * (1.0 - 1.0 / noise));
     }
 
-    /// How much likelier the readings are if this is the case than as stated, with or without a
-    /// contact; none if this is refuted, or does not matter here.
-    pub(super) fn evidence(&self, view: View, sight: Sight) -> Option<f64> {
-        let fit = self
-            .fits
-            .iter()
-            .find(|fit| fit.view == view && fit.contact.is_none())?;
-        let branch = fit.branches.iter().find(|branch| branch.sight == sight)?;
+    /// Of what is not refuted here, how much likelier the readings are if it is the case than as
+    /// stated, with or without a contact.
+    pub(super) fn evidence(&self) -> Vec<(View, Sight, f64)> {
         let as_stated = (self.fits.iter())
             .filter(|fit| fit.view == View::AsStated)
             .map(|fit| fit.branches[0].log_evidence)
             .fold(f64::NEG_INFINITY, f64::max);
-        (!branch.is_refuted).then_some(branch.log_evidence - as_stated)
+        let without_contact = self.fits.iter().filter(|fit| fit.contact.is_none());
+        without_contact
+            .flat_map(|fit| {
+                let open = fit.branches.iter().filter(|branch| !branch.is_refuted);
+                open.map(move |branch| {
+                    let evidence = self.share * (branch.log_evidence - as_stated);
+                    (fit.view, branch.sight, evidence)
+                })
+            })
+            .collect()
     }
 
     /// Sets the odds, with the evidence of other sub-trees for what matters to them too, and drops
     /// what is refuted.
     pub(super) fn decide(&mut self, elsewhere: impl Fn(View, Sight) -> f64) {
-        let of_all = self
-            .fits
-            .iter()
-            .flat_map(|fit| &fit.branches)
-            .filter(|b| !b.is_refuted);
-        let likeliest = of_all.max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence));
-        let noise = likeliest.map_or(1.0, |branch| branch.noise);
-        // What exceeds the stated noise is a misfit, which lasts.
-        let share = 1.0 / (1.0 + (LASTING - 1.0) * (1.0 - 1.0 / noise));
+        let share = self.share;
         let mut best = f64::NEG_INFINITY;
         for fit in &mut self.fits {
             for branch in fit.branches.iter_mut().filter(|branch| !branch.is_refuted) {
@@ -140,7 +143,7 @@ impl Unit {
                     (View::AsStated, Sight::AsStated) => 0.0,
                     (view, sight) => elsewhere(view, sight),
                 };
-                branch.log_odds = branch.log_prior + share * (branch.log_evidence + other);
+                branch.log_odds = branch.log_prior + share * branch.log_evidence + other;
                 best = best.max(branch.log_odds);
             }
         }
@@ -183,19 +186,20 @@ impl Unit {
         self.stated() < 0.0
     }
 
-    /// The likeliest hypothesis, if what is stated is refuted beside it.
+    /// The likeliest hypothesis, with its estimate, if what is stated is refuted beside it.
     pub(super) fn leading(&self) -> Option<Hypothesis> {
         if self.stated() > UNLIKELY.ln() {
             return None;
         }
-        let all = self
-            .fits
-            .iter()
-            .flat_map(|fit| fit.branches.iter().map(move |b| (fit, b)));
+        let all = self.fits.iter().flat_map(|fit| {
+            let branches = fit.branches.iter().enumerate();
+            branches.map(move |(number, branch)| (fit, number, branch))
+        });
         let best = all
-            .filter(|(_, branch)| !branch.is_refuted)
-            .max_by(|a, b| a.1.log_odds.total_cmp(&b.1.log_odds));
-        best.map(|(fit, branch)| fit.hypothesis(branch))
+            .filter(|(_, _, branch)| !branch.is_refuted)
+            .max_by(|a, b| a.2.log_odds.total_cmp(&b.2.log_odds));
+        let (fit, number, _) = best?;
+        Some(fit.posterior(&self.columns, number)?.hypothesis)
     }
 
     /// Whether everything is as stated, as far as is known.
