@@ -14,11 +14,10 @@ use proprio_estimator::config::Config;
 use proprio_estimator::differentiate::{Settings as WindowSettings, Window};
 use proprio_estimator::reading;
 use proprio_estimator::setup::Setup;
-use proprio_identification::dataset::defects::Defect;
 use proprio_identification::dataset::observation::Observation;
 use proprio_identification::dataset::smooth::{Scratch, Smoother};
 use proprio_identification::robot::BaseMotion;
-use proprio_identification::{Dataset, Robot, Role, Severity};
+use proprio_identification::{Dataset, Finding, Robot, Role, Severity};
 use proprio_topics::{Nanos, Quality, Reason};
 use std::path::{Path, PathBuf};
 
@@ -156,10 +155,9 @@ impl Table {
         read(robot, self.text().as_bytes())
     }
 
-    /// All its defects, including the offset jumps.
-    fn defects(&self, robot: &Robot) -> Vec<Defect> {
-        let dataset = self.dataset(robot);
-        dataset.defects().to_vec()
+    /// What is wrong with it.
+    fn findings(&self, robot: &Robot) -> Vec<Finding> {
+        self.dataset(robot).findings().to_vec()
     }
 }
 
@@ -224,35 +222,6 @@ fn log_of(
 
 /// In a log with large gaps and separate rows for torques, the rate is that of the torques while
 /// they are present.
-#[test]
-fn torques_rate_is_that_while_they_are_there() {
-    let robot = robot("");
-    let table = |period: i64| Table {
-        header: [COLUMNS[0], COLUMNS[1], "joint/shoulder/torque"]
-            .map(str::to_owned)
-            .to_vec(),
-        rows: (0..20_000_i64)
-            .filter(|i| i % 5000 < 1750)
-            .flat_map(|i| {
-                let q = motion(0, 1e-9 * (i * period) as f64)[0];
-                let encoders = (i * period, vec![q, 0.5 * q, f64::NAN]);
-                [
-                    encoders,
-                    (i * period + 300_000, vec![f64::NAN, f64::NAN, 3.0 * q]),
-                ]
-            })
-            .collect(),
-    };
-    for (period, expected) in [(1_000_000, 1000.0), (4_000_000, 250.0)] {
-        let found = table(period).dataset(&robot).torque_rate();
-        assert!((found / expected - 1.0).abs() < 1e-3, "{found}");
-    }
-    let none = log(&robot, 2.0, 1000.0, 0.0, 0.0, 1)
-        .dataset(&robot)
-        .torque_rate();
-    assert_eq!(none, 0.0);
-}
-
 fn rms(errors: impl Iterator<Item = f64>) -> f64 {
     let (sum, count) = errors.fold((0.0, 0.0), |(s, n), e| (s + e * e, n + 1.0));
     (sum / count).sqrt()
@@ -403,7 +372,7 @@ fn a_clean_log_has_no_defects_and_its_instants_are_true() {
     let robot = robot("");
     for (rate, jitter) in [(100.0, 0.5), (500.0, 0.3)] {
         let instants = log(&robot, 20.0, rate, jitter, 0.0, 7).dataset(&robot);
-        assert_eq!(instants.defects(), []);
+        assert_eq!(instants.findings(), []);
         let usable: Vec<&Observation> = instants
             .observations()
             .iter()
@@ -470,7 +439,7 @@ fn a_log_that_holds_everything_is_used_row_by_row() {
         .collect();
     let table = Table { header, rows };
     let check = |instants: &Dataset| {
-        assert_eq!(instants.defects(), []);
+        assert_eq!(instants.findings(), []);
         assert_eq!(instants.observations().len(), table.rows.len());
         for (instant, (_, row)) in instants.observations().iter().zip(&table.rows) {
             assert!(instant.faults.iter().all(|f| *f == Reason::None));
@@ -496,13 +465,12 @@ fn a_log_that_holds_everything_is_used_row_by_row() {
             .insert(at + 1, (t + if at > 150 { 0 } else { 3_000_000 }, row));
     }
     let recording = again.dataset(&robot);
-    assert_eq!(
-        recording.defects(),
-        [Defect::RepeatedRows {
-            rows: 5,
-            first: Nanos(703_000_000)
-        }]
-    );
+    let [repeated] = recording.findings() else {
+        panic!("{:?}", recording.findings());
+    };
+    assert_eq!(code(repeated), "repeated_rows");
+    assert!(repeated.text.starts_with("5 rows repeat"), "{repeated:?}");
+    assert!(repeated.text.contains("at 0.703"), "{repeated:?}");
     assert_eq!(recording.observations().len(), table.rows.len());
     // The same without stamps.
     let text: String = table
@@ -539,7 +507,7 @@ fn given_velocities_are_kept_and_differentiated() {
         row.extend(given.collect::<Vec<_>>());
     }
     let instants = table.dataset(&robot);
-    assert_eq!(instants.defects(), []);
+    assert_eq!(instants.findings(), []);
     let usable = instants
         .observations()
         .iter()
@@ -572,10 +540,15 @@ fn derivatives_that_are_noise_are_not_used() {
         row.push(if row[0].is_nan() { f64::NAN } else { given });
     }
     let instants = table.dataset(&robot);
-    let [Defect::NoisyDerivative { joint, given, off }] = instants.defects() else {
-        panic!("{:?}", instants.defects());
+    let [noisy] = instants.findings() else {
+        panic!("{:?}", instants.findings());
     };
-    assert_eq!((joint.as_str(), *given), ("elbow", "acceleration"));
+    let off = noisy
+        .text
+        .strip_prefix("joint/elbow: the logged acceleration is not that of the positions: ");
+    let off: f64 = off
+        .and_then(|rest| rest.split(' ').next()?.parse().ok())
+        .expect("a number");
     assert!((off - 12.0).abs() < 1.5, "{off}");
     let usable = instants
         .observations()
@@ -585,25 +558,9 @@ fn derivatives_that_are_noise_are_not_used() {
     assert!(error < 0.1, "{error}");
 }
 
-/// The kind of a defect, without its numbers.
-fn kind(defect: &Defect) -> &'static str {
-    match defect {
-        Defect::SkippedRows { .. } => "skipped rows",
-        Defect::NeverSeen { .. } => "never seen",
-        Defect::RepeatedRows { .. } => "repeated rows",
-        Defect::Repeated { .. } => "repeated",
-        Defect::Stamps { .. } => "stamps",
-        Defect::Gaps { .. } => "gaps",
-        Defect::Frozen { .. } => "frozen",
-        Defect::Still { .. } => "still",
-        Defect::Saturated { .. } => "saturated",
-        Defect::WrongUnits { .. } => "units",
-        Defect::Derivative { .. } => "derivative",
-        Defect::NoMotion { .. } => "no motion",
-        Defect::TooShort { .. } => "too short",
-        Defect::Outliers { .. } => "outliers",
-        _ => "other",
-    }
+/// The code of a finding.
+fn code(finding: &Finding) -> &'static str {
+    finding.code.as_str()
 }
 
 #[test]
@@ -628,7 +585,7 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
         (
             "a gap of all",
             Box::new(|t| t.rows.retain(|(t, _)| !between(*t, 80, 83))),
-            &["gaps"],
+            &["gap"],
             "every channel has no samples for 0.3",
         ),
         (
@@ -637,19 +594,19 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
                 t.rows
                     .retain(|(t, r)| !(is_wrench(r) && between(*t, 80, 84)))
             }),
-            &["gaps"],
+            &["gap"],
             "wrench/ft has no samples for 0.4",
         ),
         (
             "a sensor that ends",
             Box::new(|t| t.rows.retain(|(t, r)| !(is_wrench(r) && *t > 12 * second))),
-            &["gaps"],
+            &["gap"],
             "wrench/ft has no samples for 7.99",
         ),
         (
             "infinite",
             Box::new(|t| t.rows[500].1[0] = f64::INFINITY),
-            &["skipped rows"],
+            &["skipped_rows"],
             "1 rows cannot be read and were skipped; the first: line 502",
         ),
         (
@@ -729,19 +686,19 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
                     }
                 })
             }),
-            &["still"],
+            &["joint_still"],
             "joint/elbow never changes",
         ),
         (
             "stamps that go backward",
             Box::new(|t| (0..6).for_each(|i| t.rows[1000 + i].0 -= second)),
-            &["stamps", "stamps"],
+            &["timestamps", "timestamps"],
             "joint/shoulder, joint/elbow: 0 stamps occur twice and 3 go backward",
         ),
         (
             "one stamp far ahead",
             Box::new(|t| t.rows[1000].0 += 1000 * second),
-            &["stamps"],
+            &["timestamps"],
             "1 go backward",
         ),
         (
@@ -757,19 +714,13 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
             "fx is saturated at 25",
         ),
         (
-            "counts",
-            Box::new(|t| each(t, &mut |_, r| r[2..].iter_mut().for_each(|v| *v *= 1000.0))),
-            &["units"],
-            "counts or thousandths",
-        ),
-        (
             "degrees",
             Box::new(|t| {
                 each(t, &mut |_, r| {
                     r[..2].iter_mut().for_each(|v| *v = v.to_degrees())
                 })
             }),
-            &["units"],
+            &["wrong_units"],
             "convert all joints to radians",
         ),
         (
@@ -781,7 +732,7 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
                     }
                 })
             }),
-            &["no motion", "still", "still"],
+            &["joint_still", "joint_still", "no_motion"],
             "no joint moves",
         ),
         (
@@ -792,13 +743,19 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
                 (0..=last).for_each(|i| t.rows[i].0 = stamps[last - i]);
             }),
             // One sample is left of each channel.
-            &["stamps", "stamps", "still", "still", "too short"],
+            &[
+                "joint_still",
+                "joint_still",
+                "timestamps",
+                "timestamps",
+                "too_short",
+            ],
             "its time runs backward, first at 1",
         ),
         (
             "too short",
             Box::new(|t| t.rows.truncate(300)),
-            &["too short"],
+            &["too_short"],
             "the log of 1.",
         ),
         (
@@ -815,15 +772,15 @@ fn each_defect_put_into_a_clean_log_is_found_and_nothing_else() {
         (
             "an unrecorded sensor",
             Box::new(|t| each(t, &mut |_, r| r[2..].fill(f64::NAN))),
-            &["never seen"],
+            &["never_seen"],
             "wrench/ft is in the configuration but",
         ),
     ];
     let mut failures = Vec::new();
     for (name, change, kinds, sentence) in cases {
-        let defects = with(&*change).defects(&robot);
-        let sentences: Vec<String> = defects.iter().map(ToString::to_string).collect();
-        let mut found: Vec<&str> = defects.iter().map(kind).collect();
+        let findings = with(&*change).findings(&robot);
+        let sentences: Vec<&str> = findings.iter().map(|own| own.text.as_str()).collect();
+        let mut found: Vec<&str> = findings.iter().map(code).collect();
         found.sort_unstable();
         if found != kinds || !sentences.iter().any(|s| s.contains(sentence)) {
             failures.push(format!("{name}: {sentences:#?}"));
@@ -864,13 +821,9 @@ fn what_turns_round_or_rests_at_its_extreme_is_not_saturated_and_what_is_cut_off
             rows: rows.collect(),
         };
         let recording = table.dataset(&robot(""));
-        let flat = |d: &&Defect| matches!(d, Defect::Saturated { .. } | Defect::Frozen { .. });
-        recording
-            .defects()
-            .iter()
-            .filter(flat)
-            .map(ToString::to_string)
-            .collect()
+        let flat = |own: &&Finding| ["saturated", "frozen"].contains(&code(own));
+        let found = recording.findings().iter().filter(flat);
+        found.map(|own| own.text.clone()).collect()
     }
     let none: [String; 0] = [];
     for hertz in [0.1, 0.2, 1.0] {
@@ -928,9 +881,9 @@ fn gating_follows_contacts_quality_and_edges() {
         ]);
     }
     let instants = table.dataset(&robot);
-    let defects = instants.defects();
-    let kinds: Vec<&str> = defects.iter().map(|defect| kind(defect)).collect();
-    assert_eq!(kinds, ["saturated"], "{defects:#?}");
+    let findings = instants.findings();
+    let codes: Vec<&str> = findings.iter().map(code).collect();
+    assert_eq!(codes, ["saturated"], "{findings:#?}");
     let sensor = robot.channels.iter().position(|c| c.name == "ft").unwrap();
     let joint = robot
         .channels
@@ -1008,17 +961,11 @@ fn an_imu_tells_how_the_base_moves() {
     for (_, row) in &mut table.rows {
         row[8..11].iter_mut().for_each(|a| *a /= 9.80665);
     }
-    let defects = table.dataset(&robot).defects().to_vec();
-    assert_eq!(
-        defects.iter().map(kind).collect::<Vec<_>>(),
-        ["units"],
-        "{defects:#?}"
-    );
-    assert!(
-        defects[0].to_string().contains("is not near 9.8"),
-        "{}",
-        defects[0]
-    );
+    let findings = table.findings(&robot);
+    let codes: Vec<&str> = findings.iter().map(code).collect();
+    assert_eq!(codes, ["wrong_units"], "{findings:#?}");
+    let text = &findings[0].text;
+    assert!(text.contains("is not near 9.8"), "{text}");
 }
 
 /// A recorded log, or none if it is not available.
@@ -1054,24 +1001,32 @@ fn the_leg_of_a_real_icub_has_its_true_defects_and_no_others() {
     let robot = Setup::new(&config).unwrap().robot;
     let instants = read(&robot, std::fs::File::open(log).unwrap());
     instants
-        .defects()
+        .findings()
         .iter()
-        .for_each(|d| println!("{:?}: {d}", d.severity()));
+        .for_each(|own| println!("{own:?}"));
     println!("{} instants", instants.observations().len());
     assert_eq!(instants.observations().len(), 1981);
     let warnings = instants
-        .defects()
+        .findings()
         .iter()
-        .filter(|d| d.severity() > Severity::Note);
+        .filter(|own| own.severity > Severity::Note);
     // The left leg's board repeats one reading for nine seconds, and others now and then. All other
     // streams have no defect.
-    let (left, right): (Vec<&Defect>, Vec<&Defect>) =
-        warnings.partition(|d| d.to_string().contains("l_leg_ft_sensor"));
+    let (left, right): (Vec<&Finding>, Vec<&Finding>) =
+        warnings.partition(|own| own.text.contains("l_leg_ft_sensor"));
+    let seconds = |own: &&&Finding| {
+        let (_, rest) = own.text.split_once("does not change from ")?;
+        let (from, rest) = rest.split_once(" s to ")?;
+        let to = rest.split(' ').next()?;
+        Some(to.parse::<f64>().ok()? - from.parse::<f64>().ok()?)
+    };
+    let frozen = left.iter().filter(|own| code(own) == "frozen");
     assert!(
-        left.iter()
-            .any(|d| matches!(d, Defect::Frozen { from, to, .. } if (*to - *from).seconds() > 9.0))
+        frozen
+            .filter_map(|own| seconds(&own))
+            .any(|seconds| seconds > 9.0)
     );
-    assert_eq!(right, [] as [&Defect; 0]);
+    assert_eq!(right, [] as [&Finding; 0]);
 }
 
 #[test]
@@ -1087,10 +1042,10 @@ fn the_logs_of_a_real_kuka_are_clean() {
         let robot = Setup::new(&config).unwrap().robot;
         let instants = read(&robot, std::fs::File::open(log).unwrap());
         instants
-            .defects()
+            .findings()
             .iter()
-            .for_each(|d| println!("{:?}: {d}", d.severity()));
-        assert_eq!(instants.defects(), []);
+            .for_each(|own| println!("{own:?}"));
+        assert_eq!(instants.findings(), []);
         let usable = instants
             .observations()
             .iter()
@@ -1141,9 +1096,9 @@ fn a_wrong_model_and_a_late_start_are_no_defects() {
             ] {
                 alarms.extend(
                     table
-                        .defects(&wrong)
+                        .findings(&wrong)
                         .into_iter()
-                        .map(|d| format!("{seed}, {rate} Hz: {d}")),
+                        .map(|own| format!("{seed}, {rate} Hz: {}", own.text)),
                 );
             }
         }

@@ -1,12 +1,9 @@
 //! Several recorded logs to one set of parameters: the stages of [`identify`].
 //!
-//! 1. [`prepare_logs`]: observations without motion are dropped. Joint torques with a wrong sign or
-//!    unit are excluded ([`crate::diagnose::torque_units`]), repeated logs are refused.
-//! 2. [`plausible_model`]: the measurement model, which makes rows of observations
-//!    ([`crate::measurement::model`]). Logs with F/T readings in wrong units
-//!    ([`crate::diagnose::wrench_units`]) are refused, and so is a wrong measurement frame or
-//!    direction of a sensor, in all logs or in one ([`crate::diagnose::sensor_frame`]), and a wrong
-//!    gravity ([`crate::diagnose::gravity`]).
+//! 1. [`prepare_logs`]: observations without motion are dropped, repeated logs are refused.
+//! 2. [`plausible_model`]: what contradicts the configuration is refused: units and signs of
+//!    readings, frames of F/T sensors, gravity ([`crate::diagnose::configuration`]). The
+//!    measurement model makes rows of observations ([`crate::measurement::model`]).
 //! 3. [`exclude_disturbed`]: noise and MAP estimate in turn, until the noise converges
 //!    ([`crate::fit::alternate_noise_and_map`]). After each such fit, undeclared contacts
 //!    ([`crate::diagnose::undeclared`]) and loads ([`crate::diagnose::load`]) are excluded; then
@@ -15,8 +12,8 @@
 //!    again.
 //! 5. [`cross_validated_fit`]: fifths of the logs are predicted from the others. That share of the
 //!    change from CAD is retained which predicts best ([`crate::cross_validation`]).
-//! 6. Disturbances in validation logs, encoder errors ([`encoder_offsets::encoder_errors`]) and
-//!    delays ([`delay::delays`]) are reported, not corrected.
+//! 6. Disturbances in validation logs, errors of encoders and delays ([`crate::diagnose::search`])
+//!    are reported, not corrected.
 //! 7. [`assemble::outcome`]: figures for every log and the parameters' uncertainty.
 
 mod gains;
@@ -24,11 +21,10 @@ mod gains;
 use crate::batch::gains::fit_gains;
 use crate::cross_validation;
 use crate::dataset::{Dataset, Role};
+use crate::diagnose::search::{Search, wrong_signs};
 use crate::diagnose::undeclared::{self, Undeclared};
-use crate::diagnose::{
-    delay, encoder_offsets, gravity, load, sensor_frame, torque_units, wrench_units,
-};
-use crate::finding::{Finding, FindingCode, Severity};
+use crate::diagnose::{configuration, load};
+use crate::finding::{Finding, FindingCode};
 use crate::fit::{
     Identified, IdentifyError, LOAD_VARIANCE_RATIO, NoiseAndMap, OffsetDrift, added,
     alternate_noise_and_map, negative_rotors, parameters_without_cad, per_column, posterior,
@@ -38,7 +34,7 @@ use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::Seconds;
 use crate::measurement::reduction::{reduce, residuals};
 use crate::prior::Fit;
-use crate::report::assemble::{self, Diagnosis};
+use crate::report::assemble;
 use crate::report::outcome::Outcome;
 use crate::robot::{IdentificationInput, Robot, TorqueSide};
 use crate::training::{
@@ -95,7 +91,7 @@ pub fn identify(
     let inputs = chosen_inputs(robot, options);
 
     // 1. Logs.
-    let mut logs = prepare_logs(robot, datasets)?;
+    let mut logs = prepare_logs(robot, datasets);
 
     // 2. Measurement model, plausibility of units and frames.
     let mut measurement = match plausible_model(robot, &inputs, &mut logs)? {
@@ -116,7 +112,7 @@ pub fn identify(
     // 3. Noise and MAP estimate, without undeclared disturbances.
     let mut clean = exclude_disturbed(robot, &measurement, &mut logs, &mut report_progress)?;
 
-    let signs = encoder_offsets::wrong_signs(&measurement, &training_logs(&logs), &clean.estimate);
+    let signs = wrong_signs(&measurement, &training_logs(&logs), &clean.estimate);
 
     // 4. Gains of the F/T sensors.
     let gain = match robot.calibrated.gain {
@@ -165,27 +161,20 @@ pub fn identify(
     undeclared::report_validation(&measurement, &mut logs, &identified);
     let training = training_logs(&logs);
     report_progress("figures".into(), 0.88);
-    // A wrong sign looks like offsets of other joints.
-    let encoder_offsets = if signs.is_empty() {
-        encoder_offsets::encoder_errors(&measurement, &training, &identified)
+    let (found, time_offsets) = if signs.is_empty() {
+        Search::new(&measurement, &training, &identified).findings()
     } else {
-        signs
+        (signs, Vec::new())
     };
-    let (time_offsets, delays) = delay::delays(&measurement, &training, &identified);
 
     // 7. Figures.
-    let diagnosis = Diagnosis {
-        encoder_offsets,
-        time_offsets,
-        delays,
-    };
     let outcome = assemble::outcome(
         robot,
         &measurement,
         &logs,
         &training,
         &identified,
-        diagnosis,
+        (found, time_offsets),
     );
     report_progress("done".into(), 1.0);
     Ok(outcome)
@@ -204,43 +193,35 @@ pub(crate) fn chosen_inputs(robot: &Robot, options: &Options) -> Vec<Identificat
     }
 }
 
-/// Logs of observations with known motion. Joint torques with a wrong sign or unit are excluded,
-/// repeated logs are refused.
-pub(crate) fn prepare_logs(
-    robot: &Robot,
-    datasets: Vec<Dataset>,
-) -> Result<Vec<TrainingLog>, IdentifyError> {
-    let mut logs = Vec::new();
-    for dataset in datasets {
-        let mut log = prepare(robot, dataset);
-        for found in torque_units::faulty(robot, &log)? {
-            log.exclude_torque(found.dof, found.reason, found.finding);
-        }
-        logs.push(log);
-    }
+/// Logs of observations with known motion; repeated ones are refused.
+pub(crate) fn prepare_logs(robot: &Robot, datasets: Vec<Dataset>) -> Vec<TrainingLog> {
+    let each = datasets.into_iter().map(|dataset| prepare(robot, dataset));
+    let mut logs: Vec<TrainingLog> = each.collect();
     refuse_repeated(&mut logs);
-    Ok(logs)
+    logs
 }
 
-/// The measurement model of the training logs whose F/T readings have plausible units, frames and
-/// directions; other logs are refused. Breaks off with an outcome without parameters if no log
-/// remains, no row contains a link, or a sensor is wrong in all logs.
+/// The measurement model of the training logs that do not contradict the configuration. Breaks off
+/// with an outcome without parameters if all of them together do, or no row contains a link.
 pub(crate) fn plausible_model<'a>(
     robot: &'a Robot,
     inputs: &[IdentificationInput],
     logs: &mut [TrainingLog],
 ) -> Result<ControlFlow<Box<Outcome>, MeasurementModel<'a>>, IdentifyError> {
-    let nothing = |logs: &[TrainingLog], reason: String| {
-        Ok(ControlFlow::Break(Box::new(assemble::nothing(
-            robot, logs, reason,
-        ))))
+    let nothing = |logs: &[TrainingLog], reason: String, findings: Vec<Finding>| {
+        let mut outcome = assemble::nothing(robot, logs, reason);
+        outcome.findings.extend(findings);
+        Ok(ControlFlow::Break(Box::new(outcome)))
     };
+    if let ControlFlow::Break((reason, findings)) = configuration::check(robot, inputs, logs)? {
+        return nothing(logs, reason, findings);
+    }
     let training = training_logs(logs);
     if training.is_empty() {
-        return nothing(logs, no_log(logs));
+        return nothing(logs, no_log(logs), Vec::new());
     }
     let all = training.iter().flat_map(|log| log.instants.iter());
-    let mut measurement = MeasurementModel::for_observations(robot, inputs, all)?;
+    let measurement = MeasurementModel::for_observations(robot, inputs, all)?;
     if measurement.unknowns().links.is_empty() {
         let what = match inputs {
             [IdentificationInput::Torque] => {
@@ -256,91 +237,14 @@ pub(crate) fn plausible_model<'a>(
                  free of unknown contacts"
             }
         };
-        return nothing(
-            logs,
-            format!("no measurement contains the links' parameters: {what}"),
-        );
-    }
-
-    // Units.
-    let before = training.len();
-    for log in &mut *logs {
-        let wrong = wrench_units::wrong(&mut measurement, log);
-        log.add_findings(wrong);
-    }
-    if let Some(surveyed) = surveyed_again(robot, inputs, logs, before)? {
-        measurement = surveyed;
-    }
-    if measurement.unknowns().links.is_empty() {
-        return nothing(logs, no_log(logs));
-    }
-
-    // Measurement frames and directions, in all logs together.
-    let training = training_logs(logs);
-    let wrong = sensor_frame::wrong(&measurement, &training);
-    if !wrong.is_empty() {
-        let names: Vec<&str> = wrong.iter().map(|f| f.subject.as_str()).collect();
-        let mut outcome = assemble::nothing(
-            robot,
-            logs,
-            format!(
-                "{}: wrong measurement frame or direction; nothing was identified",
-                names.join(", ")
-            ),
-        );
-        outcome.findings.extend(wrong);
-        return Ok(ControlFlow::Break(Box::new(outcome)));
-    }
-
-    // Gravity.
-    if let Some(wrong) = gravity::wrong(&measurement, &training) {
-        let mut outcome = assemble::nothing(robot, logs, wrong.text.clone());
-        outcome.findings.push(wrong);
-        return Ok(ControlFlow::Break(Box::new(outcome)));
-    }
-
-    // ... and in each log alone.
-    let found = sensor_frame::wrong_alone(&measurement, &training, logs);
-    let before = training.len();
-    for (log, found) in logs.iter_mut().zip(found) {
-        log.refused |= !found.is_empty();
-        log.findings.extend(found);
-    }
-    if let Some(surveyed) = surveyed_again(robot, inputs, logs, before)? {
-        measurement = surveyed;
-    }
-    if measurement.unknowns().links.is_empty() {
-        return nothing(logs, no_log(logs));
+        let reason = format!("no measurement contains the links' parameters: {what}");
+        return nothing(logs, reason, Vec::new());
     }
     Ok(ControlFlow::Continue(measurement))
 }
 
-/// A new survey of the training logs if they are not the `before` that there were; without any link
-/// if none remains.
-fn surveyed_again<'a>(
-    robot: &'a Robot,
-    inputs: &[IdentificationInput],
-    logs: &[TrainingLog],
-    before: usize,
-) -> Result<Option<MeasurementModel<'a>>, IdentifyError> {
-    let training = training_logs(logs);
-    if training.len() == before {
-        return Ok(None);
-    }
-    let instants = training.iter().flat_map(|log| log.instants.iter());
-    Ok(Some(MeasurementModel::for_observations(
-        robot, inputs, instants,
-    )?))
-}
-
 /// What the configuration requests but the inputs do not contain.
 fn not_available(robot: &Robot, inputs: &[IdentificationInput]) -> Vec<Finding> {
-    let note = |code, key: &str, text: String| Finding {
-        severity: Severity::Note,
-        code,
-        subject: key.to_owned(),
-        text,
-    };
     let mut notes = Vec::new();
     if !robot.calibrated.is_empty() && !inputs.contains(&IdentificationInput::Wrench) {
         let requested = [
@@ -360,7 +264,8 @@ fn not_available(robot: &Robot, inputs: &[IdentificationInput]) -> Vec<Finding> 
             "{requested} requested but not available: F/T sensors are not among the inputs of \
              identification, so none is calibrated; add \"wrench\" to the inputs"
         );
-        notes.push(note(FindingCode::CalibrationNotAvailable, &requested, text));
+        let code = FindingCode::CalibrationNotAvailable;
+        notes.push(Finding::note(code, requested, text));
     }
     if robot.torque_side == TorqueSide::Motor && !inputs.contains(&IdentificationInput::Torque) {
         let key = "identification.torque_side";
@@ -369,7 +274,7 @@ fn not_available(robot: &Robot, inputs: &[IdentificationInput]) -> Vec<Finding> 
              inputs of identification, so no rotor inertia is identified; add \"torque\" to the \
              inputs"
         );
-        notes.push(note(FindingCode::RotorsNotAvailable, key, text));
+        notes.push(Finding::note(FindingCode::RotorsNotAvailable, key, text));
     }
     notes
 }
@@ -610,7 +515,6 @@ mod tests {
             file: String::new(),
             role: Role::Train,
             span: (instants[0].t, instants[instants.len() - 1].t),
-            torque_rate: 0.0,
             instants: instants.to_vec(),
             excluded: Vec::new(),
             findings: Vec::new(),

@@ -299,17 +299,16 @@ fn retained_fraction(
 }
 
 fn not_cross_validated() -> Finding {
-    Finding {
-        severity: Severity::Warning,
-        code: FindingCode::NotCrossValidated,
-        subject: String::new(),
-        text: format!(
+    Finding::warning(
+        FindingCode::NotCrossValidated,
+        "",
+        format!(
             "the logs are too short for cross-validation: all links keep their URDF parameters; \
              record at least {} usable instants, or static poses in {} seconds",
             2 * MIN_FOLD,
             2 * MIN_SECONDS,
         ),
-    }
+    )
 }
 
 fn shrunk(retained_fraction: f64, names: String) -> Finding {
@@ -330,10 +329,5 @@ fn shrunk(retained_fraction: f64, names: String) -> Finding {
     } else {
         Severity::Warning
     };
-    Finding {
-        severity,
-        code: FindingCode::ShrunkToCad,
-        subject: names,
-        text,
-    }
+    Finding::new(severity, FindingCode::ShrunkToCad, &names, text)
 }

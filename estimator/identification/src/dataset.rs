@@ -1,16 +1,15 @@
 //! Converts recorded channels to observations at common times, with velocities and accelerations,
-//! and finds defects of the log.
+//! and finds what is wrong with the log.
 //!
 //! ```text
 //! samples -> Recording                               recording
 //!     -> ordered stamps; repeats, spikes removed     cleaning, repeats
 //!     -> checks of single channels                   inspection
 //!     -> every channel at common times               resampling, stream, smooth
-//!     -> Dataset: observations, defects
+//!     -> Dataset: observations, findings
 //! ```
 
 mod cleaning;
-pub mod defects;
 mod inspection;
 pub mod observation;
 pub mod recording;
@@ -19,8 +18,8 @@ pub mod resampling;
 pub mod smooth;
 mod stream;
 
+use crate::finding::{Finding, FindingCode};
 use crate::robot::{ChannelRole, Robot};
-use defects::Defect;
 use observation::Observation;
 use proprio_topics::Nanos;
 use recording::Recording;
@@ -52,8 +51,7 @@ pub struct Dataset {
     /// Its use.
     pub role: Role,
     pub(crate) instants: Vec<Observation>,
-    pub(crate) defects: Vec<Defect>,
-    pub(crate) torque_rate: f64,
+    pub(crate) findings: Vec<Finding>,
     /// Sample spacing, if it exceeds the time that a channel may be silent.
     pub(crate) apart: Option<Nanos>,
 }
@@ -63,7 +61,7 @@ impl Dataset {
     ///
     /// # Errors
     /// [`DatasetError`]: a joint that is not locked, or the IMU of the base, has no sample. A
-    /// missing F/T sensor is a defect.
+    /// missing F/T sensor is a finding.
     pub fn new(
         robot: &Robot,
         name: &str,
@@ -97,14 +95,12 @@ impl Dataset {
         }
         inspection::inspect(&mut recording, robot);
         let spacing = recording.spacing();
-        let found = recording.instants(robot);
         Ok(Self {
             name: name.to_owned(),
             role,
-            instants: found.instants,
-            defects: found.defects,
-            torque_rate: recording.torque_rate(),
+            instants: recording.instants(robot),
             apart: (recording.is_stamped() && spacing > robot.max_silence).then_some(spacing),
+            findings: recording.findings,
         })
     }
 
@@ -115,8 +111,7 @@ impl Dataset {
             name: name.to_owned(),
             role,
             instants: Vec::new(),
-            defects: vec![Defect::Unreadable { reason }],
-            torque_rate: 0.0,
+            findings: vec![Finding::refusal(FindingCode::Unreadable, "", reason)],
             apart: None,
         }
     }
@@ -127,16 +122,9 @@ impl Dataset {
         &self.instants
     }
 
-    /// Samples of joint torques per second, from the median spacing of their stamps: the rate of
-    /// the fastest joint \[Hz\]; 0 if there are none. Gaps do not count.
+    /// What is wrong with the log.
     #[must_use]
-    pub fn torque_rate(&self) -> f64 {
-        self.torque_rate
-    }
-
-    /// The defects of the log.
-    #[must_use]
-    pub fn defects(&self) -> &[Defect] {
-        &self.defects
+    pub fn findings(&self) -> &[Finding] {
+        &self.findings
     }
 }

@@ -1,7 +1,7 @@
 //! One fit: noise of every channel and maximum a posteriori (MAP) parameters in turn, until both
 //! converge.
 
-use crate::finding::{Finding, FindingCode, Severity};
+use crate::finding::{Finding, FindingCode};
 use crate::hypothesis;
 use crate::linear::information::Information;
 use crate::measurement::model::MeasurementModel;
@@ -204,17 +204,16 @@ pub(crate) fn negative_rotors(robot: &Robot, unknowns: &Unknowns, fit: &Fit) -> 
         let (value, deviation) = (fit.x[column], root.row(column).norm());
         if value < -significant * deviation {
             let joint = robot.model.dof_name(dof).to_owned();
-            findings.push(Finding {
-                severity: Severity::Warning,
-                code: FindingCode::NegativeRotorInertia,
-                text: format!(
+            findings.push(Finding::warning(
+                FindingCode::NegativeRotorInertia,
+                &joint,
+                format!(
                     "{joint}: its estimated rotor inertia is negative, {value:.4} +- \
                      {deviation:.4}, and was set to 0. Check the sign of its torque, velocity and \
                      acceleration, the time offset between its torque and its encoder, and \
                      whether torques are measured at the motors (identification.torque_side)"
                 ),
-                subject: joint,
-            });
+            ));
         }
     }
     findings
@@ -384,16 +383,17 @@ pub(crate) fn per_column(unknowns: &Unknowns, values: &[f64]) -> Vec<f64> {
 
 /// A warning that the rounds ended before noise and prior scale converged.
 pub(crate) fn unsettled(change: f64) -> Option<Finding> {
-    (change > 0.0).then(|| Finding {
-        severity: Severity::Warning,
-        code: FindingCode::NotConverged,
-        subject: String::new(),
-        text: format!(
-            "noise and the prior's scale did not converge in {ROUNDS} rounds: the last round \
+    (change > 0.0).then(|| {
+        Finding::warning(
+            FindingCode::NotConverged,
+            "",
+            format!(
+                "noise and the prior's scale did not converge in {ROUNDS} rounds: the last round \
              changed a variance by {:.0} %, and the standard deviations are uncertain by as much; \
              record longer logs",
-            100.0 * change.exp_m1()
-        ),
+                100.0 * change.exp_m1()
+            ),
+        )
     })
 }
 

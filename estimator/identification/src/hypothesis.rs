@@ -1,13 +1,14 @@
-//! The test of whether an additional effect explains residuals: a load, an offset jump, an encoder
-//! offset and a delay.
+//! The test of whether an additional effect explains residuals: a load, an encoder offset, a delay,
+//! another frame of a sensor.
 //!
-//! An effect adds unknowns to the parameters
-//! and the noise. Its gain is the increase of twice the log-likelihood with these unknowns, with
-//! all others fitted again. In the linear case the gain is the square of the estimate in standard
-//! deviations. Without an effect, the gain is a chi-square variable with one degree of freedom per
-//! unknown (Wilks 1938), or less under a prior. If the best of several effects is tested, the false
-//! alarm rate of each is divided by their number (Bonferroni).
+//! An effect adds unknowns to the parameters and the noise. Its gain is the increase of twice the
+//! log-likelihood with these unknowns, with all others fitted again. In the linear case the gain is
+//! the square of the estimate in standard deviations. Without an effect, the gain is a chi-square
+//! variable with one degree of freedom per unknown (Wilks 1938), or less under a prior. If the best
+//! of several effects is tested, the false alarm rate of each is divided by their number
+//! (Bonferroni).
 
+use crate::parallel;
 use crate::statistics::{chi_square, exceeded};
 
 /// Probability of finding an effect of a kind in a log without one.
@@ -21,6 +22,37 @@ pub(crate) fn needed(freedom: usize, tried: usize) -> f64 {
 /// The threshold for one unknown of either sign, in standard deviations.
 pub(crate) fn deviations(tried: usize) -> f64 {
     needed(1, tried).sqrt()
+}
+
+/// The hypotheses that are accepted one after another, of those that are `tried` beside the
+/// accepted ones: the first whose cost is within the factor `similar` of the least one, if it is
+/// lower than before by more than `least`, given the cost before.
+pub(crate) fn accepted<H: Clone + Send + Sync>(
+    tried: impl Fn(&[H]) -> Vec<H>,
+    cost: impl Fn(&[H]) -> Option<f64> + Sync,
+    least: impl Fn(f64) -> f64,
+    similar: f64,
+) -> Vec<H> {
+    let mut accepted = Vec::new();
+    let Some(mut before) = cost(&[]) else {
+        return accepted;
+    };
+    loop {
+        let tried = tried(&accepted);
+        let costs = parallel::map(tried.len(), |number| {
+            cost(&[&accepted[..], &tried[number..=number]].concat()).unwrap_or(f64::INFINITY)
+        });
+        let lowest = costs.iter().copied().fold(f64::INFINITY, f64::min);
+        let mut all = tried.into_iter().zip(costs);
+        let most = before - least(before);
+        match all.find(|(_, cost)| *cost < most && *cost <= similar * lowest) {
+            Some((own, cost)) => {
+                accepted.push(own);
+                before = cost;
+            }
+            None => return accepted,
+        }
+    }
 }
 
 #[cfg(test)]

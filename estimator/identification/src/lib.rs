@@ -9,12 +9,13 @@
 //!
 //! # Stages
 //! [`Dataset::new`] makes a log into observations: all channels at common instants, with
-//! derivatives, and a list of defects. [`identify`] then calls, in this order (details:
+//! derivatives, and a list of findings. [`identify`] then calls, in this order (details:
 //! `batch.rs`):
 //!
-//! 1. `prepare_logs`: drops observations without motion; joint torques with a wrong sign or unit.
-//! 2. `plausible_model`: rows of each observation, `A d + G s = r + N e`; refuses F/T sensors with
-//!    wrong units, frame or direction.
+//! 1. `prepare_logs`: drops observations without motion.
+//! 2. `plausible_model`: leaves out joint torques with a wrong sign or unit, refuses F/T sensors
+//!    with wrong units, frame or direction, and a wrong gravity (`diagnose::configuration`); rows
+//!    of each observation, `A d + G s = r + N e`.
 //! 3. `exclude_disturbed`: the nuisance parameters `s` are eliminated by a Kalman filter
 //!    (`measurement::reduction`), which leaves the square-root information `[R | z]` about `d`
 //!    ([`linear::information`]). The maximum a posteriori (MAP) parameters under a prior at CAD
@@ -23,7 +24,7 @@
 //! 4. `with_gains`: all gains of the F/T sensors.
 //! 5. `cross_validated_fit`: that share of the change from CAD is retained which predicts held-out
 //!    data best.
-//! 6. `encoder_errors`, `delays`: encoder signs, encoder offsets and time offsets are reported.
+//! 6. `diagnose::search`: encoder signs, encoder offsets and time offsets are reported.
 //! 7. `outcome`: the [`Outcome`].
 //!
 //! One test, `hypothesis`, decides whether a load, an encoder offset or a delay explains more of

@@ -57,7 +57,7 @@
 //! offsets that fit them best. The most probable parameters are solved every second, and judge new
 //! rows.
 
-mod bank;
+pub(crate) mod bank;
 mod channel;
 mod rows;
 mod selection;

@@ -88,7 +88,7 @@ pub fn payload(
 ) -> Result<Payload, PayloadError> {
     let name = || robot.model.link_name(frame.link).to_owned();
     let inputs = batch::chosen_inputs(robot, options);
-    let mut logs = prepare_logs(robot, datasets)?;
+    let mut logs = prepare_logs(robot, datasets);
     let measurement = match plausible_model(robot, &inputs, &mut logs)? {
         ControlFlow::Continue(measurement) => measurement,
         ControlFlow::Break(outcome) => return Err(PayloadError::Unusable(reason(*outcome))),

@@ -1,7 +1,6 @@
 //! The logs of an identification: the observations that can be used, why others are excluded, and
 //! the segments in which they are processed.
 
-use crate::dataset::defects::Defect;
 use crate::dataset::observation::{Annotated, Observation, UnitSet};
 use crate::dataset::{Dataset, Role};
 use crate::finding::{Finding, FindingCode, Severity};
@@ -62,8 +61,6 @@ pub(crate) struct TrainingLog {
     pub file: String,
     pub role: Role,
     pub span: (Nanos, Nanos),
-    /// Sample rate of the fastest joint torque \[Hz\]; 0 if there is none.
-    pub torque_rate: f64,
     pub instants: Vec<Annotated>,
     pub excluded: Vec<Excluded>,
     pub findings: Vec<Finding>,
@@ -115,16 +112,6 @@ pub(crate) fn training_logs_mut(
     logs.iter_mut().filter(is_used)
 }
 
-/// A finding that refuses a log.
-pub(crate) fn refusal(code: FindingCode, text: String) -> Finding {
-    Finding {
-        severity: Severity::Refusal,
-        code,
-        subject: String::new(),
-        text,
-    }
-}
-
 /// Refuses logs that repeat another one. Training twice on the same data would understate their
 /// noise, and training data cannot validate the result.
 pub(crate) fn refuse_repeated(logs: &mut [TrainingLog]) {
@@ -135,23 +122,14 @@ pub(crate) fn refuse_repeated(logs: &mut [TrainingLog]) {
         };
         let is_same = |other: &&mut TrainingLog| {
             // To the bit, because what was not measured is NaN.
-            let same = |a: &[f64], b: &[f64]| {
-                a.iter()
-                    .map(|x| x.to_bits())
-                    .eq(b.iter().map(|x| x.to_bits()))
-            };
-            let reads = |a: &[Wrench], b: &[Wrench]| {
-                a.len() == b.len()
-                    && a.iter()
-                        .zip(b)
-                        .all(|(a, b)| same(&a.torque_first(), &b.torque_first()))
+            let numbers = |of: &Annotated| -> Vec<u64> {
+                let readings = of.readings.iter().flat_map(Wrench::torque_first);
+                let others = of.position.iter().chain(&of.torque).copied();
+                others.chain(readings).map(f64::to_bits).collect()
             };
             let mut pairs = other.instants.iter().zip(&log.instants);
             let alike = |(a, b): (&Annotated, &Annotated)| {
-                a.t - other.span.0 == b.t - log.span.0
-                    && same(&a.position, &b.position)
-                    && same(&a.torque, &b.torque)
-                    && reads(&a.readings, &b.readings)
+                a.t - other.span.0 == b.t - log.span.0 && numbers(a) == numbers(b)
             };
             !other.refused && other.instants.len() == log.instants.len() && pairs.all(alike)
         };
@@ -171,7 +149,8 @@ pub(crate) fn refuse_repeated(logs: &mut [TrainingLog]) {
             }
         };
         let text = format!("it is the same recording as {}: {instead}", other.file);
-        log.findings.push(refusal(FindingCode::DuplicateLog, text));
+        log.findings
+            .push(Finding::refusal(FindingCode::DuplicateLog, "", text));
         log.refused = true;
     }
 }
@@ -212,12 +191,10 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
         name: file,
         role,
         instants: all,
-        defects,
-        torque_rate,
+        mut findings,
         ..
     } = dataset;
-    let mut findings: Vec<Finding> = defects.iter().map(finding).collect();
-    let refused = defects.iter().any(|d| d.severity() == Severity::Refusal);
+    let refused = findings.iter().any(|own| own.severity == Severity::Refusal);
     let span = match (all.first(), all.last()) {
         (Some(first), Some(last)) => (first.t, last.t),
         _ => (Nanos::ZERO, Nanos::ZERO),
@@ -276,8 +253,9 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
     }
     let is_short = folds(instants.iter().map(|instant| instant.t)) < 1;
     if is_short && !refused {
-        findings.push(refusal(
+        findings.push(Finding::refusal(
             FindingCode::TooShort,
+            "",
             too_few(instants.len(), apart, &reasons, &findings),
         ));
     }
@@ -285,7 +263,6 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
         file,
         role,
         span,
-        torque_rate,
         refused: refused || is_short,
         instants,
         excluded: reasons.into_values().collect(),
@@ -327,38 +304,6 @@ fn too_few(
         })
     };
     format!("usable instants: {count}, so nothing is identified from this log: {why}")
-}
-
-pub(crate) fn finding(defect: &Defect) -> Finding {
-    let (code, subject) = match defect {
-        Defect::Unreadable { .. } => (FindingCode::Unreadable, String::new()),
-        Defect::SkippedRows { .. } => (FindingCode::SkippedRows, String::new()),
-        Defect::NeverSeen { channel } => (FindingCode::NeverSeen, channel.clone()),
-        Defect::RepeatedRows { .. } => (FindingCode::RepeatedRows, String::new()),
-        Defect::Repeated { channel, .. } => (FindingCode::Repeated, channel.clone()),
-        Defect::Stamps { channel, .. } => (FindingCode::Timestamps, channel.clone()),
-        Defect::Gaps { channel, .. } => (FindingCode::Gap, channel.clone()),
-        Defect::Frozen { channel, .. } | Defect::MarkedFrozen { channel, .. } => {
-            (FindingCode::Frozen, channel.clone())
-        }
-        Defect::Still { channel } => (FindingCode::JointStill, channel.clone()),
-        Defect::Saturated { channel, .. } => (FindingCode::Saturated, channel.clone()),
-        Defect::WrongUnits { channels, .. } => (FindingCode::WrongUnits, channels.join(", ")),
-        Defect::Derivative { joint, .. } | Defect::NoisyDerivative { joint, .. } => {
-            (FindingCode::Derivative, joint.clone())
-        }
-        Defect::NoMotion { .. } => (FindingCode::NoMotion, String::new()),
-        Defect::TooShort { .. } => (FindingCode::TooShort, String::new()),
-        Defect::Outliers { channel, .. } => (FindingCode::Outliers, channel.clone()),
-        Defect::WrongSign { sensor } => (FindingCode::WrongSign, sensor.clone()),
-        Defect::WrongFrame { sensor, .. } => (FindingCode::WrongFrame, sensor.clone()),
-    };
-    Finding {
-        severity: defect.severity(),
-        code,
-        subject,
-        text: defect.to_string(),
-    }
 }
 
 /// Results of a pass over each segment, on all cores, in the order of the segments.

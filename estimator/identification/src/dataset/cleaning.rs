@@ -2,11 +2,11 @@
 //! stretches, and spikes of encoders, joint torques and gyroscopes. Everything removed is reported
 //! as a defect.
 
-use crate::dataset::defects::Defect;
 use crate::dataset::recording::Recording;
 use crate::dataset::repeats::{Repeat, Repeats};
 use crate::dataset::smooth::quantum;
 use crate::dataset::stream::{JointTrack, MOTION, Stream};
+use crate::finding::{Finding, FindingCode};
 use crate::robot::{ChannelRole, Robot};
 use crate::statistics::robust_std;
 use proprio_topics::Nanos;
@@ -27,7 +27,37 @@ struct Disorder {
     first: Option<Nanos>,
 }
 
-impl<const D: usize> Stream<D> {
+/// A stream of any number of axes.
+trait Series {
+    fn order(&mut self) -> Disorder;
+    fn remove(&mut self, stamps: &[Nanos]);
+    fn measure(&mut self, max_silence: Nanos);
+}
+
+impl Recording {
+    /// Every stream of a channel.
+    fn streams(&mut self, role: ChannelRole) -> Vec<&mut dyn Series> {
+        match role {
+            ChannelRole::Joint(dof) => {
+                let track = &mut self.joints[dof];
+                vec![
+                    &mut track.position,
+                    &mut track.velocity,
+                    &mut track.acceleration,
+                    &mut track.torque,
+                ]
+            }
+            ChannelRole::Sensor(number) => vec![&mut self.sensors[number]],
+            ChannelRole::Base => vec![
+                &mut self.imu.proper_acceleration,
+                &mut self.imu.angular_velocity,
+                &mut self.imu.angular_acceleration,
+            ],
+        }
+    }
+}
+
+impl<const D: usize> Series for Stream<D> {
     /// Removes as few samples as possible so that every stamp is later than the previous one: keeps
     /// a longest increasing subsequence.
     fn order(&mut self) -> Disorder {
@@ -86,6 +116,12 @@ impl<const D: usize> Stream<D> {
         }
     }
 
+    fn measure(&mut self, max_silence: Nanos) {
+        Self::measure(self, max_silence);
+    }
+}
+
+impl<const D: usize> Stream<D> {
     /// Removes samples of one axis that lie far from three neighbours on each side. Returns their
     /// number, the largest deviation, and its time. Deviations up to `least` are accepted.
     fn despike(&mut self, axis: usize, least: f64) -> Option<(usize, f64, Nanos)> {
@@ -139,35 +175,29 @@ pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
     let mut disorders = Vec::new();
     for (channel, repeat) in channels.iter().zip(&repeats.channels) {
         let mut worst = Disorder::default();
-        let mut note = |d: Disorder| {
-            if d.repeated + d.backward > worst.repeated + worst.backward {
-                worst = d;
+        for stream in recording.streams(channel.role) {
+            let own = stream.order();
+            if own.repeated + own.backward > worst.repeated + worst.backward {
+                worst = own;
             }
-        };
-        let note = std::cell::RefCell::new(&mut note);
-        recording.streams(
-            channel.role,
-            &mut |s| (note.borrow_mut())(s.order()),
-            &mut |s| (note.borrow_mut())(s.order()),
-            &mut |s| (note.borrow_mut())(s.order()),
-        );
+            stream.measure(max_silence);
+        }
         worst.repeated = worst.repeated.saturating_sub(repeat.same_stamp.len());
         disorders.push((label(channel), worst));
-        recording.streams(
-            channel.role,
-            &mut |s| s.measure(max_silence),
-            &mut |s| s.measure(max_silence),
-            &mut |s| s.measure(max_silence),
-        );
     }
     for (names, disorder) in merged(disorders, |a, b| a == b) {
         if let (Some(first), true) = (disorder.first, disorder.repeated + disorder.backward > 0) {
-            found.push(Defect::Stamps {
-                channel: names,
-                repeated: disorder.repeated,
-                backward: disorder.backward,
-                first,
-            });
+            let Disorder {
+                repeated, backward, ..
+            } = disorder;
+            let text = format!(
+                "{names}: {repeated} stamps occur twice and {backward} go backward, the first at \
+                 {first} s: these samples were excluded; check the recorder's clock"
+            );
+            found.push(Finding::warning(FindingCode::Timestamps, names, text));
+            if recording.backward.is_none_or(|(most, _)| backward > most) {
+                recording.backward = Some((backward, first));
+            }
         }
     }
     repeated(recording, &channels, &mut repeats, &mut found);
@@ -176,19 +206,11 @@ pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
         if let ChannelRole::Joint(dof) = channel.role {
             let name = label(channel);
             if let Some((from, to)) = stopped(&recording.joints[dof].position) {
-                found.push(Defect::Frozen {
-                    channel: name.clone(),
-                    from,
-                    to,
-                });
+                recording.frozen.push((name.clone(), from, to));
                 recording.joints[dof].each(|s| s.retain_outside(from, to));
             }
             for (from, to) in dead(&recording.joints[dof]) {
-                found.push(Defect::Frozen {
-                    channel: format!("{name}/torque"),
-                    from,
-                    to,
-                });
+                recording.frozen.push((format!("{name}/torque"), from, to));
                 // The first sample is removed too: its time of measurement is unknown.
                 let stamps = &recording.joints[dof].torque.t;
                 let drop: Vec<bool> = stamps.iter().map(|t| (from..=to).contains(t)).collect();
@@ -201,34 +223,43 @@ pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
                 ("position", &mut track.position, noise),
                 ("torque", &mut track.torque, 1e-9),
             ] {
-                if let Some((samples, largest, t)) = stream.despike(0, least) {
-                    found.push(Defect::Outliers {
-                        channel: name.clone(),
-                        axis,
-                        samples,
-                        largest,
-                        t,
-                    });
-                }
+                found.extend(
+                    stream
+                        .despike(0, least)
+                        .map(|own| outliers(&name, axis, own)),
+                );
             }
         }
         if channel.role == ChannelRole::Base {
             for (axis, word) in ["gx", "gy", "gz"].into_iter().enumerate() {
-                if let Some((samples, largest, t)) =
-                    recording.imu.angular_velocity.despike(axis, 1e-9)
-                {
-                    found.push(Defect::Outliers {
-                        channel: label(channel),
-                        axis: word,
-                        samples,
-                        largest,
-                        t,
-                    });
-                }
+                let own = recording.imu.angular_velocity.despike(axis, 1e-9);
+                found.extend(own.map(|own| outliers(&label(channel), word, own)));
             }
         }
     }
-    recording.defects = found;
+    found.extend(recording.frozen.iter().map(|(channel, from, to)| {
+        let text = format!(
+            "{channel} does not change from {from} s to {to} s while the robot moves: this time is \
+             excluded; check the cable and the board"
+        );
+        Finding::warning(FindingCode::Frozen, channel, text)
+    }));
+    recording.findings = found;
+}
+
+/// Samples far from their neighbours: their number, the largest deviation, its time.
+fn outliers(channel: &str, axis: &str, (samples, largest, t): (usize, f64, Nanos)) -> Finding {
+    let unit = match axis {
+        "torque" => "Nm",
+        "position" => "rad (or m)",
+        _ => "rad/s",
+    };
+    let text = format!(
+        "{channel}: {samples} outlier{} of {axis}, the largest by {largest:.4} {unit} at {t} s: \
+         excluded",
+        if samples == 1 { "" } else { "s" }
+    );
+    Finding::warning(FindingCode::Outliers, channel, text)
 }
 
 /// Merges equal entries of several channels to one.
@@ -262,12 +293,13 @@ fn repeated(
     recording: &mut Recording,
     channels: &[crate::robot::Channel],
     repeats: &mut Repeats,
-    found: &mut Vec<Defect>,
+    found: &mut Vec<Finding>,
 ) {
     for (channel, repeat) in channels.iter().zip(&mut repeats.channels) {
         repeat.later.sort_unstable();
         let (stamps, ..) = recording.stamps(channel.role);
         let (mut drop, mut held_samples, all) = (Vec::new(), 0, stamps.len());
+        let mut frozen = Vec::new();
         // Runs of repeats. Each run follows the sample that it repeats.
         let mut i = 1;
         while i < stamps.len() {
@@ -288,32 +320,20 @@ fn repeated(
                     held_samples += run.len();
                 } else if recording.moves(from, to, but) {
                     drop.extend_from_slice(run);
-                    found.push(Defect::Frozen {
-                        channel: label(channel),
-                        from,
-                        to,
-                    });
+                    frozen.push((label(channel), from, to));
                 }
             }
             i += 1;
         }
         repeat.later = drop;
-        let later = repeat.later.clone();
-        recording.streams(
-            channel.role,
-            &mut |s| s.remove(&later),
-            &mut |s| s.remove(&later),
-            &mut |s| s.remove(&later),
-        );
-        // Mostly repeats: the sensor's own rate is that of the remaining samples.
-        if held_samples * 2 > all {
-            let max_silence = recording.max_silence;
-            recording.streams(
-                channel.role,
-                &mut |s| s.measure(max_silence),
-                &mut |s| s.measure(max_silence),
-                &mut |s| s.measure(max_silence),
-            );
+        recording.frozen.append(&mut frozen);
+        let max_silence = recording.max_silence;
+        for stream in recording.streams(channel.role) {
+            stream.remove(&repeat.later);
+            // Mostly repeats: the sensor's own rate is that of the remaining samples.
+            if held_samples * 2 > all {
+                stream.measure(max_silence);
+            }
         }
     }
     let of_rows = |r: &Repeat| {
@@ -328,31 +348,26 @@ fn repeated(
         seen.len() > 1 && seen.iter().all(|r| of_rows(r) == rows),
     ) {
         // Skipped if a frozen stretch of all channels was already reported.
-        if !found.iter().any(|d| matches!(d, Defect::Frozen { .. })) {
-            found.push(Defect::RepeatedRows {
-                rows: rows.len(),
-                first: *first,
-            });
+        if recording.frozen.is_empty() {
+            let text = format!(
+                "{} rows repeat the previous row, the first at {first} s: they were excluded; let \
+                 the recorder wait for new samples",
+                rows.len()
+            );
+            found.push(Finding::warning(FindingCode::RepeatedRows, "", text));
         }
         return;
     }
     let mut found_repeats = Vec::new();
     for (channel, repeat) in channels.iter().zip(&repeats.channels) {
-        let frozen: usize = found
-            .iter()
-            .filter_map(|d| match d {
-                Defect::Frozen {
-                    channel: name,
-                    from,
-                    to,
-                } if *name == label(channel) => Some((*from, *to)),
-                _ => None,
-            })
-            .map(|(from, to)| {
+        let frozen = recording.frozen.iter();
+        let frozen: usize = frozen
+            .filter(|(name, ..)| *name == label(channel))
+            .map(|(_, from, to)| {
                 repeat
                     .later
                     .iter()
-                    .filter(|t| **t > from && **t <= to)
+                    .filter(|t| *t > from && *t <= to)
                     .count()
             })
             .sum();
@@ -365,13 +380,13 @@ fn repeated(
         }
     }
     let found_repeats = merged(found_repeats, |a, b| a == b).into_iter();
-    found.extend(
-        found_repeats.map(|(channel, (samples, of))| Defect::Repeated {
-            channel,
-            samples,
-            of,
-        }),
-    );
+    found.extend(found_repeats.map(|(channel, (samples, of))| {
+        let text = format!(
+            "{channel} repeats its last reading in {samples} of {of} samples: these were excluded; \
+             the sensor is slower than the recording"
+        );
+        Finding::warning(FindingCode::Repeated, channel, text)
+    }));
 }
 
 impl<const D: usize> Stream<D> {

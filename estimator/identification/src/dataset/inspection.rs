@@ -1,21 +1,27 @@
 //! Checks the recorded channels one by one: gaps, saturation, units, derivatives, motion.
 
 use crate::dataset::cleaning::{FREEZE, STEEP, label, merged, steep};
-use crate::dataset::defects::{Defect, LEAST_ROWS, LEAST_SECONDS, Units};
 use crate::dataset::recording::{Recording, SkippedRows};
 use crate::dataset::smooth::{Scratch, quantum};
 use crate::dataset::stream::{MOTION, Stream, range};
+use crate::finding::{Finding, FindingCode};
 use crate::robot::{AXES, ChannelRole, Robot};
 use crate::statistics::median;
-use proprio_dynamics::spatial::Wrench;
 use proprio_topics::{Nanos, Reason};
 use std::ops::Range;
 
+/// Least duration of a log \[s\], and least number of rows of a log without stamps.
+const LEAST_SECONDS: f64 = 2.0;
+const LEAST_ROWS: u64 = 20;
+
 /// Checks all channels.
 pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
-    let mut found = std::mem::take(&mut recording.defects);
+    let mut found = std::mem::take(&mut recording.findings);
     if let Some(SkippedRows { rows, line, reason }) = recording.skipped.clone() {
-        found.insert(0, Defect::SkippedRows { rows, line, reason });
+        let text = format!(
+            "{rows} rows cannot be read and were skipped; the first: line {line}: {reason}"
+        );
+        found.insert(0, Finding::warning(FindingCode::SkippedRows, "", text));
     }
     let channels = recording.channels.clone();
     gaps(recording, &channels, &mut found);
@@ -24,36 +30,37 @@ pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
             ChannelRole::Joint(dof) => {
                 let (track, joint) = (&recording.joints[dof], &channel.name);
                 if recording.stamped && range(track.position.value.iter().map(|[v]| *v)) == 0.0 {
-                    found.push(Defect::Still {
-                        channel: label(channel),
-                    });
-                }
-                for (given, of, stream) in [
-                    ("velocity", &track.position, &track.velocity),
-                    ("acceleration", &track.velocity, &track.acceleration),
-                ] {
-                    if let Some(factor) = factor(of, stream, given == "velocity") {
-                        found.push(Defect::Derivative {
-                            joint: joint.clone(),
-                            given,
-                            factor,
-                        });
-                    }
+                    let channel = label(channel);
+                    let text = format!(
+                        "{channel} never changes: the joint stands still, or its encoder is dead; \
+                         parameters that need its motion keep their URDF values"
+                    );
+                    found.push(Finding::note(FindingCode::JointStill, channel, text));
                 }
                 let track = &mut recording.joints[dof];
                 let derivatives = [
-                    ("velocity", 1, &mut track.velocity),
-                    ("acceleration", 2, &mut track.acceleration),
+                    ("velocity", "rad/s", 1, &mut track.velocity),
+                    ("acceleration", "rad/s^2", 2, &mut track.acceleration),
                 ];
-                for (given, order, stream) in derivatives {
-                    if let Some(off) = noisy(&track.position, stream, order) {
-                        found.push(Defect::NoisyDerivative {
-                            joint: joint.clone(),
-                            given,
-                            off,
-                        });
-                        *stream = Stream::default();
-                    }
+                for (given, unit, order, stream) in derivatives {
+                    let Some(wrong) = wrong_derivative(&track.position, stream, order) else {
+                        continue;
+                    };
+                    let text = match wrong {
+                        Wrong::Factor(factor) => format!(
+                            "joint/{joint}: the logged {given} must be multiplied by {factor:.4} \
+                             to match the derivative of the position: check its unit and sign, or \
+                             remove the column"
+                        ),
+                        Wrong::Noise(off) => {
+                            *stream = Stream::default();
+                            format!(
+                                "joint/{joint}: the logged {given} is not that of the positions: \
+                                 {off:.3} {unit} off, most of it noise; it is not used"
+                            )
+                        }
+                    };
+                    found.push(Finding::warning(FindingCode::Derivative, joint, text));
                 }
                 let track = &recording.joints[dof];
                 let cut = cut_off(&track.torque, 0, |from, to| recording.moves(from, to, None));
@@ -63,9 +70,12 @@ pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
             ChannelRole::Sensor(number) => {
                 let stream = &recording.sensors[number];
                 if stream.t.is_empty() && stream.faulty.is_empty() {
-                    found.push(Defect::NeverSeen {
-                        channel: label(channel),
-                    });
+                    let channel = label(channel);
+                    let text = format!(
+                        "{channel} is in the configuration but has no sample: everything that \
+                         needs it is excluded; record it, or remove it from the configuration"
+                    );
+                    found.push(Finding::warning(FindingCode::NeverSeen, channel, text));
                     continue;
                 }
                 let marked = |reason| {
@@ -75,20 +85,18 @@ pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
                     Some((first, 1 + stamps.count()))
                 };
                 if let Some((first, samples)) = marked(Reason::Saturated) {
-                    found.push(Defect::Saturated {
-                        channel: label(channel),
-                        axis: "",
-                        samples,
-                        first,
-                        value: f64::NAN,
-                    });
+                    let channel = label(channel);
+                    let text = format!("{channel} reports saturation {}", at(samples, first));
+                    found.push(Finding::warning(FindingCode::Saturated, channel, text));
                 }
                 if let Some((first, samples)) = marked(Reason::Frozen) {
-                    found.push(Defect::MarkedFrozen {
-                        channel: label(channel),
-                        samples,
-                        first,
-                    });
+                    let channel = label(channel);
+                    let text = format!(
+                        "{channel} is frozen in {samples} samples, the first at {first} s: its \
+                         board repeats its readings instead of measuring; they are excluded; check \
+                         the board, its cable and its temperature, and switch it off and on"
+                    );
+                    found.push(Finding::warning(FindingCode::Frozen, channel, text));
                 }
                 for (axis, word) in AXES.into_iter().enumerate() {
                     let cut = cut_off(&recording.sensors[number], axis, |from, to| {
@@ -103,10 +111,10 @@ pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
     }
     units(recording, robot, &mut found);
     motion(recording, &mut found);
-    recording.defects = found;
+    recording.findings = found;
 }
 
-fn gaps(recording: &Recording, channels: &[crate::robot::Channel], found: &mut Vec<Defect>) {
+fn gaps(recording: &Recording, channels: &[crate::robot::Channel], found: &mut Vec<Finding>) {
     if !recording.stamped {
         return;
     }
@@ -129,15 +137,9 @@ fn gaps(recording: &Recording, channels: &[crate::robot::Channel], found: &mut V
         }
         // Gaps by exclusion are reported with the reason for the exclusion.
         let is_reported = |(from, to): &(Nanos, Nanos)| {
-            let frozen = found.iter().any(|d| match d {
-                Defect::Frozen {
-                    channel: name,
-                    from: f,
-                    to: t,
-                } => *name == label(channel) && from <= t && to >= f,
-                _ => false,
-            });
-            frozen || recording.has_faulty(channel.role, *from, *to)
+            let mut frozen = recording.frozen.iter();
+            frozen.any(|(name, f, t)| *name == label(channel) && from <= t && to >= f)
+                || recording.has_faulty(channel.role, *from, *to)
         };
         gaps.retain(|gap| !is_reported(gap));
         (label(channel), gaps)
@@ -156,13 +158,16 @@ fn gaps(recording: &Recording, channels: &[crate::robot::Channel], found: &mut V
     let all = merged(seen.map(of_channel).collect(), same);
     for (channel, gaps) in all {
         if let Some(longest) = gaps.iter().max_by_key(|(from, to)| *to - *from) {
-            found.push(Defect::Gaps {
-                channel,
-                gaps: gaps.len(),
-                total: Nanos(gaps.iter().map(|(from, to)| (*to - *from).0).sum()),
-                longest: longest.1 - longest.0,
-                at: longest.0,
-            });
+            let total = Nanos(gaps.iter().map(|(from, to)| (*to - *from).0).sum());
+            let text = format!(
+                "{channel} has no samples for {:.3} s in {} gaps, the longest of {:.3} s from {} s \
+                 on: these times are excluded",
+                total.seconds(),
+                gaps.len(),
+                (longest.1 - longest.0).seconds(),
+                longest.0
+            );
+            found.push(Finding::warning(FindingCode::Gap, channel, text));
         }
     }
 }
@@ -250,64 +255,45 @@ fn saturated<const D: usize>(
     (value, samples): (f64, Vec<usize>),
     channel: String,
     axis: &'static str,
-) -> Option<Defect> {
+) -> Option<Finding> {
     let first = stream.t[*samples.first()?];
     stream
         .faulty
         .extend(samples.iter().map(|i| (stream.t[*i], Reason::Saturated)));
     stream.faulty.sort_by_key(|(t, _)| *t);
     stream.retain(|i| samples.binary_search(&i).is_err());
-    Some(Defect::Saturated {
-        channel,
-        axis,
-        samples: samples.len(),
-        first,
-        value,
-    })
+    let text = format!(
+        "{channel}: {axis} is saturated at {value} {}",
+        at(samples.len(), first)
+    );
+    Some(Finding::warning(FindingCode::Saturated, channel, text))
 }
 
-/// The factor by which the given derivative must be multiplied to be that of `of`; None if it fits,
-/// or if there is too little motion.
-fn factor(of: &Stream<1>, given: &Stream<1>, position: bool) -> Option<f64> {
-    if given.t.len() < 100 {
-        return None;
-    }
-    let (mut uu, mut uv, mut vv) = (0.0, 0.0, 0.0);
-    let mut motion = (f64::INFINITY, f64::NEG_INFINITY);
-    for i in (5..of.t.len().saturating_sub(5)).step_by(3) {
-        let (a, b) = (of.t[i - 5], of.t[i + 5]);
-        if b - a > Nanos(of.max_gap.0.saturating_mul(3)) || (b - a).0 > 200_000_000 {
-            continue;
-        }
-        motion = (motion.0.min(of.value[i][0]), motion.1.max(of.value[i][0]));
-        let (begin, end) = (
-            given.t.partition_point(|t| *t < a),
-            given.t.partition_point(|t| *t <= b),
-        );
-        if end <= begin {
-            continue;
-        }
-        // Mean of the given derivative over the same time.
-        let mean = given.value[begin..end].iter().map(|[v]| v).sum::<f64>() / (end - begin) as f64;
-        let slope = (of.value[i + 5][0] - of.value[i - 5][0]) / (b - a).seconds();
-        uu += mean * mean;
-        uv += mean * slope;
-        vv += slope * slope;
-    }
-    let enough = motion.1 - motion.0 > if position { 0.05 } else { 0.1 };
-    let correlation = uv / (uu * vv).sqrt();
-    let factor = uv / uu;
-    (enough && correlation.abs() > 0.8 && !(0.8..=1.25).contains(&factor)).then_some(factor)
+/// Which samples are saturated, and what to do.
+fn at(samples: usize, first: Nanos) -> String {
+    format!(
+        "in {samples} samples, the first at {first} s: they are excluded; move more gently or use \
+         a larger range"
+    )
 }
 
-/// The RMS difference of a given derivative from that of the positions, if the positions tell it
-/// better: at least half of the difference's square is noise of the given one (its scatter about
-/// its own smooth course), and the difference is a tenth of the motion or more. A smaller one
-/// changes no torque by more than a tenth of its inertial part.
+/// What is wrong with a recorded derivative.
+enum Wrong {
+    /// It must be multiplied by this.
+    Factor(f64),
+    /// It is mostly noise: RMS of its difference from the derivative of the positions.
+    Noise(f64),
+}
+
+/// Compares a recorded derivative with that of the positions; none if it fits, or if there is too
+/// little motion. It has another unit or sign if it follows the positions' by another factor. The
+/// positions tell it better if at least half of the square of the difference is noise of the given
+/// one (its scatter about its own smooth course), and the difference is a tenth of the motion or
+/// more. A smaller one changes no torque by more than a tenth of its inertial part.
 ///
 /// Without it, accelerations that a controller differenced raise the error on held-out torques from
 /// .7 to 30 %.
-fn noisy(position: &Stream<1>, given: &Stream<1>, order: usize) -> Option<f64> {
+fn wrong_derivative(position: &Stream<1>, given: &Stream<1>, order: usize) -> Option<Wrong> {
     const EDGE: f64 = 0.3;
     const MOST: usize = 2000;
     const NOTICEABLE: f64 = 0.1;
@@ -316,27 +302,28 @@ fn noisy(position: &Stream<1>, given: &Stream<1>, order: usize) -> Option<f64> {
     }
     let (smooth, noise) = (position.smoother(0), given.smoother(0).sigma());
     let mut scratch = Scratch::default();
-    let (mut off, mut motion, mut count) = (0.0, 0.0, 0.0);
+    // Squares and product of the given one and that of the positions.
+    let (mut uu, mut uv, mut vv, mut count) = (0.0, 0.0, 0.0, 0.0);
     for i in (0..given.t.len()).step_by(given.t.len().div_ceil(MOST)) {
         if let Some(own) = smooth.at(given.t[i], order..=order, EDGE, &mut scratch) {
-            off += (given.value[i][0] - own[order]).powi(2);
-            motion += own[order].powi(2);
-            count += 1.0;
+            let (u, v) = (given.value[i][0], own[order]);
+            (uu, uv, vv, count) = (uu + u * u, uv + u * v, vv + v * v, count + 1.0);
         }
     }
+    let (factor, off) = (uv / uu, uu - 2.0 * uv + vv);
+    if uv.abs() > 0.8 * (uu * vv).sqrt() && !(0.8..=1.25).contains(&factor) {
+        return Some(Wrong::Factor(factor));
+    }
     let is_noise = 2.0 * noise * noise * count > off;
-    (is_noise && off > NOTICEABLE.powi(2) * motion).then(|| (off / count).sqrt())
+    (is_noise && off > NOTICEABLE.powi(2) * vv).then(|| Wrong::Noise((off / count).sqrt()))
 }
 
-fn units(recording: &Recording, robot: &Robot, found: &mut Vec<Defect>) {
+fn units(recording: &Recording, robot: &Robot, found: &mut Vec<Finding>) {
     let mut degrees = (Vec::new(), 0.0_f64);
-    let weight = 9.80665
-        * robot
-            .model
-            .inertias()
-            .iter()
-            .map(|i| i.parameters()[0])
-            .sum::<f64>();
+    let mut wrong = |channels: String, text: &str| {
+        let text = format!("{channels}: {text}");
+        found.push(Finding::refusal(FindingCode::WrongUnits, channels, text));
+    };
     for channel in &recording.channels {
         match channel.role {
             ChannelRole::Joint(dof) => {
@@ -363,38 +350,8 @@ fn units(recording: &Recording, robot: &Robot, found: &mut Vec<Defect>) {
                     }
                 }
             }
-            ChannelRole::Sensor(number) => {
-                let norm = |from: usize| {
-                    // A configured gain may convert counts to newtons.
-                    let corrected = |[fx, fy, fz, tx, ty, tz]: &[f64; 6]| {
-                        let raw = Wrench::from_parts([*fx, *fy, *fz], [*tx, *ty, *tz]);
-                        robot.calibrations[number]
-                            .apply(&raw, f64::NAN)
-                            .force_first()
-                    };
-                    let of = |v: &[f64; 6]| {
-                        corrected(v)[from..from + 3]
-                            .iter()
-                            .map(|x| x * x)
-                            .sum::<f64>()
-                            .sqrt()
-                    };
-                    median(recording.sensors[number].value.iter().map(of).collect())
-                };
-                let (force, torque) = (norm(0), norm(3));
-                let magnitude = if force > 100.0 * weight {
-                    force
-                } else {
-                    torque
-                };
-                if magnitude > 100.0 * weight {
-                    found.push(Defect::WrongUnits {
-                        channels: vec![label(channel)],
-                        units: Units::Counts,
-                        magnitude,
-                    });
-                }
-            }
+            // Their units are compared with what CAD predicts.
+            ChannelRole::Sensor(_) => {}
             ChannelRole::Base => {
                 let of = |v: &[f64; 3]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
                 let magnitude = median(
@@ -407,43 +364,48 @@ fn units(recording: &Recording, robot: &Robot, found: &mut Vec<Defect>) {
                         .collect(),
                 );
                 if !(3.0..=30.0).contains(&magnitude) {
-                    let units = Units::NotMetresPerSecondSquared;
-                    found.push(Defect::WrongUnits {
-                        channels: vec![label(channel)],
-                        units,
-                        magnitude,
-                    });
+                    let text = format!(
+                        "a typical proper acceleration of {magnitude:.4} m/s^2 is not near 9.8: \
+                         convert it to m/s^2"
+                    );
+                    wrong(label(channel), &text);
                 }
             }
         }
     }
     if !degrees.0.is_empty() {
-        found.push(Defect::WrongUnits {
-            channels: degrees.0,
-            units: Units::Degrees,
-            magnitude: degrees.1,
-        });
+        let text = format!(
+            "positions up to {:.4} rad are far beyond the URDF's limits, but within them as \
+             degrees: convert all joints to radians",
+            degrees.1
+        );
+        wrong(degrees.0.join(", "), &text);
     }
 }
 
-fn motion(recording: &Recording, found: &mut Vec<Defect>) {
+fn motion(recording: &Recording, found: &mut Vec<Finding>) {
     let rows = recording.rows;
     // The last row lasts as long as the others: 200 rows at 100 Hz are 2 s, from 0 to 1.99.
     let seconds =
         recording.duration().seconds() * (1.0 + 1.0 / rows.max(2).saturating_sub(1) as f64) + 1e-9;
     if (recording.stamped && seconds < LEAST_SECONDS) || (!recording.stamped && rows < LEAST_ROWS) {
         let kept = recording.longest_stream();
-        let backward = found.iter().find_map(|defect| match defect {
-            Defect::Stamps {
-                backward, first, ..
-            } if *backward > kept => Some(*first),
-            _ => None,
-        });
-        found.push(Defect::TooShort {
-            seconds,
-            rows,
-            backward,
-        });
+        let backward = recording.backward.filter(|(samples, _)| *samples > kept);
+        let text = if let Some((_, at)) = backward {
+            format!(
+                "its time runs backward, first at {at} s: in order are only {seconds:.2} s of its \
+                 {rows} rows; t must grow from row to row: sort the rows, or correct the \
+                 recorder's clock"
+            )
+        } else if seconds > 0.0 && recording.stamped {
+            format!(
+                "the log of {seconds:.2} s ({rows} rows) is too short: record at least \
+                 {LEAST_SECONDS} s of motion, better 30 s"
+            )
+        } else {
+            format!("the log of {rows} rows is too short: record at least {LEAST_ROWS}")
+        };
+        found.push(Finding::refusal(FindingCode::TooShort, "", text));
         return;
     }
     let mut most: f64 = 0.0;
@@ -461,6 +423,10 @@ fn motion(recording: &Recording, found: &mut Vec<Defect>) {
     };
     let rotates = changes(&imu.angular_velocity, 0.1) || changes(&imu.proper_acceleration, 1.0);
     if !rotates {
-        found.push(Defect::NoMotion { most });
+        let text = format!(
+            "no joint moves by more than {most:.4} rad: without motion, weights are not separable \
+             from offsets; record motion"
+        );
+        found.push(Finding::refusal(FindingCode::NoMotion, "", text));
     }
 }

@@ -1,7 +1,8 @@
 //! Observations: the values of all channels at one time, and annotations by fits.
 
+use crate::online::bank::hypothesis::{Motion, View};
 use crate::robot::{Channel, ChannelRole};
-use proprio_dynamics::spatial::{Vec3, Wrench};
+use proprio_dynamics::spatial::Wrench;
 use proprio_dynamics::{BitSet, ContactSet, FrameMotion};
 use proprio_topics::{Nanos, Reason};
 
@@ -70,29 +71,23 @@ impl Observation {
         self
     }
 
-    /// Reverses the sign of these encoders.
+    /// As a hypothesis takes the readings of joints and base.
     #[must_use]
-    pub(crate) fn turned(mut self, dofs: &[usize]) -> Self {
-        for &dof in dofs {
-            self.position[dof] *= -1.0;
-            self.velocity[dof] *= -1.0;
-            self.acceleration[dof] *= -1.0;
+    pub(crate) fn seen(self, view: View) -> Self {
+        let mut motion = Motion {
+            position: self.position,
+            velocity: self.velocity,
+            acceleration: self.acceleration,
+            base: self.base,
+        };
+        motion.see(view);
+        Self {
+            position: motion.position,
+            velocity: motion.velocity,
+            acceleration: motion.acceleration,
+            base: motion.base,
+            ..self
         }
-        self
-    }
-
-    /// Adds a proper acceleration of the base.
-    #[must_use]
-    pub(crate) fn accelerated(mut self, by: &Vec3) -> Self {
-        self.base.proper_acceleration += by;
-        self
-    }
-
-    /// Adds an offset to the position of a joint.
-    #[must_use]
-    pub(crate) fn moved(mut self, dof: usize, by: f64) -> Self {
-        self.position[dof] += by;
-        self
     }
 }
 

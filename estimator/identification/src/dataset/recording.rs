@@ -1,8 +1,8 @@
 //! Samples of a log, channel by channel, as they were recorded.
 
-use crate::dataset::defects::Defect;
 use crate::dataset::repeats::Repeats;
 use crate::dataset::stream::{ImuTrack, JointTrack, MOTION, Stream};
+use crate::finding::Finding;
 use crate::robot::{Channel, ChannelRole, Robot};
 use proprio_topics::{Nanos, Quality, Reading, Reason};
 
@@ -31,7 +31,11 @@ pub struct Recording {
     pub(crate) rows: u64,
     pub(crate) skipped: Option<SkippedRows>,
     pub(crate) repeats: Repeats,
-    pub(crate) defects: Vec<Defect>,
+    /// Channels that do not change while the robot moves, from and to when.
+    pub(crate) frozen: Vec<(String, Nanos, Nanos)>,
+    /// The most samples of a channel whose stamps go backward, and when first.
+    pub(crate) backward: Option<(usize, Nanos)>,
+    pub(crate) findings: Vec<Finding>,
 }
 
 /// Rows of a table that could not be read.
@@ -63,7 +67,9 @@ impl Recording {
             rows: 0,
             skipped: None,
             repeats: Repeats::new(robot.channels.len()),
-            defects: Vec::new(),
+            frozen: Vec::new(),
+            backward: None,
+            findings: Vec::new(),
             channels: robot.channels.clone(),
         }
     }
@@ -226,43 +232,9 @@ impl Recording {
     pub(crate) fn is_stamped(&self) -> bool {
         self.stamped
     }
-
-    /// Samples of joint torques per second, from the median spacing of their stamps: the rate of
-    /// the fastest joint \[Hz\]; 0 if there are none. Gaps do not count.
-    pub(crate) fn torque_rate(&self) -> f64 {
-        let spacings = self
-            .joints
-            .iter()
-            .map(|joint| joint.torque.spacing.seconds());
-        spacings
-            .filter(|s| *s > 0.0)
-            .map(f64::recip)
-            .fold(0.0, f64::max)
-    }
 }
 
 impl Recording {
-    /// Applies `f` to every stream of a channel.
-    pub(crate) fn streams(
-        &mut self,
-        role: ChannelRole,
-        one: &mut dyn FnMut(&mut Stream<1>),
-        three: &mut dyn FnMut(&mut Stream<3>),
-        six: &mut dyn FnMut(&mut Stream<6>),
-    ) {
-        match role {
-            ChannelRole::Joint(dof) => self.joints[dof].each(one),
-            ChannelRole::Sensor(number) => six(&mut self.sensors[number]),
-            ChannelRole::Base => [
-                &mut self.imu.proper_acceleration,
-                &mut self.imu.angular_velocity,
-                &mut self.imu.angular_acceleration,
-            ]
-            .into_iter()
-            .for_each(three),
-        }
-    }
-
     /// The stamps of a channel's main stream.
     pub(crate) fn stamps(&self, role: ChannelRole) -> (&[Nanos], Nanos, Nanos) {
         fn of<const D: usize>(s: &Stream<D>) -> (&[Nanos], Nanos, Nanos) {

@@ -21,7 +21,6 @@
 //! Readings are corrected as configured ([`proprio_dynamics::calibration`]). Configured offsets are
 //! not subtracted, since identification determines the reading without load.
 
-use crate::dataset::defects::Defect;
 use crate::dataset::observation::Observation;
 use crate::dataset::recording::Recording;
 use crate::dataset::smooth::{Scratch, Smoother};
@@ -39,18 +38,9 @@ const RATE: f64 = 100.0;
 /// narrower \[ns\].
 const EDGE: Nanos = Nanos::from_millis(300);
 
-/// The observations of a log, and its defects.
-#[derive(Debug, Clone)]
-pub struct Observations {
-    /// In order of time.
-    pub instants: Vec<Observation>,
-    /// All other defects of the log: those of single channels, and those found at common times.
-    pub defects: Vec<Defect>,
-}
-
 impl Recording {
     /// The observations of the log.
-    pub(crate) fn instants(&self, robot: &Robot) -> Observations {
+    pub(crate) fn instants(&self, robot: &Robot) -> Vec<Observation> {
         let period = Nanos::from_seconds(1.0 / RATE);
         let times = self.times(robot, period);
         let joints = self.joint_columns(&times, period);
@@ -112,10 +102,7 @@ impl Recording {
             }
             observation
         };
-        Observations {
-            instants: parallel::in_chunks(times.len(), |range| range.map(at).collect()),
-            defects: self.defects.clone(),
-        }
+        parallel::in_chunks(times.len(), |range| range.map(at).collect())
     }
 
     /// The times of the observations.

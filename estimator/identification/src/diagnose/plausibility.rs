@@ -2,11 +2,8 @@
 //! saturated. `proprio estimate` runs the tests that identification runs before any fit.
 
 use crate::dataset::Dataset;
-use crate::dataset::defects::Defect;
-
-use crate::diagnose::{sensor_frame, wrench_units};
-use crate::finding::{Finding, FindingCode, Severity};
-use crate::measurement::model::MeasurementModel;
+use crate::diagnose::configuration;
+use crate::finding::{Finding, FindingCode};
 use crate::robot::{IdentificationInput, Robot};
 use crate::training::{folds, prepare, stamps_apart};
 
@@ -23,9 +20,11 @@ const WRONG: [FindingCode; 5] = [
 /// Implausible channels of a log.
 #[must_use]
 pub fn implausible(robot: &Robot, dataset: Dataset) -> Vec<Finding> {
-    let lacks_motion =
-        |defect: &Defect| matches!(defect, Defect::WrongUnits { .. } | Defect::NoMotion { .. });
-    let has_motion = !dataset.defects.iter().any(lacks_motion);
+    let no_motion = [FindingCode::WrongUnits, FindingCode::NoMotion];
+    let has_motion = !dataset
+        .findings
+        .iter()
+        .any(|own| no_motion.contains(&own.code));
     let apart = stamps_apart(robot, &dataset);
     let mut log = prepare(robot, dataset);
     // A simulated IMU without noise on a base that stands still is constant.
@@ -42,28 +41,15 @@ pub fn implausible(robot: &Robot, dataset: Dataset) -> Vec<Finding> {
     findings.extend(
         apart
             .filter(|_| log.instants.is_empty())
-            .map(|text| Finding {
-                severity: Severity::Warning,
-                code: FindingCode::SampleSpacing,
-                subject: String::new(),
-                text,
-            }),
+            .map(|text| Finding::warning(FindingCode::SampleSpacing, "", text)),
     );
     log.findings.clear();
     // Without motion, with motion in wrong units, or with too few instants, F/T readings cannot be
     // tested.
     log.refused = !has_motion || folds(log.instants.iter().map(|instant| instant.t)) < 1;
     let wrench = [IdentificationInput::Wrench];
-    let measurement = MeasurementModel::for_observations(robot, &wrench, log.instants.iter()).ok();
-    if let Some(mut measurement) =
-        measurement.filter(|measurement| !log.refused && !measurement.unknowns().links.is_empty())
-    {
-        let wrong = wrench_units::wrong(&mut measurement, &log);
-        log.add_findings(wrong);
-        findings.append(&mut log.findings);
-        if !log.refused {
-            findings.extend(sensor_frame::wrong(&measurement, &[&log]));
-        }
-    }
+    // No error is expected: the observations are of this robot.
+    let _ = configuration::check(robot, &wrench, std::slice::from_mut(&mut log));
+    findings.append(&mut log.findings);
     findings
 }

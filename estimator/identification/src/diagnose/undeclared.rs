@@ -6,7 +6,7 @@ use crate::dataset::Role;
 use crate::dataset::observation::UnitSet;
 use crate::diagnose::load::Load;
 use crate::diagnose::{disturbance, load};
-use crate::finding::{Finding, FindingCode, Severity};
+use crate::finding::{Finding, FindingCode};
 use crate::fit::{Identified, NoiseAndMap};
 use crate::measurement::channels;
 use crate::measurement::model::MeasurementModel;
@@ -109,9 +109,7 @@ impl Undeclared {
         logs: &mut [TrainingLog],
         estimate: &NoiseAndMap,
     ) {
-        let Self {
-            loads, contacts, ..
-        } = self;
+        let (loads, contacts) = (&self.loads, &self.contacts);
         let robot = measurement.robot();
         let training = training_logs(logs);
         let body = |load: &Load| {
@@ -141,37 +139,18 @@ impl Undeclared {
                 .filter(|(load, _)| load.log == number)
                 .collect();
             let loads: Vec<&Load> = own.iter().map(|(load, _)| *load).collect();
-            let apparent_contacts = apparent_contacts(log, contacts, &loads);
-            for unit in units(contacts).iter() {
-                let of = |cause| {
-                    Tally::of(
-                        log,
-                        apparent_contacts
-                            .iter()
-                            .filter(|contact_span| contact_span.is(unit, cause)),
-                    )
-                };
-                let Some(contacts) = of(Cause::Contact) else {
-                    continue;
-                };
-                let reason = format!("contact suspected: {}", part(robot, unit));
-                log.excluded.push(contacts.excluded(reason));
-                log.findings.push(Finding {
-                    severity: Severity::Warning,
-                    code: FindingCode::Disturbance,
-                    subject: part(robot, unit),
-                    text: format!(
-                        "{}: undeclared disturbance (contact, load or a jump of a sensor's offset) \
-                         {}. These instants were excluded; declare contacts where they occur",
-                        part(robot, unit),
-                        contacts.describe(log)
-                    ),
-                });
+            let apparent = apparent_contacts(log, contacts, &loads);
+            for (part, excluded, when) in suspected(robot, log, &apparent) {
+                log.excluded.push(excluded);
+                let text = format!(
+                    "{part}: undeclared disturbance (contact, load or a jump of a sensor's offset) \
+                     {when}. These instants were excluded; declare contacts where they occur"
+                );
+                log.findings
+                    .push(Finding::warning(FindingCode::Disturbance, part, text));
             }
             for (place, (load, body)) in own.into_iter().enumerate() {
-                let handovers = apparent_contacts
-                    .iter()
-                    .filter(|contact_span| contact_span.cause == Cause::Load(place));
+                let handovers = apparent.iter().filter(|own| own.load == Some(place));
                 report_load(measurement, log, load, body.as_ref(), handovers);
             }
         }
@@ -232,30 +211,28 @@ fn report_load<'a>(
             (1..4).map(sigma).fold(0.0, f64::max)
         )
     });
-    log.findings.push(Finding {
-        severity: Severity::Warning,
-        code: FindingCode::LoadChanged,
-        subject: link.to_owned(),
-        text: format!(
+    log.findings.push(Finding::warning(
+        FindingCode::LoadChanged,
+        link,
+        format!(
             "{when} about {:.1} s after the log's start, {link} carried another load than in the \
              rest of the data{what}. That part was excluded: the parameters are those without \
              this load",
             since(at)
         ),
-    });
+    ));
 }
 
 /// A warning that the excluded instants still change after `fits` fits.
 pub(crate) fn not_converged(fits: usize) -> Finding {
-    Finding {
-        severity: Severity::Warning,
-        code: FindingCode::DisturbancesNotConverged,
-        subject: String::new(),
-        text: format!(
+    Finding::warning(
+        FindingCode::DisturbancesNotConverged,
+        "",
+        format!(
             "undeclared disturbances did not converge in {fits} fits: check the \
              instants that the logs exclude, and declare contacts where they occurred"
         ),
-    }
+    )
 }
 
 /// Description of the links of a unit.
@@ -273,24 +250,12 @@ fn part(robot: &Robot, unit: usize) -> String {
     }
 }
 
-/// An apparent contact: consecutive disturbed instants of a unit, and their cause.
+/// Consecutive disturbed instants of a unit.
 struct ApparentContact {
     unit: usize,
     instants: Range<usize>,
-    cause: Cause,
-}
-
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Cause {
-    Contact,
-    /// The hand that gives or takes the load of this number.
-    Load(usize),
-}
-
-impl ApparentContact {
-    fn is(&self, unit: usize, cause: Cause) -> bool {
-        (self.unit, self.cause) == (unit, cause)
-    }
+    /// The load that a hand gives or takes there; none if it is a contact.
+    load: Option<usize>,
 }
 
 /// The union of these sets.
@@ -324,67 +289,51 @@ fn apparent_contacts(
                 |load: &&Load| load.units.contains(unit) && is_near(load.span, NEAR_LOAD_CHANGE);
             let load = loads.iter().position(is_handed);
             let load = load.filter(|&load| lasts <= LONGEST_HANDOVER.max(loads[load].within));
-            let cause = match load {
-                Some(number) => Cause::Load(number),
-                None => Cause::Contact,
-            };
             apparent_contacts.push(ApparentContact {
                 unit,
                 instants: range,
-                cause,
+                load,
             });
         }
     }
     apparent_contacts
 }
 
-/// How often, how long and when a disturbance acted on a unit.
-struct Tally {
-    times: usize,
-    instants: usize,
-    first: Nanos,
-    last: Nanos,
-}
-
-impl Tally {
-    /// Of these contacts, in the order of time; none if there are none.
-    fn of<'a>(
-        log: &TrainingLog,
-        apparent_contacts: impl Iterator<Item = &'a ApparentContact>,
-    ) -> Option<Self> {
-        let apparent_contacts: Vec<&ApparentContact> = apparent_contacts.collect();
-        Some(Self {
-            times: apparent_contacts.len(),
-            instants: apparent_contacts
-                .iter()
-                .map(|contact_span| contact_span.instants.len())
-                .sum(),
-            first: log.instants[apparent_contacts.first()?.instants.start].t,
-            last: log.instants[apparent_contacts.last()?.instants.end - 1].t,
-        })
-    }
-
-    fn excluded(&self, reason: String) -> Excluded {
-        Excluded {
-            reason,
-            instants: self.instants as u64,
-            first: self.first,
-            last: self.last,
-        }
-    }
-
-    /// `2 times between 3.1 and 7.4 s after the log's start, 5.0 % of the log`.
-    fn describe(&self, log: &TrainingLog) -> String {
+/// Each unit with contacts: its links, what is excluded, and in words how often, when and how long.
+fn suspected(
+    robot: &Robot,
+    log: &TrainingLog,
+    contacts: &[ApparentContact],
+) -> Vec<(String, Excluded, String)> {
+    let contacts = contacts.iter().filter(|own| own.load.is_none());
+    let contacts: Vec<&ApparentContact> = contacts.collect();
+    let of_unit = |own: &[&ApparentContact]| {
+        let part = part(robot, own[0].unit);
+        let instants: usize = own.iter().map(|own| own.instants.len()).sum();
+        let first = log.instants[own[0].instants.start].t;
+        let last = log.instants[own[own.len() - 1].instants.end - 1].t;
         let since = |t: Nanos| (t - log.span.0).seconds();
-        format!(
+        let when = format!(
             "{} time{} between {:.1} and {:.1} s after the log's start, {:.1} % of the log",
-            self.times,
-            if self.times == 1 { "" } else { "s" },
-            since(self.first),
-            since(self.last),
-            100.0 * self.instants as f64 / log.instants.len() as f64
-        )
-    }
+            own.len(),
+            if own.len() == 1 { "" } else { "s" },
+            since(first),
+            since(last),
+            100.0 * instants as f64 / log.instants.len() as f64
+        );
+        let excluded = Excluded {
+            reason: format!("contact suspected: {part}"),
+            instants: instants as u64,
+            first,
+            last,
+        };
+        (part, excluded, when)
+    };
+    // They are in the order of the units.
+    contacts
+        .chunk_by(|a, b| a.unit == b.unit)
+        .map(of_unit)
+        .collect()
 }
 
 /// Reports undeclared disturbances of the validation logs, stores them in
@@ -404,36 +353,24 @@ pub(crate) fn report_validation(
     });
     let checked = logs.iter_mut().filter(is_checked);
     for (log, contacts) in checked.zip(undeclared.contacts) {
-        let apparent_contacts = apparent_contacts(log, &contacts, &[]);
-        for unit in units(&contacts).iter() {
-            let own = apparent_contacts
-                .iter()
-                .filter(|contact_span| contact_span.is(unit, Cause::Contact));
-            let Some(sum) = Tally::of(log, own) else {
-                continue;
-            };
-            let part = part(robot, unit);
-            log.findings.push(Finding {
-                severity: Severity::Note,
-                code: FindingCode::Disturbance,
-                text: format!(
-                    "{part}: residuals as of an undeclared disturbance (contact, load or a jump of \
-                     a sensor's offset) {}. The figures of this log include these instants",
-                    sum.describe(log)
-                ),
-                subject: part,
-            });
+        let apparent = apparent_contacts(log, &contacts, &[]);
+        for (part, _, when) in suspected(robot, log, &apparent) {
+            let text = format!(
+                "{part}: residuals as of an undeclared disturbance (contact, load or a jump of a \
+                 sensor's offset) {when}. The figures of this log include these instants"
+            );
+            log.findings
+                .push(Finding::note(FindingCode::Disturbance, part, text));
         }
         if !converges {
-            log.findings.push(Finding {
-                severity: Severity::Note,
-                code: FindingCode::DisturbancesNotConverged,
-                subject: String::new(),
-                text: format!(
+            log.findings.push(Finding::note(
+                FindingCode::DisturbancesNotConverged,
+                "",
+                format!(
                     "undeclared disturbances of this log did not converge in \
                      {ROUNDS} rounds: those reported are uncertain"
                 ),
-            });
+            ));
         }
         log.instants
             .iter_mut()

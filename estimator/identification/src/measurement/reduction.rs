@@ -77,38 +77,6 @@ pub(crate) fn reduce(
     reduce_with(measurement, segment, noise, &[], 0, &mut |_, _, _, _| ())
 }
 
-/// As [`reduce`], with extra columns: the effect of a constant position error of these joints.
-pub(crate) fn reduce_with_angles(
-    measurement: &mut MeasurementModel<'_>,
-    segment: Segment<'_>,
-    noise: &NoiseModel,
-    angles: &[usize],
-    d: &[f64],
-) -> ReducedLog {
-    const ANGLE: f64 = 1e-5;
-    let mut perturbed = Rows::new(measurement.unknowns());
-    let mut columns = |measurement: &mut MeasurementModel<'_>,
-                       number: usize,
-                       rows: &Rows,
-                       slopes: &mut [f64]| {
-        for (place, &dof) in angles.iter().enumerate() {
-            let other = segment.instants[number]
-                .clone()
-                .map(|o| o.moved(dof, ANGLE));
-            if measurement.make(&other, &mut perturbed).is_err() || perturbed.count != rows.count {
-                continue;
-            }
-            for row in 0..rows.count {
-                // The row holds at the true position: the measured one minus the error. The
-                // small change of the offset terms is ignored.
-                let right = |r: &Rows| r.r(row) - dot(r.a(row), d);
-                slopes[row * angles.len() + place] = -(right(rows) - right(&perturbed)) / ANGLE;
-            }
-        }
-    };
-    reduce_with(measurement, segment, noise, &[], angles.len(), &mut columns)
-}
-
 /// Writes extra columns of an observation's rows, row by row, given its number in the segment and
 /// its rows.
 type Columns<'a> = dyn FnMut(&mut MeasurementModel<'_>, usize, &Rows, &mut [f64]) + 'a;

@@ -30,7 +30,7 @@
 //! motion nothing is known about it, and the torques that it matters to are unknown.
 
 mod evidence;
-mod hypothesis;
+pub(crate) mod hypothesis;
 mod unit;
 
 pub use hypothesis::{Hypothesis, Sight, View};

@@ -4,8 +4,7 @@
 mod newton;
 
 use crate::prior::posterior::newton::{Chart, Descent, Newton, State, block};
-use nalgebra::linalg::Cholesky;
-use nalgebra::{DMatrix, DVector, Dyn, Matrix4};
+use nalgebra::{DMatrix, DVector, Matrix4};
 
 use crate::linear::blocked;
 use crate::prior::{
@@ -445,14 +444,8 @@ impl Posterior {
         let of_further = self.extra.len() as f64 - (&inverse * extra).norm_squared();
         let effective = (of_data - of_further).max(0.0);
         let residual_square = self.residual_square + chart.excess(&y);
-        let mut maps = Vec::with_capacity(links);
-        for (centre, l) in self.centres.iter().zip(&chart.stretch) {
-            let back = l.try_inverse().unwrap_or_default();
-            maps.push((
-                centre.parameters * congruence(l),
-                congruence(&back) * centre.whiten,
-            ));
-        }
+        let centres = self.centres.iter().zip(&chart.stretch);
+        let maps = centres.map(|(centre, l)| centre.parameters * congruence(l));
         Fit {
             x,
             bodies,
@@ -463,11 +456,10 @@ impl Posterior {
             iterations: descent.iterations,
             is_converged: descent.is_converged,
             decrement: descent.decrement,
-            maps,
+            maps: maps.collect(),
             expected: self.expected,
             units: self.extra.iter().map(|&(unit, _)| unit).collect(),
             chart,
-            factor: descent.factor,
             inverse,
         }
     }
@@ -498,15 +490,14 @@ pub struct Fit {
     pub is_converged: bool,
     /// Square of the last Newton decrement.
     pub(crate) decrement: f64,
-    /// `u -> phi` and back, for each link.
-    maps: Vec<(Matrix10, Matrix10)>,
+    /// `u -> phi`, for each link.
+    maps: Vec<Matrix10>,
     /// The prior of `tau`.
     expected: Expected,
     /// Units of the extra parameters.
     units: Vec<f64>,
     chart: Chart,
-    /// Factor `L` of the Hessian by the chart's `y`, and its inverse.
-    factor: Cholesky<f64, Dyn>,
+    /// The inverse of the factor `L` of the Hessian by the chart's `y`.
     inverse: DMatrix<f64>,
 }
 
@@ -524,7 +515,7 @@ impl Fit {
         // F = (u -> d) V A^-1/2: the factor's inverse, transposed, from the right.
         let mut root = &self.chart.v * self.inverse.transpose();
         for mut column in root.column_iter_mut() {
-            for (link, (map, _)) in self.maps.iter().enumerate() {
+            for (link, map) in self.maps.iter().enumerate() {
                 let mapped = map * column.fixed_rows::<10>(10 * link).into_owned();
                 column.fixed_rows_mut::<10>(10 * link).copy_from(&mapped);
             }
@@ -534,33 +525,6 @@ impl Fit {
             row *= *unit;
         }
         root
-    }
-
-    /// The posterior covariance of `x`.
-    pub fn covariance(&self) -> DMatrix<f64> {
-        let root = self.covariance_root();
-        &root * root.transpose()
-    }
-
-    /// The upper triangular square root of the posterior's precision: `P` with `P^T P` the inverse
-    /// of the covariance, and a positive diagonal.
-    pub fn precision_root(&self) -> DMatrix<f64> {
-        let mut root = self.factor.l().transpose() * &self.chart.t;
-        for (link, (_, inverse)) in self.maps.iter().enumerate() {
-            let columns = root.fixed_columns::<10>(10 * link).into_owned() * inverse;
-            root.fixed_columns_mut::<10>(10 * link).copy_from(&columns);
-        }
-        for (index, unit) in self.units.iter().enumerate() {
-            let mut column = root.column_mut(10 * self.maps.len() + index);
-            column /= *unit;
-        }
-        let mut triangle = root.qr().r();
-        for row in 0..triangle.nrows() {
-            if triangle[(row, row)] < 0.0 {
-                triangle.row_mut(row).neg_mut();
-            }
-        }
-        triangle
     }
 }
 
@@ -596,7 +560,7 @@ mod tests {
         let right = DVector::from_vec(normals(5, rows)) * 10.0;
         let posterior = Posterior::new(&prior, &[0, 1, 2], &data, &right, &[1.0, 0.0]).unwrap();
         let fit = posterior.fit(0.4).unwrap();
-        let precision = fit.precision_root();
+        let root = fit.covariance_root().lu();
         let mut impossible = fit.x.clone();
         impossible[10] = -100.0;
         // For a body of more than twice CAD's parameters a Newton step overshoots, whatever the
@@ -616,7 +580,7 @@ mod tests {
         ] {
             let found = posterior.fit_from(x.as_slice(), 0.4, 1e-8).unwrap();
             // In standard deviations.
-            let off = (&precision * (&found.x - &fit.x)).norm();
+            let off = root.solve(&(&found.x - &fit.x)).expect("a root").norm();
             assert!(off < 2e-4, "{off}");
             assert!(found.is_converged && found.decrement <= 1e-8 && found.iterations <= most);
             assert!((found.effective - fit.effective).abs() < 1e-3 * fit.effective);

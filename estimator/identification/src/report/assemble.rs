@@ -1,7 +1,7 @@
 //! Assembles the [`Outcome`]: the errors of every log with CAD, with CAD and fitted offsets, and
 //! with the identified parameters; the parameters with their uncertainty; findings.
 
-use crate::finding::{Finding, FindingCode, Severity};
+use crate::finding::{Finding, FindingCode};
 use crate::fit::{Identified, per_column};
 use crate::measurement::model::MeasurementModel;
 use crate::report::calibration::{calibrations, channels};
@@ -72,34 +72,24 @@ pub(crate) fn nothing(robot: &Robot, logs: &[TrainingLog], reason: String) -> Ou
         channels: Vec::new(),
         time_offsets: Vec::new(),
         logs: logs.collect(),
-        findings: vec![Finding {
-            severity: Severity::Refusal,
-            code: FindingCode::NotIdentified,
-            subject: String::new(),
-            text: reason.clone(),
-        }],
+        findings: vec![Finding::refusal(
+            FindingCode::NotIdentified,
+            "",
+            reason.clone(),
+        )],
         verdict: Verdict::Nothing(reason),
     }
 }
 
-/// Results of the detectors that run after the fit.
-pub(crate) struct Diagnosis {
-    /// Wrong encoder signs and encoder offsets.
-    pub encoder_offsets: Vec<Finding>,
-    /// Time offset of every stream.
-    pub time_offsets: Vec<TimeOffset>,
-    /// Findings about significant delays.
-    pub delays: Vec<Finding>,
-}
-
-/// The whole outcome.
+/// The whole outcome; with what the search for errors of the set-up `found`, and the time offset of
+/// every stream.
 pub(crate) fn outcome(
     robot: &Robot,
     measurement: &MeasurementModel<'_>,
     logs: &[TrainingLog],
     training: &[&TrainingLog],
     identified: &Identified,
-    diagnosis: Diagnosis,
+    (found, time_offsets): (Vec<Finding>, Vec<TimeOffset>),
 ) -> Outcome {
     let unknowns = &identified.unknowns;
     let p = unknowns.inertial();
@@ -144,20 +134,15 @@ pub(crate) fn outcome(
         .floors()
         .iter()
         .filter(|floor| unknowns.links.contains(&floor.link))
-        .map(|floor| Finding {
-            severity: Severity::Note,
-            code: FindingCode::InertiaRegularised,
-            subject: robot.model.link_name(floor.link).to_owned(),
-            text: floor.describe(robot.model.link_name(floor.link)),
+        .map(|floor| {
+            Finding::note(
+                FindingCode::InertiaRegularised,
+                robot.model.link_name(floor.link),
+                floor.describe(robot.model.link_name(floor.link)),
+            )
         })
         .collect();
-    let Diagnosis {
-        encoder_offsets,
-        time_offsets,
-        delays,
-    } = diagnosis;
-    findings.extend(encoder_offsets);
-    findings.extend(delays);
+    findings.extend(found);
     findings.extend(identified.findings.iter().cloned());
     let (calibrations, calibration_findings) = calibrations(robot, measurement, identified, &root);
     findings.extend(calibration_findings);

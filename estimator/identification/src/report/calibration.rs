@@ -1,6 +1,6 @@
 //! Calibrations and noise of the sensors.
 
-use crate::finding::{Finding, FindingCode, Severity};
+use crate::finding::{Finding, FindingCode};
 use crate::fit::Identified;
 use crate::measurement::channels::{channel_name, sensor_name};
 use crate::measurement::model::MeasurementModel;
@@ -62,15 +62,14 @@ pub(crate) fn calibrations(
             temperature: own.iter().any(|(_, unknown, _)| !is_gain(unknown)),
         };
         if robot.calibrated.temperature && !kind.temperature {
-            findings.push(Finding {
-                severity: Severity::Warning,
-                code: FindingCode::NoTemperature,
-                subject: name.clone(),
-                text: format!(
+            findings.push(Finding::warning(
+                FindingCode::NoTemperature,
+                &name,
+                format!(
                     "{name}: its temperature coefficients are not identified: no log has its \
                      temperature (column wrench/{name}/temperature), or it never changed"
                 ),
-            });
+            ));
         }
         if kind.is_empty() {
             continue;
@@ -106,10 +105,10 @@ pub(crate) fn calibrations(
                 },
             );
             not_excited.truncate(MAX_NAMED);
-            findings.push(Finding {
-                severity: Severity::Note,
-                code: FindingCode::CalibrationNotObservable,
-                text: format!(
+            findings.push(Finding::note(
+                FindingCode::CalibrationNotObservable,
+                &name,
+                format!(
                     "{name}: {} of the {} calibration parameters are not excited by the motion and \
                      stay close to the factory calibration: {}. Record motion that loads these \
                      channels more",
@@ -117,8 +116,7 @@ pub(crate) fn calibrations(
                     own.len(),
                     not_excited.join(", ") + more
                 ),
-                subject: name.clone(),
-            });
+            ));
         }
         // A common gain of all forces is not separable from a common scale of all masses beyond.
         let is_force_gain = |unknown: &Unknown| match unknown {
@@ -139,10 +137,10 @@ pub(crate) fn calibrations(
                 .map_or(f64::NAN, |sum| sum.norm() / 3.0);
             let before = robot.gain_std / 3.0_f64.sqrt();
             if spread > 0.5 * before {
-                findings.push(Finding {
-                    severity: Severity::Note,
-                    code: FindingCode::GainMassNotSeparable,
-                    text: format!(
+                findings.push(Finding::note(
+                    FindingCode::GainMassNotSeparable,
+                    &name,
+                    format!(
                         "{name}: the common gain of its forces, {:+.1} +- {:.1} %, is not \
                          separable from the masses beyond it; only the priors decide between them \
                          (identification.gain_std for the factory calibration, the estimated \
@@ -151,8 +149,7 @@ pub(crate) fn calibrations(
                         100.0 * common,
                         100.0 * spread
                     ),
-                    subject: name.clone(),
-                });
+                ));
             }
         }
         outcomes.push(CalibrationOutcome {

@@ -2,7 +2,7 @@
 
 use crate::arithmetic::{dot, rms};
 use crate::dataset::observation::{Annotated, UnitSet};
-use crate::finding::{Finding, FindingCode, Severity};
+use crate::finding::{Finding, FindingCode};
 use crate::fit::Identified;
 use crate::measurement::channels::{channel_of, sensor_name};
 use crate::measurement::model::MeasurementModel;
@@ -12,7 +12,7 @@ use crate::measurement::unknowns::{FRICTION, Unknowns, friction_row};
 use crate::report::comparison::{
     Compared, STILL, TorqueSeries, cases, configured_nuisance, covered, three,
 };
-use crate::report::curves::{EDGE, Places, RAW_RATE, curves, mean};
+use crate::report::curves::{curves, mean};
 use crate::report::outcome::{
     FrictionOutcome, JointOutcome, LogOutcome, OffsetOutcome, Predicted, SensorOutcome,
     TwoRouteOutcome, both,
@@ -23,6 +23,10 @@ use crate::training::{MIN_FOLD, TrainingLog};
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::Structure;
 use proprio_topics::Nanos;
+
+/// Time at both ends of a log that is not used to compare torques, because derivatives are less
+/// certain there \[s\].
+const EDGE: f64 = 0.3;
 
 /// Residuals of a joint's torque with the friction of the training logs for one set of parameters,
 /// instead of the friction fitted to the log.
@@ -74,15 +78,6 @@ pub(crate) fn log_outcome(
         .iter()
         .map(|i| (i.t - log.span.0).seconds())
         .collect();
-    let places = Places::new(&times);
-    let filter = places.as_ref().filter(|_| log.torque_rate > RAW_RATE);
-    let inner = |i: &usize| {
-        let (first, last) = (
-            times.first().copied().unwrap_or(0.0),
-            times.last().copied().unwrap_or(0.0),
-        );
-        times[*i] >= first + EDGE && times[*i] <= last - EDGE
-    };
     let wrenches = 6 * unknowns.sensors.len();
     let compared = Compared::new(measurement, instants, &residuals, identified, sets);
     let undisturbed = undisturbed(measurement, log, identified, sets);
@@ -97,7 +92,6 @@ pub(crate) fn log_outcome(
     // Torques: an input of the identification, or a reference for F/T sensors.
     let mut joints = Vec::new();
     let mut torques_predicted = Vec::new();
-    let mut torque_share = Vec::new();
     let mut torque_series: Vec<TorqueSeries> = Vec::new();
     if unknowns.joints.is_empty() {
         let dofs = robot.model.dof_count();
@@ -141,20 +135,21 @@ pub(crate) fn log_outcome(
                     place,
                 )
             });
-            let fitted = [0, 1].map(|set| residuals.noise[set][channel].clone());
-            let [cad_fitted, own_fitted] = fitted;
+            let [cad_fitted, own_fitted] = [0, 1].map(|set| residuals.noise[set][channel].clone());
             torque_series.push((dof, [raw, cad_fitted, own_fitted, cad, own], measured));
         }
     }
+    let ends = times.first().zip(times.last());
+    let is_inner = |t: f64| ends.is_some_and(|(a, b)| (a + EDGE..=b - EDGE).contains(&t));
+    let keep = |values: &[f64]| -> Vec<f64> {
+        let inner = values.iter().zip(&times).filter(|(_, t)| is_inner(**t));
+        inner.map(|(x, _)| *x).collect()
+    };
+    let mut torque_share = Vec::new();
     for (dof, errors, measured) in &torque_series {
-        let smooth = |x: &[f64]| match &filter {
-            Some(places) => places.low_passed(x),
-            None => x.to_vec(),
-        };
-        let keep = |x: &[f64]| -> Vec<f64> { (0..x.len()).filter(inner).map(|i| x[i]).collect() };
-        let errors = errors.each_ref().map(|e| keep(&smooth(e)));
+        let errors = errors.each_ref().map(|errors| keep(errors));
+        let measured = keep(measured);
         let [cad, fitted, own, ..] = &errors;
-        let measured = keep(&smooth(measured));
         let place = unknowns.joints.binary_search(dof).ok();
         let of_training = both([3, 4].map(|set| rms(errors[set].iter().copied())));
         torques_predicted.push((robot.model.dof_name(*dof).to_owned(), of_training));
@@ -164,7 +159,7 @@ pub(crate) fn log_outcome(
             measured_rms_nm: rms(measured.iter().copied()),
             coverage: place.map_or(f64::NAN, |place| coverage[wrenches + place]),
         });
-        torque_share.push((errors.to_vec(), measured));
+        torque_share.push((errors, measured));
     }
 
     let mut sensors = Vec::new();
@@ -350,11 +345,10 @@ pub(crate) fn unexplained(
             opposite.join(", ")
         )
     };
-    Some(Finding {
-        severity: Severity::Warning,
-        code: FindingCode::Unexplained,
-        subject: format!("wrench/{name}"),
-        text: format!(
+    Some(Finding::warning(
+        FindingCode::Unexplained,
+        format!("wrench/{name}"),
+        format!(
             "wrench/{name}: the identified parameters leave {:.0} % of its changes unexplained \
              (times the stated noise: {}).{hint} Check encoder offsets, signs and the order of \
              joints, dead encoders, the sensor's axes and calibration, time offsets, cables, \
@@ -362,7 +356,7 @@ pub(crate) fn unexplained(
             100.0 * share,
             axes.join(", ")
         ),
-    })
+    ))
 }
 
 /// When a joint first moves by more than [`STILL`] from its initial position; none if none does, or

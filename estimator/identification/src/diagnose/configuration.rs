@@ -1,0 +1,897 @@
+//! What a log says against the configuration, before any fit: units and signs of readings, frames
+//! of F/T sensors, gravity.
+//!
+//! Every alternative changes the readings linearly, or the proper acceleration of the base, in
+//! which the rows are linear as well. So one pass over a log serves all of them. It collects the
+//! squares and products of these columns, with CAD, and without what constant offsets, friction and
+//! rotors explain ([`Evidence`]):
+//!
+//! ```text
+//! [ rows for 1 g along x, y, z | g_i y_j of each sensor | torque of the joint | r ]
+//! ```
+//!
+//! `y` is a sensor's reading and `g` what its offset has in the row: with the reading `M y`, `sum
+//! (M - 1)_ij g_i y_j` is added to `r`.
+//!
+//! # What is tested
+//! CAD may be wrong by a large factor: a gripper that the URDF lacks, on a light flange, has thirty
+//! times the flange's mass. So a unit is wrong only beyond what bodies do:
+//!
+//! - A joint torque `y` that CAD predicts as `x`: wrong sign if `|y + x|^2 < |y - x|^2 / 3` (a
+//!   correlation below -1/2 if they are of one size); counts or thousandths if `|y| > 30 |x|` and
+//!   the correlation is above 0.7 in magnitude, or more than a hundred times any prediction for a
+//!   joint of its kind; thousands or a dead channel if `|y| < |x| / 30`. It is left out of the log.
+//! - The readings of an F/T sensor: the log is refused if forces or torques are more than 30 times
+//!   the prediction and change by more than the weight of the whole robot, or if both are below
+//!   1/300 of it, correlated as above. More than 3 times, or less than a third, is reported.
+//! - Its direction and frame, in all logs together, then in each alone: that change of a sensor is
+//!   accepted which leaves the least squares of all F/T readings, if less than a third remains
+//!   (a correlation of -1/2); then the next. The opposite direction is always tested: with it,
+//!   masses would be negative. Other frames only if the readings hardly follow CAD ([`STRANGE`]),
+//!   and accepted only if they do with the change.
+//! - Gravity, if the base stands still: its direction that leaves the least squares, if it is
+//!   nearer to another axis than to the configured one.
+
+use crate::dataset::Role;
+use crate::dataset::observation::{Annotated, Observation};
+use crate::finding::{Finding, FindingCode, Severity};
+use crate::hypothesis::accepted;
+use crate::linear::nuisance::NuisanceFilter;
+use crate::measurement::channels::{attribute_to, sensor_name};
+use crate::measurement::model::MeasurementModel;
+use crate::measurement::reduction::nuisance_prior;
+use crate::measurement::rows::Rows;
+use crate::online::bank::hypothesis::{View, quarter_turns};
+use crate::parallel;
+use crate::robot::{BaseMotion, IdentificationInput, Robot};
+use crate::training::TrainingLog;
+use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Rotation3, Vector3, Vector6};
+use proprio_dynamics::model::{JointKind, MeasurementDirection, MeasurementFrame};
+use proprio_dynamics::spatial::{Mat3, Pose, Vec3, Wrench};
+use proprio_dynamics::{DynamicsError, SensorCut, Structure};
+use std::ops::ControlFlow;
+
+/// Observations of a log that are used at most, and how many share offsets and friction.
+const MAX_OBSERVATIONS: usize = 2000;
+const STRETCH: usize = 500;
+
+/// Fewest values for a comparison with the prediction.
+const MIN_VALUES: f64 = 50.0;
+
+/// Readings above this multiple of the prediction have wrong units, and joint torques below its
+/// inverse.
+const FACTOR: f64 = 30.0;
+
+/// So have F/T readings below the prediction by this factor ...
+const SMALL: f64 = 300.0;
+
+/// ... and joint torques above this multiple of the largest prediction for any joint of the kind.
+const BEYOND: f64 = 100.0;
+
+/// Predicted joint torques below this fraction of the largest one are dominated by CAD's errors.
+const SLIGHT: f64 = 0.01;
+
+/// A ratio of F/T readings beyond this, or below its inverse, is reported.
+const ODD: f64 = 3.0;
+
+/// Least magnitude of the correlation of readings and prediction: they share half of the squares.
+const CORRELATED: f64 = 0.7;
+
+/// F/T readings are compared if the prediction's RMS exceeds this multiple of the noise.
+const ABOVE_NOISE: f64 = 5.0;
+
+/// Lever of the whole robot's weight \[m\].
+const LEVER: f64 = 1.0;
+
+/// Standard gravity \[m/s^2\].
+const GRAVITY: f64 = 9.80665;
+
+/// Fraction of the squared readings that CAD leaves unexplained, above which errors of the inertial
+/// parameters are not the cause: parameters wrong by a third leave a ninth.
+const STRANGE: f64 = 0.25;
+
+/// A change of a sensor is accepted if less than this fraction of the squares remains.
+const REMAINING: f64 = 1.0 / 3.0;
+
+/// Among changes whose remaining squares differ by less than this factor, the simplest is accepted.
+const SIMILAR: f64 = 1.5;
+
+/// A log is tested alone if the mean square of its readings is at least this fraction of that of
+/// the training logs: with little motion, errors of CAD look like a wrong frame.
+const ENOUGH_ALONE: f64 = 1.0 / 9.0;
+
+/// Another gravity is accepted if less than this fraction of the squares remains: parameters wrong
+/// by a third leave a ninth. (A joint that counts backwards looks like another gravity, and leaves
+/// more.)
+const REMAINING_OF_GRAVITY: f64 = 1.0 / 9.0;
+
+/// Tests logs: refuses some, leaves out joint torques, and reports why. Breaks with a reason and
+/// findings if all logs together contradict the configuration.
+///
+/// # Errors
+/// Observations of another robot.
+pub(crate) fn check(
+    robot: &Robot,
+    inputs: &[IdentificationInput],
+    logs: &mut [TrainingLog],
+) -> Result<ControlFlow<(String, Vec<Finding>)>, DynamicsError> {
+    let (mut all, mut trained) = (Evidence::new(robot), 0);
+    let mut alone = Vec::new();
+    for log in &mut *logs {
+        let mut evidence = Evidence::new(robot);
+        if !log.refused {
+            evidence.add_log(robot, inputs, log)?;
+            for (dof, fault) in evidence.faulty_torques(robot) {
+                let torque = evidence.joint(dof);
+                evidence.groups[torque] = Group::new(evidence.width());
+                let (reason, finding) = fault.of_torque(robot, dof);
+                log.exclude_torque(dof, reason, finding);
+            }
+            log.add_findings(evidence.wrong_units(robot));
+        }
+        if log.role == Role::Train && !log.refused {
+            all.add(&evidence);
+            trained += 1;
+        }
+        alone.push((evidence.change(), evidence.wrong_frames(robot)));
+    }
+    let wrong = all.wrong_frames(robot);
+    if !wrong.is_empty() {
+        let names: Vec<&str> = wrong.iter().map(|f| f.subject.as_str()).collect();
+        let reason = format!(
+            "{}: wrong measurement frame or direction; nothing was identified",
+            names.join(", ")
+        );
+        return Ok(ControlFlow::Break((reason, wrong)));
+    }
+    let with_torques = inputs.contains(&IdentificationInput::Torque);
+    if let Some(wrong) = all.wrong_gravity(robot, with_torques) {
+        return Ok(ControlFlow::Break((wrong.text.clone(), vec![wrong])));
+    }
+    // A sensor that was mounted differently in a minority of the logs.
+    for (log, (change, wrong)) in logs.iter_mut().zip(alone) {
+        let is_all = log.role == Role::Train && trained == 1;
+        if !log.refused && !is_all && change >= ENOUGH_ALONE * all.change() {
+            log.add_findings(wrong);
+        }
+    }
+    Ok(ControlFlow::Continue(()))
+}
+
+/// Squares and products of the columns in the rows of one quantity.
+#[derive(Clone)]
+struct Group {
+    gram: DMatrix<f64>,
+    rows: f64,
+}
+
+impl Group {
+    fn new(width: usize) -> Self {
+        Self {
+            gram: DMatrix::zeros(width, width),
+            rows: 0.0,
+        }
+    }
+
+    /// Adds a row with these coefficients of offsets and friction.
+    fn add<'a>(
+        &mut self,
+        nuisance: &mut NuisanceFilter,
+        g: impl Iterator<Item = &'a f64>,
+        line: impl Iterator<Item = &'a f64>,
+    ) {
+        let (g, mut line): (Vec<f64>, Vec<f64>) = (g.copied().collect(), line.copied().collect());
+        nuisance.update(&g, &mut line);
+        let there: Vec<usize> = (0..line.len()).filter(|&i| line[i] != 0.0).collect();
+        for &i in &there {
+            there
+                .iter()
+                .for_each(|&j| self.gram[(j, i)] += line[i] * line[j]);
+        }
+        self.rows += 1.0;
+    }
+
+    /// The reading, in these columns, and what CAD predicts for it.
+    fn compare(&self, reading: &DVector<f64>) -> Option<Compared> {
+        let mut prediction = reading.clone();
+        *prediction.iter_mut().next_back()? -= 1.0;
+        let product = |a: &DVector<f64>, b: &DVector<f64>| a.dot(&(&self.gram * b));
+        let [yy, xx, xy] = [
+            product(reading, reading),
+            product(&prediction, &prediction),
+            product(reading, &prediction),
+        ];
+        (self.rows >= MIN_VALUES && xx > 0.0).then(|| Compared {
+            predicted: (xx / self.rows).sqrt(),
+            ratio: (yy.max(0.0) / xx).sqrt(),
+            correlation: xy / (yy * xx).sqrt().max(f64::MIN_POSITIVE),
+        })
+    }
+}
+
+/// See the [module](self).
+struct Evidence {
+    sensors: usize,
+    /// The rows of F/T sensors, in which a force has the weight of its torque at a lever of
+    /// [`Structure::LENGTH_SCALE`]; torques and forces of each sensor, to which the residual of its
+    /// rows is attributed; the torque of each degree of freedom.
+    groups: Vec<Group>,
+    /// The base and its proper acceleration, if it stands still.
+    base: Option<(usize, Vec3)>,
+    instants: usize,
+}
+
+impl Evidence {
+    fn new(robot: &Robot) -> Self {
+        let sensors = robot.structure.sensors().len();
+        let mut new = Self {
+            sensors,
+            groups: Vec::new(),
+            base: None,
+            instants: 0,
+        };
+        let count = new.joint(robot.model.dof_count());
+        new.groups = vec![Group::new(new.width()); count];
+        new
+    }
+
+    fn width(&self) -> usize {
+        3 + 36 * self.sensors + 2
+    }
+
+    /// The group of a degree of freedom.
+    fn joint(&self, dof: usize) -> usize {
+        1 + 2 * self.sensors + dof
+    }
+
+    fn add(&mut self, other: &Self) {
+        for (own, other) in self.groups.iter_mut().zip(&other.groups) {
+            own.gram += &other.gram;
+            own.rows += other.rows;
+        }
+        self.base = match (self.instants, self.base == other.base) {
+            (0, _) | (_, true) => other.base,
+            _ => None,
+        };
+        self.instants += other.instants;
+    }
+
+    fn add_log(
+        &mut self,
+        robot: &Robot,
+        inputs: &[IdentificationInput],
+        log: &TrainingLog,
+    ) -> Result<(), DynamicsError> {
+        let step = log.instants.len().div_ceil(MAX_OBSERVATIONS).max(1);
+        let some: Vec<&Annotated> = log.instants.iter().step_by(step).collect();
+        // Joint torques are a reference even if nothing is identified from them.
+        let inputs = [inputs, &[IdentificationInput::Torque]].concat();
+        let measurement = MeasurementModel::for_observations(robot, &inputs, some.iter().copied())?;
+        let of = |own: &Observation| (own.base_link, own.base);
+        let Some(first) = some.first() else {
+            return Ok(());
+        };
+        let stands = matches!(robot.base, BaseMotion::Standing(_))
+            && some.iter().all(|own| of(own) == of(first));
+        self.base = stands.then(|| (first.base_link, first.base.proper_acceleration));
+        let stretches: Vec<&[&Annotated]> = some.chunks(STRETCH).collect();
+        let parts = parallel::map_with(
+            stretches.len(),
+            || measurement.clone(),
+            |measurement, number| {
+                let mut own = Self {
+                    base: self.base,
+                    ..Self::new(robot)
+                };
+                own.add_stretch(measurement, stretches[number]);
+                own
+            },
+        );
+        parts.iter().for_each(|part| self.add(part));
+        Ok(())
+    }
+
+    /// Adds observations with common offsets and friction.
+    fn add_stretch(&mut self, measurement: &mut MeasurementModel<'_>, stretch: &[&Annotated]) {
+        let unknowns = measurement.unknowns().clone();
+        let (offsets, last) = (unknowns.nuisance(), self.width() - 1);
+        // A rotor is among what is eliminated: CAD does not contain it.
+        let mut prior = nuisance_prior(&unknowns);
+        prior.extend(unknowns.precision.iter().map(|precision| 1.0 / precision));
+        let mut nuisance = NuisanceFilter::new(&prior, last + 1);
+        let mut of_sensors = nuisance.clone();
+        let ones = vec![1.0; unknowns.channels()];
+        let mut variances = ones.clone();
+        for torque in (0..unknowns.sensors.len()).flat_map(|place| 6 * place..6 * place + 3) {
+            variances[torque] = Structure::LENGTH_SCALE.powi(2);
+        }
+        let [mut rows, mut moved] = [Rows::new(&unknowns), Rows::new(&unknowns)];
+        for instant in stretch {
+            if measurement.make(instant, &mut rows).is_err() {
+                continue;
+            }
+            self.instants += 1;
+            let mut lines = DMatrix::zeros(rows.count, last + 1);
+            if self.base.is_some() {
+                let mut right = |axis: Vec3| {
+                    let other = (*instant).clone().map(|own| own.seen(View::Upright(axis)));
+                    let is_made = measurement.make(&other, &mut moved).is_ok();
+                    (is_made && moved.count == rows.count)
+                        .then(|| DVector::from_column_slice(&moved.r))
+                };
+                let without = right(Vec3::zeros());
+                for axis in 0..3 {
+                    if let (Some(own), Some(without)) = (right(Vec3::ith(axis, 1.0)), &without) {
+                        lines.set_column(axis, &(own - without));
+                    }
+                }
+            }
+            for row in 0..rows.count {
+                for (place, &sensor) in unknowns.sensors.iter().enumerate() {
+                    let reading = instant.readings[sensor].torque_first();
+                    for (i, g) in rows.g(row)[6 * place..][..6].iter().enumerate() {
+                        for (j, y) in reading.iter().enumerate().filter(|_| *g != 0.0) {
+                            lines[(row, entry(sensor, i, j))] = g * y;
+                        }
+                    }
+                }
+                if let Some(joint) = rows.joint(row, 6 * unknowns.sensors.len()) {
+                    lines[(row, last - 1)] = instant.torque[unknowns.joints[joint]];
+                }
+                lines[(row, last)] = rows.r(row);
+            }
+            let g = |rows: &Rows| {
+                DMatrix::from_fn(rows.count, prior.len(), |row, column| {
+                    match column.checked_sub(offsets) {
+                        None => rows.g(row)[column],
+                        Some(rotor) => rows.a(row)[unknowns.inertial() + rotor],
+                    }
+                })
+            };
+            let all = g(&rows);
+            for (place, &sensor) in unknowns.sensors.iter().enumerate() {
+                let channels = 6 * place..6 * place + 6;
+                let Some(map) = attribute_to(&rows, &ones, channels.clone()) else {
+                    continue;
+                };
+                let (g, lines) = (&map * &all, &map * &lines);
+                for (k, _) in channels
+                    .enumerate()
+                    .filter(|(_, channel)| rows.has(*channel))
+                {
+                    let group = &mut self.groups[1 + 2 * sensor + k / 3];
+                    group.add(&mut of_sensors, g.row(k).iter(), lines.row(k).iter());
+                }
+            }
+            let mut lines = lines.transpose();
+            rows.whiten_with(&variances, lines.as_mut_slice(), last + 1);
+            let all = g(&rows);
+            for row in 0..rows.count {
+                let joint = rows.joint(row, 6 * unknowns.sensors.len());
+                let group = joint.map_or(0, |joint| self.joint(unknowns.joints[joint]));
+                let line = lines.column(row);
+                self.groups[group].add(&mut nuisance, all.row(row).iter(), line.iter());
+            }
+        }
+    }
+
+    /// Coefficients of the columns of readings: these multiples of the readings of each sensor.
+    fn readings(&self, of: impl Fn(usize) -> Matrix6<f64>) -> DVector<f64> {
+        let mut own = DVector::zeros(self.width());
+        for sensor in 0..self.sensors {
+            let of = of(sensor);
+            for (i, j) in (0..6).flat_map(|i| (0..6).map(move |j| (i, j))) {
+                own[entry(sensor, i, j)] = of[(i, j)];
+            }
+        }
+        own
+    }
+
+    /// Mean square of the sensors' readings per instant.
+    fn change(&self) -> f64 {
+        let readings = self.readings(|_| Matrix6::identity());
+        squares(&self.groups[0].gram, &readings) / self.instants.max(1) as f64
+    }
+
+    /// Degrees of freedom whose torque has a wrong unit or sign.
+    fn faulty_torques(&self, robot: &Robot) -> Vec<(usize, Fault)> {
+        let mut torque = DVector::zeros(self.width());
+        torque[self.width() - 2] = 1.0;
+        let compared: Vec<_> = self.groups[self.joint(0)..]
+            .iter()
+            .map(|group| group.compare(&torque))
+            .collect();
+        let slides: Vec<bool> = (0..compared.len()).map(|dof| slides(robot, dof)).collect();
+        let faults = torque_faults(&compared, &slides).into_iter().enumerate();
+        faults
+            .filter_map(|(dof, fault)| Some((dof, fault?)))
+            .collect()
+    }
+
+    /// Findings of wrong units of F/T readings; refusals if nothing can be identified from them.
+    fn wrong_units(&self, robot: &Robot) -> Vec<Finding> {
+        let bodies = robot.model.inertias().iter();
+        let weight = GRAVITY * bodies.map(|body| body.mass).sum::<f64>();
+        let mut faults = Vec::new();
+        for sensor in 0..self.sensors {
+            let noise = robot.structure.sensors()[sensor].noise();
+            let [torque, force] = [noise.torque, noise.force].map(|x| Vec3::from(x).max());
+            let compared =
+                [(0, torque, LEVER * weight), (1, force, weight)].map(|(kind, noise, most)| {
+                    let reading = self.readings(|other| {
+                        let is_own = |i: usize| other == sensor && i / 3 == kind;
+                        let own = |i: usize, _| if is_own(i) { 1.0 } else { 0.0 };
+                        Matrix6::from_diagonal(&Vector6::from_fn(own))
+                    });
+                    let compared = self.groups[1 + 2 * sensor + kind].compare(&reading)?;
+                    (compared.predicted > ABOVE_NOISE * noise).then_some((compared, most))
+                });
+            let fault = wrench_fault(&compared);
+            faults.extend(fault.map(|fault| (sensor, fault, compared)));
+        }
+        // The prediction of one sensor uses the other sensors of its sub-tree: one that is far too
+        // large makes the others look too small.
+        let is_large = |fault: Fault| matches!(fault, Fault::Unit(ratio) if ratio > 1.0);
+        if faults.iter().any(|(_, fault, _)| is_large(*fault)) {
+            faults.retain(|(_, fault, _)| *fault == Fault::Odd || is_large(*fault));
+        }
+        let findings = faults.into_iter();
+        findings
+            .map(|(sensor, fault, [torque, force])| {
+                let ratio = |of: Option<(Compared, f64)>| of.map(|(own, _)| own.ratio);
+                fault.of_wrench(&sensor_name(robot, sensor), ratio(force), ratio(torque))
+            })
+            .collect()
+    }
+
+    /// Sensors whose readings fit CAD only in another frame than the configuration says.
+    fn wrong_frames(&self, robot: &Robot) -> Vec<Finding> {
+        let gram = &self.groups[0].gram;
+        let without = squares(gram, &self.readings(|_| Matrix6::identity()));
+        let remains = |chosen: &[(usize, Mounting)]| {
+            let mut changed = self.readings(|sensor| {
+                let own = chosen.iter().find(|(own, _)| *own == sensor);
+                own.map_or_else(Matrix6::zeros, |(_, own)| own.change - Matrix6::identity())
+            });
+            changed[self.width() - 1] = 1.0;
+            squares(gram, &changed)
+        };
+        // In this order: signs, frames with a name, turned axes.
+        let tried = |chosen: &[(usize, Mounting)]| {
+            let is_open = |own: &usize| chosen.iter().all(|(other, _)| other != own);
+            let open: Vec<usize> = (0..self.sensors).filter(is_open).collect();
+            let opposite = open.iter().map(|&own| (own, Mounting::opposite()));
+            let mut tried: Vec<(usize, Mounting)> = opposite.collect();
+            if remains(chosen) > STRANGE * without {
+                let each = open.iter().flat_map(|&sensor| {
+                    let all = mountings(robot, sensor).into_iter();
+                    all.map(move |mounting| (sensor, mounting))
+                });
+                tried.extend(each.filter(|own| {
+                    remains(&[chosen, std::slice::from_ref(own)].concat()) < STRANGE * without
+                }));
+            }
+            tried
+        };
+        let cost = |chosen: &[(usize, Mounting)]| Some(remains(chosen));
+        let mut chosen = accepted(tried, cost, |before| (1.0 - REMAINING) * before, SIMILAR);
+        chosen.sort_by_key(|(sensor, _)| *sensor);
+        let findings = chosen.into_iter().map(|(sensor, mounting)| {
+            let sensor = sensor_name(robot, sensor);
+            let (code, text) = match mounting.instead {
+                None => (
+                    FindingCode::WrongSign,
+                    "fits only with the opposite sign (masses would be negative): check \
+                     `direction` and `frame` in the configuration and, if an IMU measures gravity, \
+                     that it is not upside down"
+                        .to_owned(),
+                ),
+                Some(instead) => {
+                    let text = format!(
+                        "does not fit the links beyond it in the configured frame, but would with \
+                         {instead}: check its mounting, and `frame` and `direction` in its \
+                         [[force_torque]]"
+                    );
+                    (FindingCode::WrongFrame, text)
+                }
+            };
+            let text = format!("wrench/{sensor} {text}");
+            Finding::refusal(code, sensor, text)
+        });
+        findings.collect()
+    }
+
+    /// The finding, if the logs contradict the configured gravity.
+    fn wrong_gravity(&self, robot: &Robot, with_torques: bool) -> Option<Finding> {
+        let (base, configured) = self.base?;
+        let mut gram = self.groups[0].gram.clone();
+        if with_torques {
+            let joints = &self.groups[self.joint(0)..];
+            joints.iter().for_each(|joint| gram += &joint.gram);
+        }
+        let columns: Matrix3<f64> = gram.fixed_view::<3, 3>(0, 0).into_owned();
+        let right: Vector3<f64> = gram.fixed_view::<3, 1>(0, self.width() - 1).into_owned();
+        let remains = |by: Vec3| {
+            let mut change = DVector::zeros(self.width());
+            change.rows_mut(0, 3).copy_from(&(by / GRAVITY));
+            change[self.width() - 1] = 1.0;
+            squares(&gram, &change)
+        };
+        let best = configured - GRAVITY * columns.cholesky()?.solve(&right);
+        let found = best.normalize() * configured.norm();
+        let is_other_axis = found.dot(&configured) < 0.5_f64.sqrt() * configured.norm_squared();
+        let share = remains(found - configured) / remains(Vec3::zeros());
+        if !is_other_axis || share > REMAINING_OF_GRAVITY {
+            return None;
+        }
+        let written = |p: &Vec3| {
+            let [x, y, z] = [-p.x, -p.y, -p.z].map(|x| if x.abs() < 0.05 { 0.0 } else { x });
+            format!("[{x:.1}, {y:.1}, {z:.1}]")
+        };
+        Some(Finding::refusal(
+            FindingCode::WrongGravity,
+            "base.gravity_mps2",
+            format!(
+                "the logs contradict the configured gravity_mps2 = {}: with {} in the axes of {} \
+                 the URDF's links leave {:.0} % of the error; correct [base]",
+                written(&configured),
+                written(&found),
+                robot.model.link_name(base),
+                100.0 * share.sqrt()
+            ),
+        ))
+    }
+}
+
+/// The column of `g_i y_j` of a sensor.
+fn entry(sensor: usize, i: usize, j: usize) -> usize {
+    3 + 36 * sensor + 6 * i + j
+}
+
+/// The square sum of a combination of columns.
+fn squares(gram: &DMatrix<f64>, of: &DVector<f64>) -> f64 {
+    of.dot(&(gram * of))
+}
+
+fn slides(robot: &Robot, dof: usize) -> bool {
+    let joint = robot.model.dof_joint(dof);
+    let joint = joint.map(|joint| robot.model.joints()[joint]);
+    joint.is_some_and(|joint| matches!(joint.kind, JointKind::Prismatic(_)))
+}
+
+/// A reading beside its prediction, both without what offsets and friction explain.
+#[derive(Clone, Copy, Debug)]
+struct Compared {
+    /// RMS of the prediction.
+    predicted: f64,
+    /// RMS of the reading relative to it.
+    ratio: f64,
+    correlation: f64,
+}
+
+/// An error of a unit or sign, with the ratio of reading and prediction.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Fault {
+    Sign,
+    Unit(f64),
+    /// Possible, but unusual.
+    Odd,
+}
+
+/// The fault of each of these joint torques. `slides`: whether the joint is prismatic. Forces are
+/// compared with forces, torques with torques.
+fn torque_faults(compared: &[Option<Compared>], slides: &[bool]) -> Vec<Option<Fault>> {
+    let all = || compared.iter().zip(slides);
+    all()
+        .map(|(own, kind)| {
+            let alike = all().filter(|(_, other)| *other == kind);
+            let predicted = alike.filter_map(|(other, _)| Some(other.as_ref()?.predicted));
+            let greatest = predicted.fold(0.0, f64::max);
+            let Compared {
+                predicted,
+                ratio,
+                correlation,
+            } = (*own)?;
+            let beyond = ratio * predicted / greatest;
+            if beyond > BEYOND {
+                Some(Fault::Unit(beyond))
+            } else if predicted <= SLIGHT * greatest {
+                None
+            } else if ratio > FACTOR && correlation.abs() > CORRELATED || ratio < 1.0 / FACTOR {
+                Some(Fault::Unit(ratio))
+            } else {
+                let is_opposite = 4.0 * correlation * ratio < -(1.0 + ratio * ratio);
+                is_opposite.then_some(Fault::Sign)
+            }
+        })
+        .collect()
+}
+
+/// The fault of a sensor from its torques and forces, each with the largest change that the robot
+/// can cause.
+fn wrench_fault(both: &[Option<(Compared, f64)>; 2]) -> Option<Fault> {
+    let both = || both.iter().flatten();
+    let is_alike = |own: &Compared| own.correlation.abs() > CORRELATED;
+    let is_large = |own: &Compared, most: f64| {
+        own.ratio > FACTOR && is_alike(own) && own.ratio * own.predicted > most
+    };
+    let is_odd =
+        |own: &Compared| !(1.0 / ODD..=ODD).contains(&own.ratio) && own.correlation > CORRELATED;
+    let (first, _) = both().next()?;
+    if let Some((own, _)) = both().find(|(own, most)| is_large(own, *most)) {
+        Some(Fault::Unit(own.ratio))
+    } else if both().all(|(own, _)| own.ratio < 1.0 / SMALL && is_alike(own)) {
+        Some(Fault::Unit(first.ratio))
+    } else {
+        both().any(|(own, _)| is_odd(own)).then_some(Fault::Odd)
+    }
+}
+
+fn times(ratio: f64) -> String {
+    match ratio {
+        ratio if ratio >= 10.0 => format!("{ratio:.0} times"),
+        ratio if ratio >= 1.0 => format!("{ratio:.1} times"),
+        ratio if ratio > 0.0 => format!("1/{:.0}", 1.0 / ratio),
+        _ => "0 times".into(),
+    }
+}
+
+impl Fault {
+    /// Why a joint's torque is left out, and the finding.
+    fn of_torque(self, robot: &Robot, dof: usize) -> (String, Finding) {
+        let joint = robot.model.dof_name(dof);
+        let (unit, units) = if slides(robot, dof) {
+            ("N", "newtons")
+        } else {
+            ("Nm", "newton metres")
+        };
+        let (code, reason, what) = if let Self::Unit(ratio) = self {
+            let cause = if ratio > 1.0 {
+                format!("it is in counts or thousandths of {units}")
+            } else {
+                format!("its channel is dead, or it is in thousands of {units}")
+            };
+            let text = format!(
+                "is {} what the URDF's masses predict, and was excluded: {cause}; convert it to \
+                 {unit}",
+                times(ratio)
+            );
+            (FindingCode::WrongUnits, "units", text)
+        } else {
+            let text = "has the wrong sign: it is opposite to what the URDF's masses predict, and \
+                        was excluded; positive is along the joint's axis, by the parent on the \
+                        child. Check its sign, that of the encoder, and gravity_mps2";
+            (FindingCode::WrongSign, "sign", text.to_owned())
+        };
+        let finding = Finding::warning(
+            code,
+            format!("joint/{joint}/torque"),
+            format!("joint/{joint}/torque {what}"),
+        );
+        (format!("{reason} of the torque of {joint}"), finding)
+    }
+
+    fn of_wrench(self, name: &str, force: Option<f64>, torque: Option<f64>) -> Finding {
+        let both = [("forces", force), ("torques", torque)].into_iter();
+        let ratios = both.filter_map(|(word, ratio)| Some(format!("{word} {}", times(ratio?))));
+        let ratios = ratios.collect::<Vec<_>>().join(" and ");
+        let (severity, code, rest) = match self {
+            Self::Unit(ratio) if ratio > 1.0 => (
+                Severity::Refusal,
+                FindingCode::WrongUnits,
+                "it is in counts or in mN and mNm (convert it to N and Nm), or the URDF's masses \
+                 are not in kg",
+            ),
+            Self::Unit(_) => (
+                Severity::Refusal,
+                FindingCode::WrongUnits,
+                "it is in kN and kNm (convert it to N and Nm), or the URDF's masses are not in kg",
+            ),
+            _ => (
+                Severity::Warning,
+                FindingCode::Scale,
+                "the robot carries a load that the URDF lacks, or the URDF's masses are wrong by \
+                 this factor; or the units (1 kgf is 9.807 N) or the calibration are wrong, and \
+                 then so are the parameters: weigh the robot, or hang a known mass on it",
+            ),
+        };
+        Finding::new(
+            severity,
+            code,
+            format!("wrench/{name}"),
+            format!(
+                "wrench/{name} does not change as the URDF's masses predict ({ratios} as \
+                 large as predicted): {rest}"
+            ),
+        )
+    }
+}
+
+/// Another frame that a sensor's readings may be in.
+#[derive(Clone)]
+struct Mounting {
+    /// What the configuration should state; none: the opposite direction, all else unchanged.
+    instead: Option<String>,
+    /// From readings in that frame to readings as configured, [torque; force].
+    change: Matrix6<f64>,
+}
+
+impl Mounting {
+    fn opposite() -> Self {
+        Self {
+            instead: None,
+            change: -Matrix6::identity(),
+        }
+    }
+}
+
+/// Frames that have a name in the configuration; then axes rotated by right angles about the
+/// configured origin; all in both directions, the configured one first.
+fn mountings(robot: &Robot, sensor: usize) -> Vec<Mounting> {
+    let cut = &robot.structure.sensors()[sensor];
+    let joint = robot.model.joint_name(cut.joint());
+    let configured = *cut.pose();
+    let (same, other) = match cut.sign() < 0.0 {
+        true => ("child_to_parent", "parent_to_child"),
+        false => ("parent_to_child", "child_to_parent"),
+    };
+    let parent = SensorCut::new(
+        &robot.model,
+        joint,
+        MeasurementFrame::Parent,
+        MeasurementDirection::ChildToParent,
+        &Pose::identity(),
+        &cut.noise(),
+    );
+    let mut elements = robot.model.sensors().iter();
+    let element = elements.find(|element| element.joint == joint);
+    let mut poses: Vec<(String, Pose)> = vec![("frame = \"child\"".into(), Pose::identity())];
+    poses.extend(parent.map(|parent| ("frame = \"parent\"".to_owned(), *parent.pose())));
+    poses.extend(element.map(|element| {
+        let text = "frame = \"sensor\" (as the URDF poses it)";
+        (text.to_owned(), element.pose)
+    }));
+    let list = |values: [f64; 3]| {
+        let numbers = values.map(|value| format!("{}", (1e4 * value).round() / 1e4 + 0.0));
+        format!("[{}]", numbers.join(", "))
+    };
+    for turn in [Mat3::identity()].into_iter().chain(quarter_turns()) {
+        let rotation = configured.rotation * turn;
+        let (roll, pitch, yaw) = Rotation3::from_matrix_unchecked(rotation).euler_angles();
+        let text = format!(
+            "frame = \"sensor\", xyz_m = {}, rpy_rad = {}",
+            list(configured.translation.into()),
+            list([roll, pitch, yaw])
+        );
+        poses.push((
+            text,
+            Pose {
+                rotation,
+                ..configured
+            },
+        ));
+    }
+    let mut mountings = vec![
+        Mounting {
+            instead: None,
+            change: Matrix6::identity(),
+        },
+        Mounting::opposite(),
+    ];
+    for (sign, direction) in [(1.0, same), (-1.0, other)] {
+        for (text, pose) in &poses {
+            let change = Matrix6::from_columns(&std::array::from_fn::<_, 6, _>(|channel| {
+                let mut unit = [0.0; 6];
+                unit[channel] = sign;
+                let in_child = pose.wrench(&Wrench::from_torque_first(unit));
+                Vector6::from(configured.wrench_back(&in_child).torque_first())
+            }));
+            let is_new = |other: &Mounting| (change - other.change).amax() > 1e-6;
+            if mountings.iter().all(is_new) {
+                mountings.push(Mounting {
+                    instead: Some(format!("{text}, direction = \"{direction}\"")),
+                    change,
+                });
+            }
+        }
+    }
+    mountings.split_off(2)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::arithmetic::normals;
+
+    /// A reading of `scale` times the prediction, which is wrong by `wrong` times another motion;
+    /// with noise.
+    fn compared(size: f64, scale: f64, wrong: f64, noise: f64) -> Compared {
+        let mut gram = DMatrix::zeros(2, 2);
+        let deviates = normals(3, 1000);
+        for (i, deviate) in deviates.iter().enumerate() {
+            let t = 0.05 * i as f64;
+            let (x, other) = (8.0 * (0.9 * t).sin(), 8.0 * (1.7 * t + 1.0).sin());
+            let y = scale * (size * (x + wrong * other) + noise * deviate);
+            let row = DVector::from_column_slice(&[y, y - size * x]);
+            gram += &row * row.transpose();
+        }
+        let group = Group { gram, rows: 1000.0 };
+        group
+            .compare(&DVector::from_column_slice(&[1.0, 0.0]))
+            .expect("enough")
+    }
+
+    /// The fault of a torque that is the only one.
+    fn of_torque(scale: f64, wrong: f64, noise: f64) -> Option<Fault> {
+        torque_faults(&[Some(compared(1.0, scale, wrong, noise))], &[false])[0]
+    }
+
+    /// The fault of a sensor of a robot that weighs ten times the moved mass.
+    fn of_force(scale: f64, wrong: f64, noise: f64) -> Option<Fault> {
+        wrench_fault(&[None, Some((compared(1.0, scale, wrong, noise), 80.0))])
+    }
+
+    fn is_unit(fault: Option<Fault>, expected: f64) -> bool {
+        matches!(fault, Some(Fault::Unit(ratio)) if (0.7..1.5).contains(&(ratio / expected)))
+    }
+
+    #[test]
+    fn wrong_units_are_separated_from_a_wrong_model() {
+        for (wrong, noise) in [(0.0, 0.01), (0.5, 1.0), (1.5, 4.0)] {
+            assert_eq!(of_torque(1.0, wrong, noise), None, "{wrong} {noise}");
+            assert_eq!(of_force(1.0, wrong, noise), None, "{wrong} {noise}");
+        }
+        assert_eq!(of_torque(-1.0, 0.4, 1.0), Some(Fault::Sign));
+        // Cables and drifting offsets, with little motion, are not counts.
+        assert_eq!(of_force(1.0, 60.0, 1.0), None);
+        for (scale, times) in [(1000.0, 1000.0), (-1000.0, 1000.0), (0.001, 0.001)] {
+            assert!(is_unit(of_torque(scale, 0.3, 1.0), times), "{scale}");
+            assert!(is_unit(of_force(scale, 0.3, 1.0), times), "{scale}");
+        }
+        assert!(matches!(of_torque(0.0, 0.0, 0.0), Some(Fault::Unit(ratio)) if ratio < 1.0));
+        for kilograms in [0.102, 9.8] {
+            assert_eq!(of_force(kilograms, 0.3, 1.0), Some(Fault::Odd));
+        }
+    }
+
+    /// A gantry that carries a wrist: an error of the wrist's torque is found beside forces of a
+    /// thousand newtons, and these are not compared with torques. A joint that carries next to
+    /// nothing shows its unit only by far.
+    #[test]
+    fn torques_are_compared_with_torques() {
+        let all = |wrist: f64, idle: f64| {
+            let own = [
+                compared(200.0, 1.0, 0.2, 1.0),
+                compared(0.2, wrist, 0.2, 0.01),
+                compared(0.2, 1.0, 0.2, 0.01),
+                compared(1e-3, idle, 0.2, 0.1),
+            ];
+            torque_faults(&own.map(Some), &[true, false, false, false])
+        };
+        assert_eq!(all(1.0, 1.0), [None; 4]);
+        assert_eq!(all(-1.0, 1.0), [None, Some(Fault::Sign), None, None]);
+        let [None, small, None, None] = all(0.001, 1.0)[..] else {
+            panic!("another fault")
+        };
+        assert!(is_unit(small, 0.001));
+        assert!(matches!(
+            all(1.0, 1e4)[..],
+            [None, None, None, Some(Fault::Unit(_))]
+        ));
+    }
+
+    /// A gripper on a flange that the URDF lacks, or the opposite; a tool whose centre of mass is
+    /// elsewhere: unusual, but possible.
+    #[test]
+    fn errors_of_the_urdf_are_not_refused() {
+        let of_both = |force: f64, torque: f64| {
+            wrench_fault(&[torque, force].map(|scale| {
+                let own = compared(1.0, scale, 0.3, 1.0);
+                Some((own, 5000.0))
+            }))
+        };
+        for (force, torque) in [(40.0, 40.0), (0.02, 0.02), (1.1, 40.0), (1.1, 0.001)] {
+            assert_eq!(of_both(force, torque), Some(Fault::Odd), "{force} {torque}");
+        }
+    }
+}

@@ -1,0 +1,646 @@
+//! The search for errors of the set-up that a fit shows: encoders that count backwards or have
+//! another zero, readings that are stamped late.
+//!
+//! Every hypothesis is judged by the same evidence, the cost of a fit with it: squared residuals
+//! plus twice the prior's cost, at the prior's scale. The hypothesis that lowers the cost the most
+//! is accepted if it does so by more than parameters and noise do ([`crate::hypothesis`]); then the
+//! next beside it ([`crate::hypothesis::accepted`]). What is found is reported, not corrected.
+//!
+//! # Encoder sign
+//! Other rows: positions, velocities and accelerations are negated. Tested before gains of the F/T
+//! sensors are fitted, 36 of which would make up for much of a wrong sign. If a sign is wrong,
+//! nothing else is tested: it looks like zeros of other joints.
+//!
+//! # Encoder zero
+//! An unknown with a prior, whose column is a difference of the rows. A zero of a joint beyond or
+//! between F/T sensors shifts a centre of mass. That of a joint between the base and the sensors
+//! tilts everything beyond by an amount that depends on the posture; only for the joint at the base
+//! it is not separable from a base that is not level. The error is the same in all logs, or present
+//! in one of several: incremental encoders find their zero again at each start.
+//!
+//! # Delay
+//! What happens at `t` is stamped `t + delay`: an unknown with a prior, whose column is the
+//! negative rate of change of the stream. An error of the friction model makes each joint torque
+//! seem late by a different time (a real arm with joint torque sensors: 10 to 95 ms, but no delay
+//! of all together); and friction and masses that were fitted to late torques absorb most of a
+//! delay. So joint torques are one stream. A single torque is reported only if its delay differs
+//! from the common one of the others by far more than any of theirs does, and the others together
+//! have no delay: the reference is the encoders, not the majority.
+
+use crate::arithmetic::dot;
+use crate::dataset::observation::{Annotated, Observation};
+use crate::finding::{Finding, FindingCode};
+use crate::fit::{Identified, NoiseAndMap, added};
+use crate::hypothesis::{accepted, deviations, needed};
+use crate::linear::information::Information;
+use crate::measurement::channels::sensor_name;
+use crate::measurement::model::MeasurementModel;
+use crate::measurement::reduction::{Segment, reduce, reduce_with, residuals};
+use crate::measurement::rows::Rows;
+use crate::measurement::unknowns::Unknowns;
+use crate::online::bank::hypothesis::View;
+use crate::prior::{Fit, Posterior};
+use crate::report::outcome::TimeOffset;
+use crate::robot::Robot;
+use crate::training::{TrainingLog, map_segments};
+use nalgebra::{DMatrix, DVector};
+use proprio_dynamics::model::{Joint, JointKind};
+use std::f64::consts::FRAC_1_SQRT_2;
+use std::ops::Range;
+
+/// Prior standard deviation of an encoder's zero \[rad\], and of a delay \[s\].
+const ZERO_STD: f64 = 0.1;
+const DELAY_STD: f64 = 0.05;
+
+/// A step of an encoder whose effect is linear \[rad\].
+const STEP: f64 = 1e-5;
+
+/// Smallest zero that is reported \[rad\] ...
+const MIN_ZERO: f64 = 0.01;
+
+/// ... of a joint between the base and the sensors: floors and bases are tilted by less ...
+const MIN_ZERO_BEFORE_SENSORS: f64 = 0.02;
+
+/// ... and smallest delay \[s\].
+const MIN_DELAY: f64 = 2e-3;
+
+/// Observations that are used in all, and of each log at least.
+const ENOUGH: [usize; 2] = [4000, 400];
+
+/// The same for signs: a wrong sign shows in fewer observations.
+const ENOUGH_FOR_SIGN: [usize; 2] = [1200, 300];
+
+/// Stretches of consecutive instants per log. Offsets and noise need consecutive instants, and each
+/// stretch has sensor offsets of its own.
+const STRETCHES: usize = 4;
+
+/// Fraction of the cost that the right sign must save. The noise is that of a fit with the wrong
+/// sign, which leaves most of the cost; a joint that hardly moves may save a little by chance of
+/// the model's errors.
+const SURE: f64 = 0.25;
+
+/// Most likely candidates that are fitted in each round.
+const TRIED: usize = 6;
+
+/// A single torque is reported if its delay exceeds that of any other by this factor. (A real arm
+/// with joint torque sensors, whose friction makes them seem late, reaches 3.7.)
+const SINGLE: f64 = 8.0;
+
+/// Rates are computed over this time before and after an instant \[s\], because friction changes
+/// its sign suddenly.
+const REACH: f64 = 0.03;
+
+/// The squared residuals of a fit plus twice its prior cost.
+fn cost(unknowns: &Unknowns, fit: &Fit, precision: &[f64]) -> f64 {
+    let extra = fit.x.iter().skip(unknowns.inertial());
+    let extra = extra.zip(precision).map(|(x, precision)| x * x * precision);
+    fit.residual_square + fit.divergence / fit.tau.powi(2) + extra.sum::<f64>()
+}
+
+/// Instants of all logs, so many in all and of each log at least, in stretches from the first to
+/// the last.
+fn stretches<'a>(training: &[&'a TrainingLog], enough: [usize; 2]) -> Vec<Vec<Segment<'a>>> {
+    let share = (enough[0] / training.len().max(1)).max(enough[1]);
+    let of_log = |log: &&'a TrainingLog| {
+        let all = log.instants.as_slice();
+        let stretches = if all.len() > share { STRETCHES } else { 1 };
+        let count = all.len().min(share) / stretches;
+        let segment = |stretch: usize| {
+            let start = (all.len() - count) * stretch / (stretches - 1).max(1);
+            Segment {
+                instants: &all[start..start + count],
+                log: None,
+            }
+        };
+        (0..stretches).map(segment).collect()
+    };
+    training.iter().map(of_log).collect()
+}
+
+/// The revolute joint of a degree of freedom.
+fn revolute(robot: &Robot, dof: usize) -> Option<&Joint> {
+    let joint = robot.model.dof_joint(dof)?;
+    let joint = &robot.model.joints()[joint];
+    matches!(joint.kind, JointKind::Revolute(_)).then_some(joint)
+}
+
+/// The degrees of freedom that are tested. (A joint that moves no identified link has columns of
+/// zeros, and explains nothing.)
+fn turning(robot: &Robot) -> Vec<usize> {
+    let is_tested = |dof: &usize| robot.locked[*dof].is_nan() && revolute(robot, *dof).is_some();
+    (0..robot.model.dof_count()).filter(is_tested).collect()
+}
+
+/// Findings of wrong encoder signs, with a fit without gains.
+pub(crate) fn wrong_signs(
+    measurement: &MeasurementModel<'_>,
+    training: &[&TrainingLog],
+    estimate: &NoiseAndMap,
+) -> Vec<Finding> {
+    let (robot, unknowns) = (measurement.robot(), measurement.unknowns());
+    let NoiseAndMap {
+        prior, noise, fit, ..
+    } = estimate;
+    // A joint's axis can be reversed by links that are nothing like CAD's: CAD is taken to be as
+    // good as stated.
+    let stated = robot.urdf_relative_std * FRAC_1_SQRT_2;
+    let tau = if stated > 0.0 {
+        fit.tau.min(stated)
+    } else {
+        fit.tau
+    };
+    let segments = stretches(training, ENOUGH_FOR_SIGN).concat();
+    let cost_with = |negated: &[usize]| {
+        let (mut measurement, mut reduced) = (measurement.clone(), Vec::new());
+        for Segment { instants, log } in &segments {
+            let other = |own: &Annotated| {
+                let views = negated.iter().map(|&dof| View::Reversed(dof));
+                own.clone().map(|own| views.fold(own, Observation::seen))
+            };
+            let instants: Vec<Annotated> = instants.iter().map(other).collect();
+            let (instants, log) = (&instants[..], *log);
+            reduced.push(reduce(&mut measurement, Segment { instants, log }, noise));
+        }
+        let all = added(&reduced, unknowns.parameters());
+        let (r, z) = all.to_triangle();
+        let posterior = Posterior::new(prior, &unknowns.links, &r, &z, &unknowns.precision);
+        let fit = posterior.ok()?.fit(tau).ok()?;
+        Some(all.residual_square() + cost(unknowns, &fit, &unknowns.precision))
+    };
+    let dofs = turning(robot);
+    let negated = accepted(
+        |negated| {
+            let rest = dofs.iter().copied();
+            rest.filter(|dof| !negated.contains(dof)).collect()
+        },
+        cost_with,
+        |before| needed(1, dofs.len()).max(SURE * before),
+        1.0,
+    );
+    let finding = |dof: usize| {
+        let joint = format!("joint/{}", robot.model.dof_name(dof));
+        Finding::warning(
+            FindingCode::WrongSign,
+            &joint,
+            format!(
+                "{joint}: wrong encoder sign, the data fit only with the position negated; negate \
+                 the encoder's reading, or the joint's axis in the URDF"
+            ),
+        )
+    };
+    negated.into_iter().map(finding).collect()
+}
+
+/// An error that is estimated.
+#[derive(Clone, Debug, PartialEq)]
+enum Error {
+    /// The zero of a joint's encoder (its place among the tested ones), in all logs or in one.
+    Zero { joint: usize, log: Option<usize> },
+    /// The common delay of these streams: F/T sensors, then joint torques.
+    Delay(Range<usize>),
+}
+
+impl Error {
+    fn precision(&self) -> f64 {
+        match self {
+            Self::Zero { .. } => ZERO_STD.powi(-2),
+            Self::Delay(_) => DELAY_STD.powi(-2),
+        }
+    }
+}
+
+/// An error and its standard deviation.
+type Estimate = (f64, f64);
+
+/// The search for errors that are estimated.
+pub(crate) struct Search<'a> {
+    measurement: &'a MeasurementModel<'a>,
+    training: &'a [&'a TrainingLog],
+    identified: &'a Identified,
+    /// The tested joints.
+    dofs: Vec<usize>,
+    /// Triangle of the information about the zeros, log by log, then the delays, then the
+    /// parameters; and its right side.
+    r: DMatrix<f64>,
+    z: DVector<f64>,
+    candidates: Vec<Error>,
+    /// Reduction of the cost that one error must reach.
+    gain: f64,
+}
+
+impl<'a> Search<'a> {
+    pub(crate) fn new(
+        measurement: &'a MeasurementModel<'a>,
+        training: &'a [&'a TrainingLog],
+        identified: &'a Identified,
+    ) -> Self {
+        let unknowns = &identified.unknowns;
+        let dofs = turning(measurement.robot());
+        let (logs, joints, parameters) = (training.len(), dofs.len(), unknowns.parameters());
+        let streams = unknowns.sensors.len() + unknowns.joints.len();
+        let (first, width) = (joints * logs, joints + streams);
+        let mut sum = Information::new(first + streams + parameters);
+        let stretches = stretches(training, ENOUGH);
+        for (number, segments) in stretches.iter().enumerate() {
+            let reduced = map_segments(measurement, segments, |measurement, _, segment| {
+                let rates = rates(measurement, segment, identified);
+                let d = identified.fit.x.as_slice();
+                let mut other = Rows::new(unknowns);
+                let mut columns = |measurement: &mut MeasurementModel<'_>,
+                                   number: usize,
+                                   rows: &Rows,
+                                   columns: &mut [f64]| {
+                    let instant = &segment.instants[number];
+                    for (joint, &dof) in dofs.iter().enumerate() {
+                        // The row holds at the true position: the measured one minus the error.
+                        // The small change of the offset terms is ignored.
+                        let moved = View::Encoder(dof, [STEP, 0.0]);
+                        let moved = instant.clone().map(|own| own.seen(moved));
+                        let is_made = measurement.make(&moved, &mut other).is_ok();
+                        for row in (0..rows.count).filter(|_| is_made && other.count == rows.count)
+                        {
+                            let right = |rows: &Rows| rows.r(row) - dot(rows.a(row), d);
+                            columns[row * width + joint] = (right(&other) - right(rows)) / STEP;
+                        }
+                    }
+                    // A reading enters a row as its offset does.
+                    let sensors = unknowns.sensors.len();
+                    for (row, own) in columns.chunks_exact_mut(width.max(1)).enumerate() {
+                        let of_sensors = rates[number]
+                            .chunks_exact(6)
+                            .zip(rows.g(row).chunks_exact(6));
+                        for (column, (rates, g)) in
+                            own[joints..].iter_mut().zip(of_sensors).take(sensors)
+                        {
+                            *column = -dot(g, rates);
+                        }
+                        if let Some(joint) = rows.joint(row, 6 * sensors) {
+                            own[joints + sensors + joint] = -rates[number][6 * sensors + joint];
+                        }
+                    }
+                };
+                reduce_with(
+                    measurement,
+                    segment,
+                    &identified.noise,
+                    &[],
+                    width,
+                    &mut columns,
+                )
+            });
+            let own = added(&reduced, parameters + width);
+            let common = (first + streams..first + streams + parameters).collect::<Vec<_>>();
+            let zeros = joints * number..joints * (number + 1);
+            let own_columns = common
+                .into_iter()
+                .chain(zeros)
+                .chain(first..first + streams);
+            let _ = sum.merge(&own, &own_columns.collect::<Vec<_>>());
+        }
+        let (r, z) = sum.to_triangle();
+        let each = (0..logs).filter(|_| logs > 1).map(Some);
+        let zeros = [None].into_iter().chain(each).flat_map(|log| {
+            let of = move |joint| Error::Zero { joint, log };
+            (0..joints).map(of)
+        });
+        let mut search = Self {
+            measurement,
+            training,
+            identified,
+            r,
+            z,
+            candidates: zeros.collect(),
+            gain: 0.0,
+            dofs,
+        };
+        search.candidates.extend(search.streams());
+        search.gain = needed(1, search.candidates.len());
+        search
+    }
+
+    /// The delay of each F/T sensor, and that of all joint torques.
+    fn streams(&self) -> Vec<Error> {
+        let Unknowns {
+            sensors, joints, ..
+        } = &self.identified.unknowns;
+        let mut all: Vec<Error> = (0..sensors.len())
+            .map(|own| Error::Delay(own..own + 1))
+            .collect();
+        if !joints.is_empty() {
+            all.push(Error::Delay(sensors.len()..sensors.len() + joints.len()));
+        }
+        all
+    }
+
+    fn column(&self, error: &Error) -> DVector<f64> {
+        let (joints, logs) = (self.dofs.len(), self.training.len());
+        let own: Vec<usize> = match error {
+            Error::Zero { joint, log } => {
+                let logs = log.map_or(0..logs, |log| log..log + 1);
+                logs.map(|log| joints * log + joint).collect()
+            }
+            Error::Delay(streams) => streams.clone().map(|own| joints * logs + own).collect(),
+        };
+        self.r.select_columns(&own).column_sum()
+    }
+
+    /// The parameters' columns, then those of these errors. (Other errors are zero: their columns
+    /// are omitted.)
+    fn columns(&self, errors: &[Error]) -> DMatrix<f64> {
+        let parameters = self.identified.unknowns.parameters();
+        let own = self
+            .r
+            .columns(self.r.ncols() - parameters, parameters)
+            .into_owned();
+        let mut own = own.resize_horizontally(parameters + errors.len(), 0.0);
+        for (place, error) in errors.iter().enumerate() {
+            own.set_column(parameters + place, &self.column(error));
+        }
+        own
+    }
+
+    /// The MAP parameters and these errors, and their cost.
+    fn fit(&self, errors: &[Error]) -> Option<(f64, Fit)> {
+        let Identified {
+            unknowns,
+            prior,
+            fit,
+            ..
+        } = self.identified;
+        let mut precision = unknowns.precision.clone();
+        precision.extend(errors.iter().map(Error::precision));
+        let columns = self.columns(errors);
+        let posterior = Posterior::new(prior, &unknowns.links, &columns, &self.z, &precision);
+        let fit = posterior.ok()?.fit(fit.tau).ok()?;
+        Some((cost(unknowns, &fit, &precision), fit))
+    }
+
+    /// These errors, all of them estimated together, with their deviations.
+    fn estimates(&self, errors: &[Error]) -> Option<Vec<Estimate>> {
+        let (_, fit) = self.fit(errors)?;
+        let (root, first) = (fit.covariance_root(), self.identified.unknowns.parameters());
+        let own = (first..first + errors.len()).map(|k| (fit.x[k], root.row(k).norm()));
+        Some(own.collect())
+    }
+
+    /// The most likely candidates beside these errors: those with the largest gain if the prior
+    /// were quadratic, and the same joints in all logs.
+    fn likely(&self, errors: &[Error]) -> Vec<Error> {
+        let Some((_, fit)) = self.fit(errors) else {
+            return Vec::new();
+        };
+        let own = self.columns(errors);
+        let (residuals, root) = (&self.z - &own * &fit.x, fit.covariance_root());
+        let gain = |error: &Error| {
+            let column = self.column(error);
+            let known = root.tr_mul(&own.tr_mul(&column)).norm_squared();
+            let precision = error.precision();
+            column.dot(&residuals).powi(2)
+                / (column.norm_squared() - known + precision).max(precision)
+        };
+        let rest = self
+            .candidates
+            .iter()
+            .filter(|error| !errors.contains(error));
+        let mut ranked: Vec<(f64, &Error)> = rest.map(|error| (gain(error), error)).collect();
+        ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let mut likely: Vec<Error> = ranked
+            .into_iter()
+            .take(TRIED)
+            .map(|(_, own)| own.clone())
+            .collect();
+        for place in 0..likely.len() {
+            if let Error::Zero { joint, .. } = likely[place] {
+                let in_all = Error::Zero { joint, log: None };
+                if !likely.contains(&in_all) && !errors.contains(&in_all) {
+                    likely.push(in_all);
+                }
+            }
+        }
+        likely
+    }
+
+    /// All errors that are accepted. A zero that is wrong in one log only costs as much as one
+    /// error more: it must be clearly better than the same in all logs.
+    fn run(&self) -> Vec<Error> {
+        let cost = |errors: &[Error]| {
+            let alone = |error: &&Error| matches!(error, Error::Zero { log: Some(_), .. });
+            let more = errors.iter().filter(alone).count() as f64 * self.gain;
+            Some(self.fit(errors)?.0 + more)
+        };
+        accepted(|errors| self.likely(errors), cost, |_| self.gain, 1.0)
+    }
+
+    /// Whether the zero at `place` may as well be in another log, with the opposite sign.
+    fn is_exchangeable(&self, errors: &[Error], place: usize) -> bool {
+        let cost_in = |log: Option<usize>| {
+            let mut errors = errors.to_vec();
+            if let Error::Zero { log: own, .. } = &mut errors[place] {
+                *own = log.or(*own);
+            }
+            self.fit(&errors).map_or(f64::INFINITY, |(cost, _)| cost)
+        };
+        let Error::Zero { log, .. } = &errors[place] else {
+            return false;
+        };
+        let own = cost_in(None);
+        let mut others = (0..self.training.len()).filter(|other| Some(*other) != *log);
+        others.any(|other| cost_in(Some(other)) < own + self.gain)
+    }
+
+    /// Findings about zeros and delays, and the delays of all streams.
+    pub(crate) fn findings(&self) -> (Vec<Finding>, Vec<TimeOffset>) {
+        let is_zero = |error: &Error| matches!(error, Error::Zero { .. });
+        let errors = self.run();
+        let zeros: Vec<Error> = errors.into_iter().filter(is_zero).collect();
+        let count = zeros.len();
+        let with = |delays: &[Error]| self.estimates(&[&zeros[..], delays].concat());
+        let together = with(&self.streams()).unwrap_or_else(|| vec![(0.0, f64::INFINITY); count]);
+        let (of_zeros, of_streams) = together.split_at(count);
+        let mut findings = self.about_zeros(&zeros, of_zeros);
+
+        let (robot, unknowns) = (self.measurement.robot(), &self.identified.unknowns);
+        let (sensors, torques) = (unknowns.sensors.len(), unknowns.joints.len());
+        let significance = deviations(sensors + torques + 1);
+        let is_long = |(seconds, deviation): Estimate| {
+            seconds.abs() > MIN_DELAY.max(significance * deviation)
+        };
+        let names = unknowns
+            .sensors
+            .iter()
+            .map(|&own| format!("wrench/{}", sensor_name(robot, own)));
+        let names = names.chain(["joint torques".to_owned()]);
+        let known = names.zip(of_streams).filter(|(_, own)| is_known(own));
+        let offsets = known.map(|(channel, &(seconds, deviation))| TimeOffset {
+            channel,
+            seconds,
+            deviation,
+            significant: is_long((seconds, deviation)),
+        });
+        let offsets: Vec<TimeOffset> = offsets.collect();
+        for offset in offsets.iter().filter(|offset| offset.significant) {
+            let channel = &offset.channel;
+            let is_one = channel != "joint torques";
+            let seem = format!("{channel} seem{}", if is_one { "s" } else { "" });
+            findings.push(late(channel, &seem, (offset.seconds, offset.deviation)));
+        }
+        if torques > 2 {
+            let each: Vec<Error> = (0..sensors + torques)
+                .map(|own| Error::Delay(own..own + 1))
+                .collect();
+            let each = with(&each).unwrap_or_default();
+            let own = each
+                .get(count + sensors..)
+                .and_then(|each| alone(each, is_long));
+            findings.extend(own.map(|(place, delay)| {
+                let joint = robot.model.dof_name(unknowns.joints[place]);
+                let joint = format!("joint/{joint}/torque");
+                late(
+                    &joint,
+                    &format!("{joint}, unlike the other torques, seems"),
+                    delay,
+                )
+            }));
+        }
+        (findings, offsets)
+    }
+
+    fn about_zeros(&self, zeros: &[Error], estimates: &[Estimate]) -> Vec<Finding> {
+        let (robot, unknowns) = (self.measurement.robot(), &self.identified.unknowns);
+        let file = |log: usize| self.training[log].file.as_str();
+        let mut findings = Vec::new();
+        for (number, &dof) in self.dofs.iter().enumerate() {
+            let own: Vec<(usize, Option<usize>, f64)> = (zeros.iter().zip(estimates).enumerate())
+                .filter_map(|(place, (error, (angle, _)))| match error {
+                    Error::Zero { joint, log } if *joint == number => Some((place, *log, *angle)),
+                    _ => None,
+                })
+                .collect();
+            // Joints between two identified links of a sub-tree; with joint torques, any joint with
+            // an identified child link.
+            let is_within = revolute(robot, dof).is_some_and(|joint| {
+                let inside = robot.structure.subtree_of(joint.parent)
+                    == robot.structure.subtree_of(joint.child)
+                    && unknowns.links.contains(&joint.parent);
+                unknowns.links.contains(&joint.child) && (inside || !unknowns.joints.is_empty())
+            });
+            let least = if is_within {
+                MIN_ZERO
+            } else {
+                MIN_ZERO_BEFORE_SENSORS
+            };
+            if own.iter().all(|(_, _, angle)| angle.abs() <= least) {
+                continue;
+            }
+            let each = own.iter().map(|(_, log, angle)| {
+                format!("{angle:.4} rad in {}", log.map_or("all logs", file))
+            });
+            let mut what = format!("encoder offset of {}", each.collect::<Vec<_>>().join(", "));
+            let rest = match *own {
+                [(_, None, _)] => "",
+                [(place, Some(_), _)] if self.is_exchangeable(zeros, place) => {
+                    what += ", or the opposite in all other logs";
+                    " and use logs of one calibration"
+                }
+                _ => " and use logs of one calibration",
+            };
+            let mounting = if unknowns.sensors.is_empty() {
+                ""
+            } else {
+                " (an F/T sensor that is mounted turned, its rpy_rad, looks the same)"
+            };
+            let name = robot.model.dof_name(dof);
+            let text = if is_within {
+                format!(
+                    "joint/{name}: {what}; calibrate the encoder{rest}, or the parameters will \
+                     contain a shifted centre of mass{mounting}"
+                )
+            } else {
+                format!(
+                    "joint/{name}: {what}, or the base (its IMU, its gravity_mps2, the floor) is \
+                     tilted by as much; calibrate the encoder{rest}, and level the base{mounting}"
+                )
+            };
+            findings.push(Finding::warning(FindingCode::EncoderOffset, name, text));
+        }
+        findings
+    }
+}
+
+/// Whether the logs contain information about a delay.
+fn is_known((_, deviation): &Estimate) -> bool {
+    *deviation < 0.5 * DELAY_STD
+}
+
+/// Per instant, the rate of change of each channel without noise; 0 where it is not known.
+fn rates(
+    measurement: &MeasurementModel<'_>,
+    segment: Segment<'_>,
+    identified: &Identified,
+) -> Vec<Vec<f64>> {
+    let (unknowns, instants) = (&identified.unknowns, segment.instants);
+    let d = std::slice::from_ref(&identified.d);
+    let noise = residuals(measurement, segment, &identified.noise, d).noise;
+    let exact = |channel: usize, i: usize| {
+        let measured = match unknowns.sensors.get(channel / 6) {
+            Some(&sensor) => instants[i].readings[sensor].torque_first()[channel % 6],
+            None => instants[i].torque[unknowns.joints[channel - 6 * unknowns.sensors.len()]],
+        };
+        measured - noise[0][channel][i]
+    };
+    let around = |number: usize| {
+        let t = |i: usize| (instants[i].t - instants[number].t).seconds();
+        let before = (0..number).rev().take_while(|&i| t(i) >= -REACH).last();
+        let after = (number + 1..instants.len())
+            .take_while(|&i| t(i) <= REACH)
+            .last();
+        // The adjacent ones if instants are farther apart.
+        let low = before.unwrap_or(number.saturating_sub(1));
+        let high = after.unwrap_or((number + 1).min(instants.len() - 1));
+        let span = t(high) - t(low);
+        let rate = |channel: usize| {
+            let rate = (exact(channel, high) - exact(channel, low)) / span;
+            if rate.is_finite() && span < 0.2 {
+                rate
+            } else {
+                0.0
+            }
+        };
+        (0..unknowns.channels()).map(rate).collect()
+    };
+    (0..instants.len()).map(around).collect()
+}
+
+fn late(subject: &str, seem: &str, (seconds, deviation): Estimate) -> Finding {
+    Finding::warning(
+        FindingCode::TimeOffset,
+        subject,
+        format!(
+            "{seem} to be stamped {:.1} ms {} the encoders (+- {:.1} ms). This was not corrected, \
+             and friction and parameters have absorbed a part of it: compare the clocks and the \
+             filters of the sensors, and correct the stamps",
+            1e3 * seconds.abs(),
+            if seconds > 0.0 { "behind" } else { "ahead of" },
+            1e3 * deviation
+        ),
+    )
+}
+
+/// The single torque that has a delay while all others have none.
+fn alone(each: &[Estimate], is_long: impl Fn(Estimate) -> bool) -> Option<(usize, Estimate)> {
+    let known: Vec<usize> = (0..each.len()).filter(|&k| is_known(&each[k])).collect();
+    known.iter().filter(|_| known.len() > 2).find_map(|&place| {
+        let others = || known.iter().filter(|&&k| k != place).map(|&k| each[k]);
+        let weight: f64 = others().map(|(_, deviation)| deviation.powi(-2)).sum();
+        let sum: f64 = others()
+            .map(|(own, deviation)| own * deviation.powi(-2))
+            .sum();
+        let common = (sum / weight, weight.sqrt().recip());
+        let off = others().map(|(seconds, _)| (seconds - common.0).abs());
+        let farthest = off.fold(0.0, f64::max);
+        let own = each[place];
+        let apart = (own.0 - common.0, own.1.hypot(common.1));
+        let is_alone = is_long(apart) && apart.0.abs() > SINGLE * farthest;
+        (is_alone && is_long(own) && !is_long(common)).then_some((place, own))
+    })
+}
