@@ -27,6 +27,10 @@
 //! `T`: `U_s` becomes `U_s - U_E r + U_k (T - T0)` at each instant
 //! ([`Propagation::set_calibration_point`]).
 //!
+//! `W` is most of the work, and changes as the motion does: it is computed with the first
+//! estimate of each [`HELD`], of the stamps, and when base or covariance change, and held in
+//! between. All else is of the instant.
+//!
 //! Loops over rows use the widest vector instructions of the processor, in a portable build too.
 //!
 //! Columns are ordered sensors first, then links from the tips to the top, so that the links below
@@ -52,8 +56,9 @@ pub use covariance::Covariance;
 
 use crate::propagation::covariance::{Drift, triangle};
 use crate::propagation::vectors::{
-    Calibrated, ColumnBlock, Covariance6, LANES, Lanes, Member, Root, add_independent, add_link,
-    add_offset, add_reading, dot, numbers, project, splat, times, vectors, vectors_mut,
+    Calibrated, ColumnBlock, Covariance6, LANES, Lanes, Member, Root, add_covariance,
+    add_independent, add_link, add_offset, add_reading, dot, numbers, project, splat, times,
+    vectors, vectors_mut,
 };
 use std::ops::Range;
 
@@ -65,6 +70,10 @@ use proprio_dynamics::regressor::{LINK_PARAMETERS, link_rows};
 use proprio_dynamics::spatial::{Motion, Wrench};
 use proprio_dynamics::{DynamicsError, Kinematics, Solver, Structure, check_size};
 
+/// How long the wrenches of the links' uncertain parameters are used. In that time an acceleration
+/// that grows as fast as a robot's joint can, by 1000 rad/s^3, changes by 5 rad/s^2.
+const HELD: Nanos = Nanos::from_millis(5);
+
 /// The standard deviations of the solver's results that a [`Covariance`] causes, with all the
 /// memory needed to compute them.
 #[derive(Clone, Debug)]
@@ -75,6 +84,8 @@ pub struct Propagation {
     extra: Vec<[f64; 6]>,
     /// The first instant of this run.
     run_start: Option<Nanos>,
+    /// The period, and the base, that the wrenches are of.
+    held: Option<(i64, usize)>,
     /// Standard deviations of the torques.
     torque: Vec<f64>,
     /// Standard deviations of the contact wrenches.
@@ -94,8 +105,9 @@ struct SubtreeRoot {
     /// Links that are correlated with nothing else in this sub-tree: number, place in the sub-tree,
     /// and root (upper triangular).
     independent: Vec<(usize, usize, Box<Root>)>,
-    /// Per link, the covariance of the wrenches below it from the links in `independent` and from
+    /// Per link, the covariance of the wrenches below it from the links in `independent`; then with
     /// what is uncertain in the readings at `ends` besides.
+    below_alone: Vec<Covariance6>,
     below: Vec<Covariance6>,
     /// The sensors at its ends.
     ends: Vec<End>,
@@ -147,6 +159,7 @@ impl Propagation {
             drifts: covariance.drifts.clone(),
             extra: vec![[0.0; 6]; covariance.drifts.len()],
             run_start: None,
+            held: None,
             torque: vec![0.0; structure.dof_count()],
             contacts: vec![[0.0; 6]; structure.contacts().len()],
             imbalances: vec![Matrix6::zeros(); structure.subtrees().len()],
@@ -203,12 +216,16 @@ impl Propagation {
             return Err(DynamicsError::NotSolved);
         }
         let run_start = *self.run_start.get_or_insert(t);
+        let key = Some((t.0.div_euclid(HELD.0), kinematics.base()));
+        let is_due = self.held != key;
+        self.held = key;
         Arch::new().dispatch(Update {
             propagation: self,
             structure,
             solver,
             kinematics,
             times: (t, run_start),
+            is_due,
         });
         Ok(())
     }
@@ -240,6 +257,8 @@ struct Update<'a> {
     solver: &'a Solver,
     kinematics: &'a Kinematics,
     times: (Nanos, Nanos),
+    /// Whether the wrenches are to be computed.
+    is_due: bool,
 }
 
 impl WithSimd for Update<'_> {
@@ -253,6 +272,7 @@ impl WithSimd for Update<'_> {
             solver,
             kinematics,
             times,
+            is_due,
         } = self;
         let Propagation {
             subtrees,
@@ -269,7 +289,10 @@ impl WithSimd for Update<'_> {
             .zip(structure.subtrees())
             .zip(imbalances)
         {
-            part.update(simd, solver, kinematics, |sensor| {
+            if is_due {
+                part.update(simd, solver, kinematics);
+            }
+            part.add_readings(solver, |sensor| {
                 let (drift, extra) = (&drifts[sensor], &extra[sensor]);
                 let seconds = drift.known.elapsed(times.0, times.1);
                 std::array::from_fn(|i| seconds * drift.rate[i] + extra[i])
@@ -436,13 +459,14 @@ impl SubtreeRoot {
             let (parent, below) = (links[place].parent, links[place].rows.clone());
             links[parent].rows = hull(&links[parent].rows, &below);
         }
+        let below = match independent.is_empty() && ends.is_empty() {
+            true => Vec::new(),
+            false => vec![Covariance6::default(); links.len()],
+        };
         Self {
             wrenches: vec![[0.0; LANES]; 6 * rows * links.len()],
-            below: if independent.is_empty() && ends.is_empty() {
-                Vec::new()
-            } else {
-                vec![Covariance6::default(); links.len()]
-            },
+            below_alone: below.clone(),
+            below,
             rows,
             links,
             column_blocks,
@@ -451,16 +475,31 @@ impl SubtreeRoot {
         }
     }
 
-    /// Computes `W` of every link. `variances` are those of each channel of a sensor besides the
-    /// root's.
+    /// Adds what is uncertain in the readings, given the variances of each sensor's channels.
     #[inline(always)]
-    fn update<S: Simd>(
-        &mut self,
-        simd: S,
-        solver: &Solver,
-        kinematics: &Kinematics,
-        variances: impl Fn(usize) -> [f64; 6],
-    ) {
+    fn add_readings(&mut self, solver: &Solver, variances: impl Fn(usize) -> [f64; 6]) {
+        self.below.copy_from_slice(&self.below_alone);
+        for end in &self.ends {
+            let variances = variances(end.sensor);
+            if variances == [0.0; 6] {
+                continue;
+            }
+            let mut covariance = Covariance6::default();
+            add_reading(&mut covariance, solver.sensor_pose(end.sensor), &variances);
+            let mut place = end.place;
+            loop {
+                add_covariance(&mut self.below[place], &covariance);
+                if place == 0 {
+                    break;
+                }
+                place = self.links[place].parent;
+            }
+        }
+    }
+
+    /// Computes `W` of every link.
+    #[inline(always)]
+    fn update<S: Simd>(&mut self, simd: S, solver: &Solver, kinematics: &Kinematics) {
         let rows = self.rows;
         for (link, wrenches) in self
             .links
@@ -492,25 +531,14 @@ impl SubtreeRoot {
                 Member::Calibration => {}
             }
         }
-        self.below.fill(Covariance6::default());
+        self.below_alone.fill(Covariance6::default());
         for (link, place, root) in &self.independent {
             let coefficients = link_rows(kinematics.pose(*link), kinematics.motion(*link));
-            add_independent(&mut self.below[*place], root, &coefficients);
+            add_independent(&mut self.below_alone[*place], root, &coefficients);
         }
-        for end in &self.ends {
-            let variances = variances(end.sensor);
-            if variances != [0.0; 6] {
-                let pose = solver.sensor_pose(end.sensor);
-                add_reading(&mut self.below[end.place], pose, &variances);
-            }
-        }
-        for place in (1..self.below.len()).rev() {
-            let (below, parent) = (self.below[place], self.links[place].parent);
-            for (sums, values) in self.below[parent].iter_mut().zip(&below) {
-                sums.iter_mut()
-                    .zip(values)
-                    .for_each(|(sum, value)| *sum += value);
-            }
+        for place in (1..self.below_alone.len()).rev() {
+            let below = self.below_alone[place];
+            add_covariance(&mut self.below_alone[self.links[place].parent], &below);
         }
         for place in (1..self.links.len()).rev() {
             let Link {

@@ -61,6 +61,14 @@ fn add(sum: &mut Six, a: f64, x: &Six) {
     }
 }
 
+/// `sum += C`.
+#[inline(always)]
+pub(crate) fn add_covariance(sum: &mut Covariance6, covariance: &Covariance6) {
+    for (sum, row) in sum.iter_mut().zip(covariance) {
+        add(sum, 1.0, row);
+    }
+}
+
 /// `C a`.
 #[inline(always)]
 pub(crate) fn times(covariance: &Covariance6, a: &Six) -> Six {
@@ -90,10 +98,10 @@ pub(crate) fn add_independent(out: &mut Covariance6, root: &Root, coefficients: 
         *column = [a[i], b[i], c[i], d[i], e[i], f[i], 0.0, 0.0];
     }
     let mut sum = *out;
-    for first in 0..LINK_PARAMETERS {
+    for (first, row) in root.iter().enumerate() {
         let mut wrench = [0.0; 8];
         for c in first..LINK_PARAMETERS {
-            add(&mut wrench, root[first][c], &columns[c]);
+            add(&mut wrench, row[c], &columns[c]);
         }
         for i in 0..6 {
             add(&mut sum[i], wrench[i], &wrench);
