@@ -59,9 +59,9 @@
 //!   not depend on its length. With degrees up to five and the newest sample as the origin, this
 //!   loses five of sixteen digits for any window. The error is some 1e-10 of the signal's range
 //!   within the window, far below the noise of any sensor.
-//! - From one window to the next, the residuals of samples in both change by the difference of two
-//!   polynomials, which a few of its values bound. Residuals are computed again only where the old
-//!   bound and that change together exceed the tolerance.
+//! - The square sum of a window's residuals follows from its sums too. It grows with the window,
+//!   and bounds every residual. So residuals are computed only for windows longer than the longest
+//!   for which it is below the square of the tolerance: mostly for none.
 //! - A degree whose windows cannot be long enough is not tried, and unused windows are not
 //!   computed.
 //! - The results that depend on stamps alone (sums, recurrence, polynomials at the instant) are
@@ -97,18 +97,23 @@ pub use estimate::{
 };
 pub use grid::Grid;
 
-use crate::differentiate::basis::{DIFFERENCE_SAMPLES, Ring};
-use crate::differentiate::values::Values;
+use crate::differentiate::basis::{DIFFERENCE_SAMPLES, Recent};
+use crate::differentiate::values::{Values, sum};
 use proprio_topics::Nanos;
+use pulp::Arch;
 
 /// The last samples of one channel, and their derivatives at any instant: see the [module](self).
 #[derive(Debug, Clone)]
 pub struct Window<const D: usize> {
     settings: Settings,
-    ring: Ring,
-    values: [[f64; D]; MAX_SAMPLES],
+    stamps: Recent<Nanos>,
+    values: [Recent<f64>; D],
+    /// Per sample, how many up to it are fitted together: from the last gap or interruption on.
+    runs: Recent<usize>,
     /// Per sample, the square of the divided difference that ends there ([`Window::roughness`]).
-    roughness_square: [[f64; D]; MAX_SAMPLES],
+    roughness_square: [Recent<f64>; D],
+    /// Number of samples kept.
+    len: usize,
     /// Whether the next sample does not continue the ones before.
     interrupted: bool,
 }
@@ -132,9 +137,11 @@ impl<const D: usize> Window<D> {
         }
         Ok(Self {
             settings,
-            ring: Ring::EMPTY,
-            values: [[0.0; D]; MAX_SAMPLES],
-            roughness_square: [[0.0; D]; MAX_SAMPLES],
+            stamps: Recent::new(Nanos::ZERO),
+            values: [Recent::new(0.0); D],
+            runs: Recent::new(0),
+            roughness_square: [Recent::new(0.0); D],
+            len: 0,
             interrupted: false,
         })
     }
@@ -149,31 +156,30 @@ impl<const D: usize> Window<D> {
             return Err(Refused::NotFinite);
         }
         let mut pushed = Pushed::Added;
-        if let Some((newest, _)) = self.newest() {
+        let mut run = 1;
+        if let Some(newest) = self.stamp(0) {
             if stamp <= newest {
                 return Err(Refused::NotLater { newest, got: stamp });
             }
             let gap = stamp - newest;
             if gap > self.settings.max_gap {
                 pushed = Pushed::Restarted { gap };
+            } else if !self.interrupted {
+                run += self.runs.all()[0];
             }
         }
-        self.ring.newest = (self.ring.newest + 1) % MAX_SAMPLES;
-        if let Some(restarts) = self.ring.restarts.get_mut(self.ring.newest) {
-            *restarts = std::mem::take(&mut self.interrupted);
-        }
-        if let (Some(s), Some(v)) = (
-            self.ring.stamps.get_mut(self.ring.newest),
-            self.values.get_mut(self.ring.newest),
-        ) {
-            (*s, *v) = (stamp, value);
+        self.interrupted = false;
+        self.stamps.push(stamp);
+        self.runs.push(run);
+        for (samples, value) in self.values.iter_mut().zip(value) {
+            samples.push(value);
         }
         // More samples are kept than an estimate uses: later samples must not displace those of an
         // instant that still waits.
-        self.ring.len = (self.ring.len + 1).min(MAX_SAMPLES);
+        self.len = (self.len + 1).min(MAX_SAMPLES);
         let roughness_square = self.roughness();
-        if let Some(place) = self.roughness_square.get_mut(self.ring.newest) {
-            *place = roughness_square;
+        for (samples, value) in self.roughness_square.iter_mut().zip(roughness_square) {
+            samples.push(value);
         }
         Ok(pushed)
     }
@@ -186,30 +192,16 @@ impl<const D: usize> Window<D> {
         const SAMPLES: usize = 64;
         let skipped = self.later_than(until);
         let known = self
-            .ring
             .len
             .saturating_sub(skipped + DIFFERENCE_SAMPLES - 1)
             .min(SAMPLES);
         // Limited by time, so that a replay which begins later gives the same.
-        let is_in =
-            |age: &usize| until - self.ring.stamps[self.ring.at(*age)] <= self.settings.max_window;
-        let count = (skipped..skipped + known).take_while(is_in).count();
-        let sum = self.sum_of_roughness(skipped, count);
-        sum.map(|sum| (sum / count.max(1) as f64).sqrt())
-    }
-
-    /// The sum of the squared divided differences of `count` samples from age `first` on.
-    fn sum_of_roughness(&self, first: usize, count: usize) -> [f64; D] {
-        let mut sum = [0.0; D];
-        for age in first..first + count {
-            for (sum, roughness_square) in sum
-                .iter_mut()
-                .zip(&self.roughness_square[self.ring.at(age)])
-            {
-                *sum += roughness_square;
-            }
-        }
-        sum
+        let stamps = &self.stamps.all()[skipped.min(self.len)..][..known];
+        let count = stamps.partition_point(|stamp| until - *stamp <= self.settings.max_window);
+        std::array::from_fn(|component| {
+            let own = &self.roughness_square[component].all()[skipped.min(self.len)..][..count];
+            (sum(own) / count.max(1) as f64).sqrt()
+        })
     }
 
     /// The square of the divided difference of the newest [`DIFFERENCE_SAMPLES`] samples, scaled so
@@ -217,24 +209,21 @@ impl<const D: usize> Window<D> {
     /// three, and below an encoder's step for a motion, so it measures noise, jitter of stamps
     /// included.
     fn roughness(&self) -> [f64; D] {
-        let mut samples = [(0.0, &[0.0; D]); DIFFERENCE_SAMPLES];
-        let Some((newest, _)) = self.get(0) else {
-            return [0.0; D];
-        };
-        for (age, place) in samples.iter_mut().enumerate() {
-            let Some((stamp, value)) = self.get(age) else {
-                return [0.0; D];
-            };
-            *place = ((stamp - newest).seconds(), value);
-        }
+        let newest = self.stamps.all()[0];
         let (mut sum, mut square) = ([0.0; D], 0.0);
-        for (i, (t, value)) in samples.iter().enumerate() {
-            let others = samples.iter().enumerate().filter(|(j, _)| *j != i);
-            let weight: f64 = others.map(|(_, (other, _))| 1.0 / (t - other)).product();
+        if self.len < DIFFERENCE_SAMPLES {
+            return sum;
+        }
+        let times: [f64; DIFFERENCE_SAMPLES] =
+            std::array::from_fn(|age| (self.stamps.all()[age] - newest).seconds());
+        for (i, t) in times.iter().enumerate() {
+            let others = times.iter().enumerate().filter(|(j, _)| *j != i);
+            let product: f64 = others.map(|(_, other)| t - other).product();
+            let weight = 1.0 / product;
             square += weight * weight;
             sum.iter_mut()
-                .zip(*value)
-                .for_each(|(sum, x)| *sum += weight * x);
+                .zip(&self.values)
+                .for_each(|(sum, samples)| *sum += weight * samples.all()[i]);
         }
         sum.map(|sum| {
             if square.is_finite() {
@@ -252,19 +241,19 @@ impl<const D: usize> Window<D> {
 
     /// Forgets every sample.
     pub fn clear(&mut self) {
-        self.ring.len = 0;
+        self.len = 0;
     }
 
     /// Number of samples kept.
     #[must_use]
     pub const fn len(&self) -> usize {
-        self.ring.len
+        self.len
     }
 
     /// Whether no sample is kept.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
-        self.ring.len == 0
+        self.len == 0
     }
 
     /// The settings of the window.
@@ -273,26 +262,28 @@ impl<const D: usize> Window<D> {
         &self.settings
     }
 
-    /// The sample that has `age` later ones: 0 is the newest.
-    fn get(&self, age: usize) -> Option<(Nanos, &[f64; D])> {
-        if age >= self.ring.len {
-            return None;
-        }
-        let at = self.ring.at(age);
-        Some((*self.ring.stamps.get(at)?, self.values.get(at)?))
+    /// The stamp of the sample that has `age` later ones: 0 is the newest.
+    fn stamp(&self, age: usize) -> Option<Nanos> {
+        self.stamps.all()[..self.len].get(age).copied()
+    }
+
+    /// This sample: stamp and value.
+    fn get(&self, age: usize) -> Option<(Nanos, [f64; D])> {
+        let value = |component: usize| self.values[component].all()[age];
+        self.stamp(age)
+            .map(|stamp| (stamp, std::array::from_fn(value)))
     }
 
     /// The newest sample: stamp and value.
     #[must_use]
     pub fn newest(&self) -> Option<(Nanos, [f64; D])> {
-        self.get(0).map(|(t, v)| (t, *v))
+        self.get(0)
     }
 
     /// The oldest sample kept.
     #[must_use]
     pub fn oldest(&self) -> Option<(Nanos, [f64; D])> {
-        self.get(self.ring.len.checked_sub(1)?)
-            .map(|(t, v)| (t, *v))
+        self.get(self.len.checked_sub(1)?)
     }
 
     /// The sample stamped exactly `t`, if it is kept.
@@ -300,15 +291,15 @@ impl<const D: usize> Window<D> {
     pub fn exactly(&self, t: Nanos) -> Option<[f64; D]> {
         self.get(self.later_than(t))
             .filter(|(stamp, _)| *stamp == t)
-            .map(|(_, v)| *v)
+            .map(|(_, value)| value)
     }
 
     /// Number of samples kept that are stamped later than `t`.
     fn later_than(&self, t: Nanos) -> usize {
         // Requested instants are near the newest sample: the search from there takes a step or two.
-        (0..self.ring.len)
-            .find(|&age| self.get(age).is_some_and(|(stamp, _)| stamp <= t))
-            .unwrap_or(self.ring.len)
+        (0..self.len)
+            .find(|&age| self.stamp(age).is_some_and(|stamp| stamp <= t))
+            .unwrap_or(self.len)
     }
 
     /// The stamp of the newest sample that an estimate at `t` uses when it may use samples stamped
@@ -319,14 +310,14 @@ impl<const D: usize> Window<D> {
     /// on the time of arrival, and a replay gives the same. `None` if no sample qualifies.
     #[must_use]
     pub fn newest_for(&self, t: Nanos, until: Nanos) -> Option<Nanos> {
-        self.get(self.skipped_for(t, until)).map(|(stamp, _)| stamp)
+        self.stamp(self.skipped_for(t, until))
     }
 
     /// How many of the newest samples the rule of [`Window::newest_for`] excludes.
     fn skipped_for(&self, t: Nanos, until: Nanos) -> usize {
         let later = self.later_than(t);
-        match later.checked_sub(1).map(|first| (first, self.get(first))) {
-            Some((first, Some((stamp, _)))) if stamp <= until => first,
+        match later.checked_sub(1).map(|first| (first, self.stamp(first))) {
+            Some((first, Some(stamp))) if stamp <= until => first,
             _ => later.max(self.later_than(until)),
         }
     }
@@ -372,48 +363,14 @@ impl<const D: usize> Window<D> {
                 None => Unavailable::Starting { samples: 0 },
             });
         };
-        let at = |age: usize| self.ring.at(skipped + age);
-        let settings = (
-            self.settings.max_gap,
-            self.settings.max_window,
-            self.settings.capacity,
-        );
-        let (mut used, mut oldest, mut is_shared) = (grid.used, newest, true);
-        if used > 0
-            && grid.skipped == skipped
-            && grid.settings == settings
-            && grid.ring == self.ring
-        {
-            oldest = newest - grid.before[used - 1];
-        } else {
-            used = 0;
-            let mut later_restarts = false;
-            let most = (self.ring.len - skipped)
-                .min(self.settings.capacity)
-                .min(MAX_SAMPLES);
-            for (age, before) in grid.before.iter_mut().enumerate().take(most) {
-                let at = at(age);
-                let stamp = self.ring.stamps[at];
-                // A window does not extend across a gap, but instants before the gap still have
-                // their samples. The gaps depend on stamps alone, not on the time of arrival.
-                let is_apart = oldest - stamp > self.settings.max_gap
-                    || newest - stamp > self.settings.max_window;
-                if later_restarts || is_apart {
-                    break;
-                }
-                later_restarts = self.ring.restarts[at];
-                oldest = stamp;
-                is_shared &= *before == newest - stamp;
-                *before = newest - stamp;
-                used += 1;
-            }
-            is_shared &= used == grid.used;
-            (grid.ring, grid.settings, grid.skipped) = (self.ring, settings, skipped);
-        }
-        // The stamps that the grid was computed for have been overwritten.
-        if !is_shared {
-            grid.used = 0;
-        }
+        // A window does not extend across a gap, but instants before the gap still have their
+        // samples. The gaps depend on stamps alone, not on the time of arrival.
+        let most = (self.len - skipped)
+            .min(self.settings.capacity)
+            .min(self.runs.all()[skipped]);
+        let stamps = &self.stamps.all()[skipped..skipped + most];
+        let used = stamps.partition_point(|stamp| newest - *stamp <= self.settings.max_window);
+        let oldest = stamps[used - 1];
         if t < oldest {
             return Err(Unavailable::Before { by: oldest - t });
         }
@@ -423,26 +380,21 @@ impl<const D: usize> Window<D> {
         if used < MIN_SAMPLES {
             return Err(Unavailable::Starting { samples: used });
         }
-        if !is_shared {
-            grid.make(used);
-        }
-        grid.place((t - newest).seconds());
-        let mut values = [[0.0; MAX_SAMPLES]; D];
-        for age in 0..used {
-            for ((column, v), o) in values.iter_mut().zip(&self.values[at(age)]).zip(origin) {
-                column[age] = v - o;
-            }
-        }
         // Only divided differences of samples that are used.
         let own = used.saturating_sub(DIFFERENCE_SAMPLES - 1);
-        let roughness_sum = self.sum_of_roughness(skipped, own);
-        // An error uniformly distributed over +-noise has the variance noise^2 / 3.
-        let noise = roughness_sum.map(|sum| {
-            (3.0 * sum / own.max(1) as f64)
-                .sqrt()
-                .max(self.settings.noise)
+        let mut estimate = Arch::new().dispatch(Values {
+            grid,
+            stamps: &stamps[..used],
+            values: std::array::from_fn(|component| {
+                &self.values[component].all()[skipped..skipped + used]
+            }),
+            origin,
+            roughness_square: std::array::from_fn(|component| {
+                &self.roughness_square[component].all()[skipped..skipped + own]
+            }),
+            least_noise: self.settings.noise,
+            time: (t - newest).seconds(),
         });
-        let mut estimate = Values::new(values, grid).estimate(grid, &noise, origin);
         estimate.ahead = newest - t;
         if estimate.is_finite() {
             Ok(estimate)

@@ -79,12 +79,28 @@ impl<const D: usize, const K: usize> History<D, K> {
         &self,
         from: Nanos,
         to: Nanos,
-    ) -> impl Iterator<Item = (Nanos, &[f64; D], Quality)> {
-        (0..K)
-            .map_while(|age| self.get(age))
-            .skip_while(move |entry| entry.t > to)
-            .take_while(move |entry| entry.t >= from)
-            .map(|entry| (entry.t, &entry.value, entry.quality))
+    ) -> impl ExactSizeIterator<Item = (Nanos, &[f64; D], Quality)> {
+        let (newest, oldest) = (
+            self.count_while(|t| t > to),
+            self.count_while(|t| t >= from),
+        );
+        (newest..oldest.max(newest)).map(|age| {
+            let entry = &self.samples[(self.count - 1 - age) % K];
+            (entry.t, &entry.value, entry.quality)
+        })
+    }
+
+    /// How many of the newest samples have stamps of this kind.
+    fn count_while(&self, is_late: impl Fn(Nanos) -> bool) -> usize {
+        let (mut low, mut high) = (0, self.count.min(K));
+        while low < high {
+            let middle = usize::midpoint(low, high);
+            match self.get(middle).is_some_and(|entry| is_late(entry.t)) {
+                true => low = middle + 1,
+                false => high = middle,
+            }
+        }
+        low
     }
 
     /// The value at `t`: the sample of that instant; else a linear interpolation between the last

@@ -95,6 +95,7 @@ use proprio_identification::online::{Online, OnlineError};
 use proprio_identification::robot::{BaseMotion, ChannelRole};
 use proprio_topics::{InertiaEstimate, Nanos, Quality, Reason};
 use residuals::ResidualMonitor;
+use solution::root_of_squares;
 use std::collections::VecDeque;
 use steps::StepCover;
 use validity::Dependences;
@@ -450,7 +451,7 @@ impl Pipeline {
                             self.motion.set_joint(
                                 dof,
                                 acceleration_std,
-                                offset_std.hypot(noise).hypot(position_std),
+                                root_of_squares([offset_std, noise, position_std]),
                             );
                             let places = (
                                 self.position.get_mut(dof),

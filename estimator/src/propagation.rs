@@ -19,12 +19,17 @@
 //! A link whose parameters are correlated with nothing else in its sub-tree needs no rows:
 //! `C_l = G_l^T G_l` is six by six, and independent covariances add. Then `var(tau_j) =
 //! s_j^T C s_j - 2 s_j^T C h_j + h_j^T C_b h_j`, with `C` summed over the links below `j` and `C_b`
-//! over all links. So links that are known from the URDF alone cost little.
+//! over all links. So links that are known from the URDF alone cost little. What an offset has
+//! drifted, and what else is uncertain in a reading, is such a covariance of the link it acts on.
 //!
 //! If a sensor's calibration is uncertain, too ([`proprio_dynamics::calibration`]), its columns act
 //! like additional columns of the offset that depend on the reading `r` and the board temperature
 //! `T`: `U_s` becomes `U_s - U_E r + U_k (T - T0)` at each instant
 //! ([`Propagation::set_calibration_point`]).
+//!
+//! `W` is most of the work, and changes as the motion does: it is computed with the first
+//! estimate of each [`HELD`], of the stamps, and when base or covariance change, and held in
+//! between. All else is of the instant.
 //!
 //! Loops over rows use the widest vector instructions of the processor, in a portable build too.
 //!
@@ -51,18 +56,23 @@ pub use covariance::Covariance;
 
 use crate::propagation::covariance::{Drift, triangle};
 use crate::propagation::vectors::{
-    Calibrated, ColumnBlock, Covariance6, LANES, Lanes, Member, Root, add_independent, add_link,
-    add_offset, bilinear_form, numbers, project, splat, vectors, vectors_mut,
+    Calibrated, ColumnBlock, Covariance6, LANES, Lanes, Member, Root, add_covariance,
+    add_independent, add_link, add_offset, add_reading, dot, numbers, project, splat, times,
+    vectors, vectors_mut,
 };
 use std::ops::Range;
 
-use nalgebra::{Matrix6, Vector6};
+use nalgebra::Matrix6;
 use proprio_topics::Nanos;
 use pulp::{Arch, Simd, WithSimd};
 
 use proprio_dynamics::regressor::{LINK_PARAMETERS, link_rows};
-use proprio_dynamics::spatial::{Motion, Pose, Wrench};
+use proprio_dynamics::spatial::{Motion, Wrench};
 use proprio_dynamics::{DynamicsError, Kinematics, Solver, Structure, check_size};
+
+/// How long the wrenches of the links' uncertain parameters are used. In that time an acceleration
+/// that grows as fast as a robot's joint can, by 1000 rad/s^3, changes by 5 rad/s^2.
+const HELD: Nanos = Nanos::from_millis(5);
 
 /// The standard deviations of the solver's results that a [`Covariance`] causes, with all the
 /// memory needed to compute them.
@@ -74,6 +84,8 @@ pub struct Propagation {
     extra: Vec<[f64; 6]>,
     /// The first instant of this run.
     run_start: Option<Nanos>,
+    /// The period, and the base, that the wrenches are of.
+    held: Option<(i64, usize)>,
     /// Standard deviations of the torques.
     torque: Vec<f64>,
     /// Standard deviations of the contact wrenches.
@@ -93,7 +105,9 @@ struct SubtreeRoot {
     /// Links that are correlated with nothing else in this sub-tree: number, place in the sub-tree,
     /// and root (upper triangular).
     independent: Vec<(usize, usize, Box<Root>)>,
-    /// Per link, the covariance of the wrenches below it from the links in `independent`.
+    /// Per link, the covariance of the wrenches below it from the links in `independent`; then with
+    /// what is uncertain in the readings at `ends` besides.
+    below_alone: Vec<Covariance6>,
     below: Vec<Covariance6>,
     /// The sensors at its ends.
     ends: Vec<End>,
@@ -115,8 +129,9 @@ struct Link {
 #[derive(Clone, Copy, Debug)]
 struct End {
     sensor: usize,
-    /// The link that its wrench acts on.
+    /// The link that its wrench acts on, and the place of that in the sub-tree.
     link: usize,
+    place: usize,
     /// Whether its offset enters the balance with a positive sign.
     is_positive: bool,
 }
@@ -144,6 +159,7 @@ impl Propagation {
             drifts: covariance.drifts.clone(),
             extra: vec![[0.0; 6]; covariance.drifts.len()],
             run_start: None,
+            held: None,
             torque: vec![0.0; structure.dof_count()],
             contacts: vec![[0.0; 6]; structure.contacts().len()],
             imbalances: vec![Matrix6::zeros(); structure.subtrees().len()],
@@ -200,12 +216,16 @@ impl Propagation {
             return Err(DynamicsError::NotSolved);
         }
         let run_start = *self.run_start.get_or_insert(t);
+        let key = Some((t.0.div_euclid(HELD.0), kinematics.base()));
+        let is_due = self.held != key;
+        self.held = key;
         Arch::new().dispatch(Update {
             propagation: self,
             structure,
             solver,
             kinematics,
             times: (t, run_start),
+            is_due,
         });
         Ok(())
     }
@@ -237,6 +257,8 @@ struct Update<'a> {
     solver: &'a Solver,
     kinematics: &'a Kinematics,
     times: (Nanos, Nanos),
+    /// Whether the wrenches are to be computed.
+    is_due: bool,
 }
 
 impl WithSimd for Update<'_> {
@@ -250,6 +272,7 @@ impl WithSimd for Update<'_> {
             solver,
             kinematics,
             times,
+            is_due,
         } = self;
         let Propagation {
             subtrees,
@@ -266,94 +289,32 @@ impl WithSimd for Update<'_> {
             .zip(structure.subtrees())
             .zip(imbalances)
         {
-            part.update(simd, solver, kinematics);
+            if is_due {
+                part.update(simd, solver, kinematics);
+            }
+            part.add_readings(solver, |sensor| {
+                let (drift, extra) = (&drifts[sensor], &extra[sensor]);
+                let seconds = drift.known.elapsed(times.0, times.1);
+                std::array::from_fn(|i| seconds * drift.rate[i] + extra[i])
+            });
             if !part.ends.is_empty() {
                 *imbalance = part.covariance_of_all(simd);
-                for end in &part.ends {
-                    let variances =
-                        offset_variances((&drifts[end.sensor], &extra[end.sensor]), times);
-                    add_offset_covariance(imbalance, solver.sensor_pose(end.sensor), &variances);
-                }
             }
-            let from_drift = |motion: &dyn Fn(usize) -> Motion| -> f64 {
-                let of = |end: &End| {
-                    drift_variance(
-                        (&drifts[end.sensor], &extra[end.sensor]),
-                        times,
-                        solver.sensor_pose(end.sensor),
-                        || motion(end.link),
-                    )
-                };
-                part.ends.iter().map(of).sum()
-            };
             for (place, link) in part.links.iter().enumerate().skip(1) {
                 let Some(dof) = structure.dof_of(link.link) else {
                     continue;
                 };
                 let (axis, response) = solver.torque_rows(link.link);
-                let below = structure.below(link.link);
-                let drift = from_drift(&|other| {
-                    if below.contains(&other) {
-                        *axis - *response
-                    } else {
-                        -*response
-                    }
-                });
                 // The deviation of a sum is at most the sum of the deviations.
-                torque[dof] += (part.variance(simd, place, axis, response) + drift).sqrt();
+                torque[dof] += part.variance(simd, place, axis, response).sqrt();
             }
             for contact in subtree.contacts.iter() {
                 let motions = solver.contact_rows(contact);
                 for (deviation, motion) in contacts[contact].iter_mut().zip(motions) {
-                    *deviation =
-                        (part.variance_of_all(simd, motion) + from_drift(&|_| *motion)).sqrt();
+                    *deviation = part.variance_of_all(simd, motion).sqrt();
                 }
             }
         }
-    }
-}
-
-/// Variance of a result due to a sensor's drift until `t` and its additional variance. `motion` is
-/// the gradient of the result by the wrench; the run began at `run_start`.
-fn drift_variance(
-    (drift, extra): (&Drift, &[f64; 6]),
-    (t, run_start): (Nanos, Nanos),
-    x_bm: &Pose,
-    motion: impl Fn() -> Motion,
-) -> f64 {
-    if drift.rate == [0.0; 6] && *extra == [0.0; 6] {
-        return 0.0;
-    }
-    let variances = offset_variances((drift, extra), (t, run_start));
-    let seen = x_bm.twist_back(&motion());
-    let squares = seen.angular.iter().chain(seen.linear.iter()).zip(variances);
-    squares.map(|(m, variance)| m * m * variance).sum()
-}
-
-/// Variance of each channel [torque; force] of an offset due to its drift until `t` and its
-/// additional variance.
-fn offset_variances(
-    (drift, extra): (&Drift, &[f64; 6]),
-    (t, run_start): (Nanos, Nanos),
-) -> [f64; 6] {
-    let seconds = drift.known.elapsed(t, run_start);
-    std::array::from_fn(|i| seconds * drift.rate[i] + extra[i])
-}
-
-/// Adds the covariance of a sensor's wrench at the origin, from the variances of its channels
-/// [torque; force].
-fn add_offset_covariance(covariance: &mut Matrix6<f64>, x_bm: &Pose, variances: &[f64; 6]) {
-    for (channel, variance) in variances
-        .iter()
-        .enumerate()
-        .filter(|(_, variance)| **variance > 0.0)
-    {
-        let mut unit = [0.0; 6];
-        unit[channel] = 1.0;
-        let [tx, ty, tz, fx, fy, fz] = unit;
-        let column = x_bm.wrench(&Wrench::from_parts([fx, fy, fz], [tx, ty, tz]));
-        let column = Vector6::from(column.torque_first());
-        *covariance += *variance * column * column.transpose();
     }
 }
 
@@ -369,13 +330,14 @@ impl SubtreeRoot {
                 let cut = &structure.sensors()[sensor];
                 let child = cut.joint() + 1;
                 let is_above = structure.subtree_of(child) == Some(number);
+                let link = match is_above {
+                    true => child,
+                    false => structure.parent_of(child),
+                };
                 End {
                     sensor,
-                    link: if is_above {
-                        child
-                    } else {
-                        structure.parent_of(child)
-                    },
+                    link,
+                    place: place_of(link).unwrap_or(0),
                     is_positive: is_above == (cut.sign() > 0.0),
                 }
             })
@@ -497,18 +459,41 @@ impl SubtreeRoot {
             let (parent, below) = (links[place].parent, links[place].rows.clone());
             links[parent].rows = hull(&links[parent].rows, &below);
         }
+        let below = match independent.is_empty() && ends.is_empty() {
+            true => Vec::new(),
+            false => vec![Covariance6::default(); links.len()],
+        };
         Self {
             wrenches: vec![[0.0; LANES]; 6 * rows * links.len()],
-            below: if independent.is_empty() {
-                Vec::new()
-            } else {
-                vec![[[0.0; 6]; 6]; links.len()]
-            },
+            below_alone: below.clone(),
+            below,
             rows,
             links,
             column_blocks,
             independent,
             ends,
+        }
+    }
+
+    /// Adds what is uncertain in the readings, given the variances of each sensor's channels.
+    #[inline(always)]
+    fn add_readings(&mut self, solver: &Solver, variances: impl Fn(usize) -> [f64; 6]) {
+        self.below.copy_from_slice(&self.below_alone);
+        for end in &self.ends {
+            let variances = variances(end.sensor);
+            if variances == [0.0; 6] {
+                continue;
+            }
+            let mut covariance = Covariance6::default();
+            add_reading(&mut covariance, solver.sensor_pose(end.sensor), &variances);
+            let mut place = end.place;
+            loop {
+                add_covariance(&mut self.below[place], &covariance);
+                if place == 0 {
+                    break;
+                }
+                place = self.links[place].parent;
+            }
         }
     }
 
@@ -546,18 +531,14 @@ impl SubtreeRoot {
                 Member::Calibration => {}
             }
         }
-        self.below.fill([[0.0; 6]; 6]);
+        self.below_alone.fill(Covariance6::default());
         for (link, place, root) in &self.independent {
             let coefficients = link_rows(kinematics.pose(*link), kinematics.motion(*link));
-            add_independent(&mut self.below[*place], root, &coefficients);
+            add_independent(&mut self.below_alone[*place], root, &coefficients);
         }
-        for place in (1..self.below.len()).rev() {
-            let (below, parent) = (self.below[place], self.links[place].parent);
-            for (sums, values) in self.below[parent].iter_mut().zip(&below) {
-                sums.iter_mut()
-                    .zip(values)
-                    .for_each(|(sum, value)| *sum += value);
-            }
+        for place in (1..self.below_alone.len()).rev() {
+            let below = self.below_alone[place];
+            add_covariance(&mut self.below_alone[self.links[place].parent], &below);
         }
         for place in (1..self.links.len()).rev() {
             let Link {
@@ -586,19 +567,19 @@ impl SubtreeRoot {
         self.correlated(simd, place, axis, response) + self.independent(place, axis, response)
     }
 
-    /// The part of [`Self::variance`] from independent links.
+    /// The part of [`Self::variance`] from independent links, and from readings.
+    #[inline(always)]
     fn independent(&self, place: usize, axis: &Motion, response: &Motion) -> f64 {
         let (Some(below), Some(all)) = (self.below.get(place), self.below.first()) else {
             return 0.0;
         };
         let (s, h) = (numbers(axis), numbers(response));
+        let own = times(below, &s);
         if *response == Motion::zero() {
-            return bilinear_form(&s, below, &s);
+            return dot(&s, &own);
         }
         // If one side has no links, rounding errors of either sign remain.
-        (bilinear_form(&s, below, &s) - 2.0 * bilinear_form(&s, below, &h)
-            + bilinear_form(&h, all, &h))
-        .max(0.0)
+        (dot(&s, &own) - 2.0 * dot(&h, &own) + dot(&h, &times(all, &h))).max(0.0)
     }
 
     /// The part of [`Self::variance`] from correlated links and sensors.

@@ -56,6 +56,11 @@ impl LeastSquares {
         self.weights.clear();
     }
 
+    /// Whether there is no unknown.
+    pub fn is_empty(&self) -> bool {
+        self.columns.is_empty()
+    }
+
     /// Adds an unknown: its column of `A` and its weight `w_j`.
     pub fn push(&mut self, column: Vector6<f64>, weight: f64) {
         self.columns.push(column);
@@ -98,8 +103,16 @@ impl LeastSquares {
             }
         });
         self.rank = self.inverse_squares.iter().filter(|&&x| x > 0.0).count();
-        lower.tr_solve_lower_triangular_unchecked_mut(&mut q);
-        self.dual = q;
+        // From the last row up, all columns at once.
+        let mut rows = q.transpose();
+        for i in (0..6).rev() {
+            let mut row = rows.column(i).into_owned();
+            for k in i + 1..6 {
+                row -= rows.column(k) * lower[(k, i)];
+            }
+            rows.set_column(i, &(row / lower[(i, i)]));
+        }
+        self.dual = rows.transpose();
     }
 
     /// One Jacobi rotation. Returns whether it was needed.

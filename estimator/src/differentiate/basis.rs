@@ -1,7 +1,6 @@
 //! Polynomials orthogonal over the stamps of a window.
 
 use crate::differentiate::estimate::MAX_SAMPLES;
-use proprio_topics::Nanos;
 
 /// The number of degrees fitted, from [`FIRST_DEGREE`] up.
 pub(crate) const FITTED: usize = 3;
@@ -39,134 +38,157 @@ pub(crate) const MOMENTS: usize = 2 * TERMS - 1;
 /// is mostly rounding error. With regular stamps it is 0.03 to 1e-5.
 pub(crate) const DEGENERATE: f64 = 1e-12;
 
-/// The stamps of a window's samples, in a ring buffer.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Ring {
-    pub(crate) stamps: [Nanos; MAX_SAMPLES],
-    /// Which samples restart the window: they are not fitted together with earlier ones.
-    pub(crate) restarts: [bool; MAX_SAMPLES],
-    /// The index of the newest sample. The oldest is at `newest + 1 - len` modulo the array length.
-    pub(crate) newest: usize,
-    pub(crate) len: usize,
+/// Numbers of one sample or window that are computed together: a multiple of the vector length of
+/// every processor.
+pub(crate) const LANES: usize = 8;
+
+/// The last samples, newest first. Each is stored twice, so that any of them in a row are one
+/// slice.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Recent<T> {
+    places: [T; 2 * MAX_SAMPLES],
+    newest: usize,
 }
 
 /// Polynomials orthogonal over the newest samples, and their values at an instant; computed on
 /// demand.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Basis {
-    /// `<p_k, v^l>` for the last `k` computed and for the one before, from `l = k` on.
-    pub(crate) moments: [[f64; MOMENTS]; 2],
-    /// `<v^k, v^k>`: the scale of the rounding error of `<p_k, p_k>`.
-    pub(crate) scale: [f64; TERMS],
+    /// `<v^k, v^l>` by `k + l`.
+    sums: [f64; 2 * LANES],
     /// Coefficients of the recurrence.
-    pub(crate) a: [f64; TERMS],
-    pub(crate) b: [f64; TERMS],
-    /// `1 / <p_k, p_k>`.
-    pub(crate) per_norm: [f64; TERMS],
-    /// Coefficients of `p_k` by powers of `v`.
-    pub(crate) powers: [[f64; TERMS]; TERMS],
-    /// The number of polynomials computed, and whether there are no more.
+    a: [f64; TERMS],
+    b: [f64; TERMS],
+    /// `1 / <p_k, p_k>`; zero for polynomials that do not exist.
+    pub(crate) per_norm: [f64; LANES],
+    /// The coefficients of `v^j` in all polynomials.
+    by_power: [[f64; LANES]; TERMS],
+    /// The number of polynomials, once they are computed.
     pub(crate) found: usize,
-    pub(crate) is_exhausted: bool,
-    /// `p_k` and its derivatives by `v` at the instant, and the sums of `p_k^(m)^2 / <p_k, p_k>` up
-    /// to `k`; for `k < placed`.
+    is_computed: bool,
+    /// `p_k` and its derivatives by `v` at the instant, and the square roots of the sums of
+    /// `p_k^(m)^2 / <p_k, p_k>` up to `k`, once they are computed.
     pub(crate) here: [[f64; 3]; TERMS],
-    pub(crate) variance: [[f64; 3]; TERMS],
-    pub(crate) placed: usize,
+    pub(crate) deviation: [[f64; 3]; TERMS],
+    is_placed: bool,
 }
 
-impl Ring {
-    pub(crate) const EMPTY: Self = Self {
-        stamps: [Nanos::ZERO; MAX_SAMPLES],
-        restarts: [false; MAX_SAMPLES],
-        newest: 0,
-        len: 0,
-    };
+impl<T: Copy> Recent<T> {
+    /// All samples are `none` so far.
+    pub(crate) const fn new(none: T) -> Self {
+        Self {
+            places: [none; 2 * MAX_SAMPLES],
+            newest: 0,
+        }
+    }
 
-    /// The index of the sample that has `age` later ones.
-    pub(crate) fn at(&self, age: usize) -> usize {
-        (self.newest + MAX_SAMPLES - age) % MAX_SAMPLES
+    pub(crate) fn push(&mut self, value: T) {
+        self.newest = (self.newest + MAX_SAMPLES - 1) % MAX_SAMPLES;
+        let (first, second) = self.places.split_at_mut(MAX_SAMPLES);
+        for place in [first, second] {
+            place[self.newest] = value;
+        }
+    }
+
+    /// Newest first.
+    pub(crate) fn all(&self) -> &[T] {
+        &self.places[self.newest..][..MAX_SAMPLES]
     }
 }
 
 impl Basis {
     pub(crate) const NONE: Self = Self {
-        moments: [[0.0; MOMENTS]; 2],
-        scale: [0.0; TERMS],
+        sums: [0.0; 2 * LANES],
         a: [0.0; TERMS],
         b: [0.0; TERMS],
-        per_norm: [0.0; TERMS],
-        powers: [[0.0; TERMS]; TERMS],
+        per_norm: [0.0; LANES],
+        by_power: [[0.0; LANES]; TERMS],
         found: 0,
-        is_exhausted: true,
+        is_computed: false,
         here: [[0.0; 3]; TERMS],
-        variance: [[0.0; 3]; TERMS],
-        placed: 0,
+        deviation: [[0.0; 3]; TERMS],
+        is_placed: false,
     };
 
-    /// A basis from the sums of `v^0 ... v^10`.
-    pub(crate) fn new(sums: [f64; MOMENTS]) -> Self {
-        Self {
-            moments: [sums, [0.0; MOMENTS]],
-            scale: std::array::from_fn(|k| sums[2 * k]),
-            is_exhausted: false,
-            ..Self::NONE
+    /// A basis from the sums of `v^0 ... v^7` and of `v^8 ...`.
+    pub(crate) fn new(low: [f64; LANES], high: [f64; LANES]) -> Self {
+        let mut new = Self::NONE;
+        new.sums[..LANES].copy_from_slice(&low);
+        new.sums[LANES..].copy_from_slice(&high);
+        new
+    }
+
+    /// Computes the polynomials for this many `samples`, if they are not yet, and returns their
+    /// number.
+    #[inline(always)]
+    pub(crate) fn count(&mut self, samples: usize) -> usize {
+        if !self.is_computed {
+            self.compute(samples);
+        }
+        self.found
+    }
+
+    /// Chebyshev's algorithm.
+    fn compute(&mut self, samples: usize) {
+        self.is_computed = true;
+        // `<p_k, v^l>` for the last `k` and for the one before, from `l = k` on.
+        let (mut moments, mut before) = (self.sums, [0.0; 2 * LANES]);
+        for k in 0..TERMS.min(samples) {
+            if k > 0 {
+                let (a, b) = (self.a[k - 1], self.b[k - 1]);
+                // From those of k - 1 and k - 2, in place of the latter.
+                for l in k..MOMENTS - k {
+                    before[l] = moments[l + 1] - a * moments[l] - b * before[l];
+                }
+                std::mem::swap(&mut moments, &mut before);
+            }
+            let norm = moments[k];
+            if norm <= DEGENERATE * self.sums[2 * k] || !norm.is_finite() {
+                return;
+            }
+            self.per_norm[k] = 1.0 / norm;
+            if k == 0 {
+                self.by_power[0][0] = 1.0;
+                self.a[0] = moments[1] * self.per_norm[0];
+            } else {
+                let (a, b) = (self.a[k - 1], self.b[k - 1]);
+                for j in 0..=k {
+                    let shifted = if j > 0 {
+                        self.by_power[j - 1][k - 1]
+                    } else {
+                        0.0
+                    };
+                    let own = &mut self.by_power[j];
+                    let second = if k > 1 { own[k - 2] } else { 0.0 };
+                    own[k] = shifted - a * own[k - 1] - b * second;
+                }
+                let earlier = self.per_norm[k - 1];
+                if k + 1 < TERMS {
+                    self.a[k] = moments[k + 1] * self.per_norm[k] - before[k] * earlier;
+                }
+                self.b[k] = norm * earlier;
+            }
+            self.found = k + 1;
         }
     }
 
-    /// Computes the polynomials up to this degree. False if the `samples` are too few.
-    pub(crate) fn reaches(&mut self, degree: usize, samples: usize) -> bool {
-        while self.found <= degree && !self.is_exhausted {
-            self.next(samples);
-        }
-        self.found > degree
+    /// The instant is another one.
+    pub(crate) fn displace(&mut self) {
+        self.is_placed = false;
     }
 
-    /// One degree more, by Chebyshev's algorithm.
-    pub(crate) fn next(&mut self, samples: usize) {
-        let k = self.found;
-        let [moments, before] = &mut self.moments;
-        if k > 0 {
-            let (a, b) = (self.a[k - 1], self.b[k - 1]);
-            // <p_k, v^l> from those of k - 1 and k - 2, in place of the latter.
-            for l in k..MOMENTS - k {
-                before[l] = moments[l + 1] - a * moments[l] - b * before[l];
-            }
-            std::mem::swap(moments, before);
+    /// Evaluates the polynomials at the instant `at`, unless that was done.
+    #[inline(always)]
+    pub(crate) fn place(&mut self, at: f64) {
+        if !self.is_placed {
+            self.evaluate(at);
         }
-        let norm = moments[k];
-        if k >= samples || norm <= DEGENERATE * self.scale[k] || !norm.is_finite() {
-            self.is_exhausted = true;
-            return;
-        }
-        self.per_norm[k] = 1.0 / norm;
-        if k == 0 {
-            self.powers[0][0] = 1.0;
-            self.a[0] = moments[1] * self.per_norm[0];
-        } else {
-            let (a, b) = (self.a[k - 1], self.b[k - 1]);
-            for j in 0..=k {
-                let shifted = if j > 0 {
-                    self.powers[k - 1][j - 1]
-                } else {
-                    0.0
-                };
-                let second = if k > 1 { self.powers[k - 2][j] } else { 0.0 };
-                self.powers[k][j] = shifted - a * self.powers[k - 1][j] - b * second;
-            }
-            let earlier = self.per_norm[k - 1];
-            if k + 1 < TERMS {
-                self.a[k] = moments[k + 1] * self.per_norm[k] - before[k] * earlier;
-            }
-            self.b[k] = norm * earlier;
-        }
-        self.found += 1;
-        self.is_exhausted = self.found == TERMS;
     }
 
-    /// Evaluates `p_k` up to this degree at the instant `at`; they must have been computed.
-    pub(crate) fn place(&mut self, degree: usize, at: f64) {
-        for k in self.placed..=degree.min(TERMS - 1) {
+    fn evaluate(&mut self, at: f64) {
+        self.is_placed = true;
+        let mut variance = [0.0; 3];
+        for k in 0..self.found {
             let none = [0.0; 3];
             self.here[k] = match k {
                 0 => [1.0, 0.0, 0.0],
@@ -182,37 +204,33 @@ impl Basis {
                     })
                 }
             };
-            let so_far = if k > 0 { self.variance[k - 1] } else { none };
-            self.variance[k] = per_derivative(|m| {
-                so_far[m] + self.here[k][m] * self.here[k][m] * self.per_norm[k]
+            variance = per_derivative(|m| {
+                variance[m] + self.here[k][m] * self.here[k][m] * self.per_norm[k]
             });
-            self.placed = k + 1;
+            self.deviation[k] = variance.map(f64::sqrt);
         }
     }
 
-    /// The coefficients of the least-squares polynomial in `p_0 ... p_{N-1}`, for values with these
-    /// moments.
-    pub(crate) fn coefficients<const N: usize>(&self, moments: &[f64; TERMS]) -> [f64; N] {
-        let (mut of, mut before) = (*moments, [0.0; TERMS]);
-        std::array::from_fn(|k| {
-            if k > 0 {
-                let (a, b) = (self.a[k - 1], self.b[k - 1]);
-                for l in 0..N - k {
-                    before[l] = of[l + 1] - a * of[l] - b * before[l];
-                }
-                std::mem::swap(&mut of, &mut before);
+    /// `<x, p_k>` of all polynomials, for values `x` with these moments.
+    #[inline(always)]
+    pub(crate) fn products(&self, moments: &[f64; LANES]) -> [f64; LANES] {
+        let mut products = [0.0; LANES];
+        for (moment, own) in moments.iter().zip(&self.by_power) {
+            for k in 0..LANES {
+                products[k] += moment * own[k];
             }
-            of[0] * self.per_norm[k]
-        })
+        }
+        products
     }
 
-    /// The same in powers of `v`.
-    pub(crate) fn polynomial<const N: usize>(&self, moments: &[f64; TERMS]) -> [f64; N] {
-        let coefficients = self.coefficients::<N>(moments);
+    /// The least-squares polynomial of degree `N - 1` for values with these products, in powers of
+    /// `v`.
+    #[inline(always)]
+    pub(crate) fn polynomial<const N: usize>(&self, products: &[f64; LANES]) -> [f64; N] {
         let mut polynomial = [0.0; N];
-        for (coefficient, powers) in coefficients.iter().zip(&self.powers) {
-            for (sum, power) in polynomial.iter_mut().zip(powers) {
-                *sum += coefficient * power;
+        for (sum, own) in polynomial.iter_mut().zip(&self.by_power) {
+            for k in 0..N {
+                *sum += products[k] * self.per_norm[k] * own[k];
             }
         }
         polynomial

@@ -1,6 +1,6 @@
 //! The stamp-dependent part of differentiation, shared by channels with equal stamps.
 
-use crate::differentiate::basis::{Basis, CANDIDATES, MOMENTS, Ring, TERMS, longer};
+use crate::differentiate::basis::{Basis, CANDIDATES, LANES, longer};
 use crate::differentiate::estimate::{MAX_SAMPLES, MIN_SAMPLES};
 use proprio_topics::Nanos;
 
@@ -12,17 +12,15 @@ use proprio_topics::Nanos;
 /// it. For a channel with other stamps it is computed again. The estimates are the same to the bit.
 #[derive(Debug, Clone)]
 pub struct Grid {
-    /// The stamps of the window that it was computed for: an equal window need not be searched.
-    pub(crate) ring: Ring,
-    pub(crate) settings: (Nanos, Nanos, usize),
-    pub(crate) skipped: usize,
     /// The time from each sample to the newest one.
     pub(crate) before: [Nanos; MAX_SAMPLES],
     pub(crate) used: usize,
     /// Time from the oldest sample to the newest \[s\]: the unit of `v`.
     pub(crate) span: f64,
-    /// `v^0 ... v^5` of each sample, newest first.
-    pub(crate) powers: [[f64; TERMS]; MAX_SAMPLES],
+    /// `v` of each sample, newest first.
+    pub(crate) times: [f64; MAX_SAMPLES],
+    /// `v^0 ... v^7` of each sample.
+    pub(crate) powers: [[f64; LANES]; MAX_SAMPLES],
     /// Window lengths to try, in growing order; the last one is all samples.
     pub(crate) lengths: [usize; CANDIDATES],
     pub(crate) tried: usize,
@@ -43,13 +41,11 @@ impl Grid {
     #[must_use]
     pub const fn new() -> Self {
         Self {
-            ring: Ring::EMPTY,
-            settings: (Nanos::ZERO, Nanos::ZERO, 0),
-            skipped: 0,
             before: [Nanos::ZERO; MAX_SAMPLES],
             used: 0,
             span: 1.0,
-            powers: [[0.0; TERMS]; MAX_SAMPLES],
+            times: [0.0; MAX_SAMPLES],
+            powers: [[0.0; LANES]; MAX_SAMPLES],
             lengths: [0; CANDIDATES],
             tried: 0,
             bases: [Basis::NONE; CANDIDATES],
@@ -57,31 +53,48 @@ impl Grid {
         }
     }
 
-    /// Computes the grid for the first `used` stamps.
-    pub(crate) fn make(&mut self, used: usize) {
+    /// Computes the grid for these stamps, newest first, unless they are those of the last one but
+    /// for a shift. Call it with at least [`MIN_SAMPLES`] of them.
+    #[inline(always)]
+    pub(crate) fn make(&mut self, stamps: &[Nanos]) {
+        let newest = stamps[0].0;
+        let mut difference = i64::from(self.used != stamps.len());
+        for (stamp, before) in stamps.iter().zip(&self.before) {
+            difference |= (newest - stamp.0) ^ before.0;
+        }
+        if difference == 0 {
+            return;
+        }
+        for (before, stamp) in self.before.iter_mut().zip(stamps) {
+            *before = Nanos(newest - stamp.0);
+        }
+        let used = stamps.len();
         self.used = used;
         self.at = f64::NAN;
         self.span = self.seconds(used);
         let per_span = 1.0 / self.span;
+        for (v, before) in self.times.iter_mut().zip(&self.before).take(used) {
+            *v = -before.seconds() * per_span;
+        }
         self.tried = 0;
-        let (mut sums, mut from, mut samples) = ([0.0; MOMENTS], 0, MIN_SAMPLES);
+        let (mut low, mut high) = ([0.0; LANES], [0.0; LANES]);
+        let (mut from, mut samples) = (0, MIN_SAMPLES);
         for (length, basis) in self.lengths.iter_mut().zip(&mut self.bases) {
-            let range = from..samples;
-            let taken = self.before.get(range.clone()).unwrap_or_default();
-            let powers = self.powers.get_mut(range).unwrap_or_default();
-            for (before, powers) in taken.iter().zip(powers) {
-                let v = -before.seconds() * per_span;
-                let mut power = 1.0;
-                for (k, sum) in sums.iter_mut().enumerate() {
-                    if let Some(place) = powers.get_mut(k) {
-                        *place = power;
-                    }
-                    *sum += power;
-                    power *= v;
+            let times = &self.times[from..samples];
+            for (v, powers) in times.iter().zip(&mut self.powers[from..samples]) {
+                let mut own = [1.0; LANES];
+                for k in 1..LANES {
+                    own[k] = own[k - 1] * v;
                 }
+                let eighth = own[LANES - 1] * v;
+                for k in 0..LANES {
+                    low[k] += own[k];
+                    high[k] += own[k] * eighth;
+                }
+                *powers = own;
             }
             *length = samples;
-            *basis = Basis::new(sums);
+            *basis = Basis::new(low, high);
             self.tried += 1;
             if samples == used {
                 break;
@@ -95,7 +108,7 @@ impl Grid {
         let at = time / self.span;
         if at != self.at {
             self.at = at;
-            self.bases.iter_mut().for_each(|basis| basis.placed = 0);
+            self.bases.iter_mut().for_each(Basis::displace);
         }
     }
 
@@ -105,13 +118,5 @@ impl Grid {
             .checked_sub(1)
             .and_then(|last| self.before.get(last));
         oldest.map_or(0.0, |before| before.seconds())
-    }
-
-    /// The same in the unit of `v`.
-    pub(crate) fn extent(&self, samples: usize) -> f64 {
-        let oldest = samples
-            .checked_sub(1)
-            .and_then(|last| self.powers.get(last));
-        -oldest.map_or(0.0, |powers| powers[1])
     }
 }

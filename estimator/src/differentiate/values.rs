@@ -1,64 +1,142 @@
 //! Polynomial fits of the values of a window, and their standard deviations.
 
 use crate::differentiate::basis::{
-    CANDIDATES, FIRST_DEGREE, FITTED, KAPPA, SHORTEST, STRETCH, TERMS, TOLERANCE,
+    CANDIDATES, FIRST_DEGREE, KAPPA, LANES, SHORTEST, STRETCH, TERMS, TOLERANCE,
 };
-use crate::differentiate::estimate::{Estimate, MAX_SAMPLES};
+use crate::differentiate::estimate::Estimate;
 use crate::differentiate::grid::Grid;
+use proprio_topics::Nanos;
+use pulp::{Simd, WithSimd};
 
-/// The values of the samples used, and their moments.
-pub(crate) struct Values<const D: usize> {
-    /// Newest first, relative to the newest one, so that a constant costs no digits.
-    pub(crate) values: [[f64; MAX_SAMPLES]; D],
-    /// `<x, v^k>` over each window length.
-    pub(crate) moments: [[[f64; TERMS]; CANDIDATES]; D],
+/// Relative rounding error of the square sum of residuals.
+const ROUNDING: f64 = 1e-9;
+
+/// The samples used for an estimate, newest first.
+pub(crate) struct Values<'a, const D: usize> {
+    pub(crate) grid: &'a mut Grid,
+    pub(crate) stamps: &'a [Nanos],
+    pub(crate) values: [&'a [f64]; D],
+    /// The newest ones, which the fits are relative to, so that a constant costs no digits.
+    pub(crate) origin: [f64; D],
+    /// The squared divided differences of these samples alone.
+    pub(crate) roughness_square: [&'a [f64]; D],
+    /// The least peak noise.
+    pub(crate) least_noise: f64,
+    /// Time of the instant after the newest sample \[s\].
+    pub(crate) time: f64,
 }
 
-impl<const D: usize> Values<D> {
-    pub(crate) fn new(values: [[f64; MAX_SAMPLES]; D], grid: &Grid) -> Self {
-        let mut moments = [[[0.0; TERMS]; CANDIDATES]; D];
-        for (values, moments) in values.iter().zip(&mut moments) {
-            let (mut sums, mut from) = ([0.0; TERMS], 0);
-            for (&samples, place) in grid.lengths.iter().zip(moments).take(grid.tried) {
-                let range = from..samples;
-                let values = values.get(range.clone()).unwrap_or_default();
-                let powers = grid.powers.get(range).unwrap_or_default();
-                for (value, powers) in values.iter().zip(powers) {
-                    for k in 0..TERMS {
-                        sums[k] += value * powers[k];
-                    }
-                }
-                *place = sums;
-                from = samples;
-            }
-        }
-        Self { values, moments }
-    }
+/// Of each window length, `<x, v^k>`, and in the last lane `<x, x>`.
+type Moments<const D: usize> = [[[f64; LANES]; D]; CANDIDATES];
+
+impl<const D: usize> WithSimd for Values<'_, D> {
+    type Output = Estimate<D>;
 
     /// The three steps described in the parent module.
-    pub(crate) fn estimate(
-        &self,
-        grid: &mut Grid,
-        noise: &[f64; D],
-        origin: &[f64; D],
-    ) -> Estimate<D> {
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> Estimate<D> {
+        self.grid.make(self.stamps);
+        self.grid.place(self.time);
+        let moments = self.moments(simd);
+        let Self {
+            grid,
+            values,
+            origin,
+            roughness_square,
+            least_noise,
+            ..
+        } = self;
         let mut estimate = Estimate::NONE;
-        for (component, noise) in noise.iter().enumerate() {
-            self.component(component, grid, *noise, origin, &mut estimate);
+        for component in 0..D {
+            let own = roughness_square[component];
+            let variance = sum(own) / own.len().max(1) as f64;
+            let own = Component {
+                values: values[component],
+                origin: origin[component],
+                // An error uniformly distributed over +-noise has the variance noise^2 / 3.
+                noise: (3.0 * variance).sqrt().max(least_noise),
+                moments: &moments,
+                component,
+            };
+            own.estimate(grid, &mut estimate);
         }
         estimate
     }
+}
 
-    /// The same for one of the `D` numbers.
-    pub(crate) fn component(
-        &self,
-        component: usize,
-        grid: &mut Grid,
-        noise: f64,
-        origin: &[f64; D],
-        estimate: &mut Estimate<D>,
-    ) {
-        let tolerance = noise * TOLERANCE;
+impl<const D: usize> Values<'_, D> {
+    #[inline(always)]
+    fn moments<S: Simd>(&self, simd: S) -> Moments<D> {
+        let (mut moments, mut before, mut from) =
+            ([[[0.0; LANES]; D]; CANDIDATES], [[0.0; LANES]; D], 0);
+        let lengths = &self.grid.lengths[..self.grid.tried];
+        for (&samples, moments) in lengths.iter().zip(&mut moments) {
+            // The sums of the samples that are new in this window begin at zero, so that none
+            // waits for those before it.
+            let (mut sums, mut squares) = ([[simd.splat_f64s(0.0); LANES]; D], [0.0; D]);
+            let powers = &self.grid.powers[from..samples];
+            let mut values: [&[f64]; D] = [&[]; D];
+            for (own, all) in values.iter_mut().zip(&self.values) {
+                *own = &all[from..samples];
+            }
+            for i in 0..powers.len() {
+                let powers = S::as_simd_f64s(&powers[i]).0;
+                for component in 0..D {
+                    let x = values[component][i] - self.origin[component];
+                    let splat = simd.splat_f64s(x);
+                    for (sum, power) in sums[component].iter_mut().zip(powers) {
+                        *sum = simd.mul_add_e_f64s(splat, *power, *sum);
+                    }
+                    squares[component] += x * x;
+                }
+            }
+            for component in 0..D {
+                let own = &mut moments[component];
+                let vectors = S::as_mut_simd_f64s(own).0.iter_mut();
+                for (to, sum) in vectors.zip(&sums[component]) {
+                    *to = *sum;
+                }
+                own[LANES - 1] = squares[component];
+                for k in 0..LANES {
+                    own[k] += before[component][k];
+                }
+                before[component] = *own;
+            }
+            from = samples;
+        }
+        moments
+    }
+}
+
+/// The sum of many numbers, in parts that do not wait for each other.
+#[inline(always)]
+pub(crate) fn sum(numbers: &[f64]) -> f64 {
+    let (whole, rest) = numbers.as_chunks::<LANES>();
+    let mut sums = [0.0; LANES];
+    for eight in whole {
+        for k in 0..LANES {
+            sums[k] += eight[k];
+        }
+    }
+    let mut total = 0.0;
+    for number in sums.iter().chain(rest) {
+        total += number;
+    }
+    total
+}
+
+/// One of the `D` numbers.
+struct Component<'a, const D: usize> {
+    values: &'a [f64],
+    origin: f64,
+    noise: f64,
+    moments: &'a Moments<D>,
+    component: usize,
+}
+
+impl<const D: usize> Component<'_, D> {
+    #[inline(always)]
+    fn estimate(&self, grid: &mut Grid, estimate: &mut Estimate<D>) {
         let (mut degree, mut end, mut longest) = (0, 0, 0.0);
         for (d, stretch) in STRETCH.into_iter().enumerate() {
             // A degree is not tried if the span of all samples is too short for it.
@@ -66,9 +144,9 @@ impl<const D: usize> Values<D> {
                 continue;
             }
             let (tried, widest) = match d {
-                0 => self.grow::<3>(component, grid, tolerance),
-                1 => self.grow::<4>(component, grid, tolerance),
-                _ => self.grow::<5>(component, grid, tolerance),
+                0 => self.grow::<3>(grid),
+                1 => self.grow::<4>(grid),
+                _ => self.grow::<5>(grid),
             };
             if let Some(widest) = widest
                 && (end == 0 || widest >= stretch * longest)
@@ -78,57 +156,62 @@ impl<const D: usize> Values<D> {
         }
         match degree {
             0 => {}
-            2 => self.trim::<3>(component, grid, end, noise, origin, estimate),
-            3 => self.trim::<4>(component, grid, end, noise, origin, estimate),
-            _ => self.trim::<5>(component, grid, end, noise, origin, estimate),
+            2 => self.trim::<3>(grid, end, estimate),
+            3 => self.trim::<4>(grid, end, estimate),
+            _ => self.trim::<5>(grid, end, estimate),
         }
     }
 
     /// Step 1 for degree `N - 1`: the number of window lengths, from the first on, that fit within
     /// the tolerance; and the span of the longest that gives an estimate \[s\].
     ///
-    /// From one length to the next, the residuals of samples in both windows change by the
-    /// difference of the two polynomials. The old bound of the residuals plus a bound of that
-    /// change is mostly below the tolerance. Only where it is not, residuals are computed again.
-    pub(crate) fn grow<const N: usize>(
-        &self,
-        component: usize,
-        grid: &mut Grid,
-        tolerance: f64,
-    ) -> (usize, Option<f64>) {
-        let (values, moments) = (&self.values[component], &self.moments[component]);
+    /// The square sum of a window's residuals grows with its length, and bounds each of them. So
+    /// if it is within the square of the tolerance, that window and all shorter ones fit. Only
+    /// from the longest such window on, the residuals themselves are computed.
+    #[inline(always)]
+    fn grow<const N: usize>(&self, grid: &mut Grid) -> (usize, Option<f64>) {
+        let tolerance = TOLERANCE * self.noise;
         let (mut fitting, mut widest) = (0, None);
-        let (mut last, mut seen, mut bound) = ([0.0; N], 0, 0.0_f64);
-        for (number, moments) in moments.iter().enumerate().take(grid.tried) {
+        for number in (0..grid.tried).rev() {
+            let samples = grid.lengths[number];
+            let basis = &mut grid.bases[number];
+            if samples < N || basis.count(samples) < N {
+                continue;
+            }
+            let moments = &self.moments[number][self.component];
+            let products = basis.products(moments);
+            let all = moments[LANES - 1];
+            let mut left = all * (1.0 + ROUNDING);
+            for (product, per_norm) in products.iter().zip(&basis.per_norm).take(N) {
+                left -= product * product * per_norm;
+            }
+            // The comparisons use `<=`, so that NaN does not fit.
+            if left <= tolerance * tolerance {
+                (fitting, widest) = (number + 1, Some(grid.seconds(samples)));
+                break;
+            }
+        }
+        let certain = fitting;
+        for number in certain..grid.tried {
             let samples = grid.lengths[number];
             let basis = &mut grid.bases[number];
             if samples < N {
                 continue;
             }
-            if basis.reaches(N - 1, samples) {
-                let polynomial = basis.polynomial::<N>(moments);
-                let largest = |from: usize, to: usize| {
-                    let values = values.get(from..to).unwrap_or_default();
-                    let powers = grid.powers.get(from..to).unwrap_or_default();
-                    largest_residual(&polynomial, values, powers)
-                };
-                let mut change = [0.0; N];
-                for (change, (new, old)) in change.iter_mut().zip(polynomial.iter().zip(&last)) {
-                    *change = new - old;
+            if basis.count(samples) >= N {
+                let products = basis.products(&self.moments[number][self.component]);
+                let polynomial = basis.polynomial::<N>(&products);
+                let mut fits = true;
+                for (value, v) in self.values[..samples].iter().zip(&grid.times) {
+                    let mut fitted = 0.0;
+                    for coefficient in polynomial.iter().rev() {
+                        fitted = fitted * v + coefficient;
+                    }
+                    fits &= (value - self.origin - fitted).abs() <= tolerance;
                 }
-                let added = largest(seen, samples);
-                let kept = bound + magnitude_bound(&change, grid.extent(seen));
-                // The comparisons use `<=`, so that NaN does not fit.
-                bound = if kept <= tolerance {
-                    kept
-                } else {
-                    largest(0, seen)
-                }
-                .max(added);
-                if !(bound <= tolerance && added <= tolerance) {
+                if !fits {
                     break;
                 }
-                (last, seen) = (polynomial, samples);
                 widest = Some(grid.seconds(samples));
             }
             fitting = number + 1;
@@ -137,40 +220,39 @@ impl<const D: usize> Values<D> {
     }
 
     /// Step 3 for degree `N - 1`, on the first `end` lengths.
-    pub(crate) fn trim<const N: usize>(
-        &self,
-        component: usize,
-        grid: &mut Grid,
-        end: usize,
-        noise: f64,
-        origin: &[f64; D],
-        estimate: &mut Estimate<D>,
-    ) {
+    #[inline(always)]
+    fn trim<const N: usize>(&self, grid: &mut Grid, end: usize, estimate: &mut Estimate<D>) {
+        let component = self.component;
         let most = end.checked_sub(1).map_or(0, |last| grid.lengths[last]);
-        let sigma = noise / 3.0_f64.sqrt();
+        let sigma = self.noise / 3.0_f64.sqrt();
         let per_span = 1.0 / grid.span;
         let scale = [1.0, per_span, per_span * per_span];
-        let (mut best, mut deviation, mut samples) = ([f64::NAN; 3], [f64::NAN; 3], [0; 3]);
+        let (mut best, mut variance, mut samples) = ([f64::NAN; 3], [f64::NAN; 3], [0; 3]);
         let (mut low, mut high) = ([f64::NEG_INFINITY; 3], [f64::INFINITY; 3]);
         let mut meets = [true; 3];
         for number in 0..end {
             let length = grid.lengths[number];
             let basis = &mut grid.bases[number];
-            if (length as f64) < SHORTEST * most as f64 || !basis.reaches(N - 1, length) {
+            if (length as f64) < SHORTEST * most as f64 || basis.count(length) < N {
                 continue;
             }
-            // One degree more, to estimate the truncation error of this one.
-            let degree = if basis.reaches(N, length) { N } else { N - 1 };
-            basis.place(degree, grid.at);
-            let coefficients = basis.coefficients::<TERMS>(&self.moments[component][number]);
+            basis.place(grid.at);
+            let products = basis.products(&self.moments[number][component]);
             let mut value = [0.0; 3];
-            for (coefficient, here) in coefficients.iter().zip(&basis.here).take(N) {
-                for m in 0..3 {
-                    value[m] += coefficient * here[m];
+            let fitted = products.iter().zip(&basis.per_norm).take(N);
+            for ((product, per_norm), here) in fitted.zip(&basis.here) {
+                let coefficient = product * per_norm;
+                for (value, here) in value.iter_mut().zip(here) {
+                    *value += coefficient * here;
                 }
             }
+            // One degree more, to estimate the truncation error of this one.
+            let next = match basis.found > N {
+                true => products[N] * basis.per_norm[N],
+                false => 0.0,
+            };
             for m in 0..3 {
-                let s = sigma * scale[m] * basis.variance[N - 1][m].sqrt();
+                let s = sigma * scale[m] * basis.deviation[N - 1][m];
                 if !meets[m] || !s.is_finite() {
                     continue;
                 }
@@ -185,12 +267,8 @@ impl<const D: usize> Values<D> {
                 // Quantisation errors do not average out at rest, so the value is not better than
                 // one sample.
                 let s = if m == 0 { s.max(sigma) } else { s };
-                let omitted = if degree == N {
-                    coefficients[N] * basis.here[N][m] * scale[m]
-                } else {
-                    0.0
-                };
-                deviation[m] = (s * s + omitted * omitted).sqrt();
+                let omitted = next * basis.here[N.min(TERMS - 1)][m] * scale[m];
+                variance[m] = s * s + omitted * omitted;
                 samples[m] = length;
             }
         }
@@ -199,7 +277,7 @@ impl<const D: usize> Values<D> {
             &mut estimate.first,
             &mut estimate.second,
         ];
-        best[0] += origin[component];
+        best[0] += self.origin;
         for (place, best) in places.into_iter().zip(best) {
             place[component] = best;
         }
@@ -208,78 +286,11 @@ impl<const D: usize> Values<D> {
             &mut estimate.first_std,
             &mut estimate.second_std,
         ];
-        for (place, deviation) in places.into_iter().zip(deviation) {
+        for (place, deviation) in places.into_iter().zip(variance.map(f64::sqrt)) {
             place[component] = deviation;
         }
         for (kept, samples) in estimate.samples.iter_mut().zip(samples) {
             *kept = (*kept).min(samples);
         }
     }
-}
-
-/// The polynomial at `v`, by Horner's rule.
-#[inline(always)]
-pub(crate) fn evaluate<const N: usize>(polynomial: &[f64; N], v: f64) -> f64 {
-    polynomial.iter().rev().fold(0.0, |sum, c| sum * v + c)
-}
-
-/// The largest residual of the samples with these powers of `v`; infinite if one is NaN.
-#[inline(always)]
-pub(crate) fn largest_residual<const N: usize>(
-    polynomial: &[f64; N],
-    values: &[f64],
-    powers: &[[f64; TERMS]],
-) -> f64 {
-    // Four lanes: with a single one each step would wait for the one before.
-    let mut largest = [0.0_f64; 4];
-    let ((values4, values), (powers4, powers)) = (values.as_chunks::<4>(), powers.as_chunks::<4>());
-    let residual = |value: f64, powers: &[f64; TERMS]| {
-        let distance = (value - evaluate(polynomial, powers[1])).abs();
-        if distance.is_nan() {
-            f64::INFINITY
-        } else {
-            distance
-        }
-    };
-    for (values, powers) in values4.iter().zip(powers4) {
-        for i in 0..4 {
-            let distance = residual(values[i], &powers[i]);
-            largest[i] = if distance > largest[i] {
-                distance
-            } else {
-                largest[i]
-            };
-        }
-    }
-    for (value, powers) in values.iter().zip(powers) {
-        largest[0] = largest[0].max(residual(*value, powers));
-    }
-    largest[0].max(largest[1]).max(largest[2].max(largest[3]))
-}
-
-/// An upper bound of a polynomial's magnitude from `-extent` to 0: the largest magnitude at the
-/// extrema of the Chebyshev polynomial of degree 8, times `1 / cos(pi n / 16)` for degree `n` up to
-/// 4. (Ehlich, Zeller, "Schwankung von Polynomen zwischen Gitterpunkten", Math. Zeitschrift 86,
-/// 1964.)
-#[inline(always)]
-pub(crate) fn magnitude_bound<const N: usize>(polynomial: &[f64; N], extent: f64) -> f64 {
-    const PLACES: [f64; 9] = [
-        0.0,
-        0.038_060_233_744_356_62,
-        0.146_446_609_406_726_24,
-        0.308_658_283_817_455_1,
-        0.5,
-        0.691_341_716_182_544_9,
-        0.853_553_390_593_273_8,
-        0.961_939_766_255_643_4,
-        1.0,
-    ];
-    let mut largest = 0.0_f64;
-    for place in PLACES {
-        let value = evaluate(polynomial, -extent * place).abs();
-        largest = if value > largest { value } else { largest };
-    }
-    // 1 / cos(pi / 8), 1 / cos(3 pi / 16), 1 / cos(pi / 4), rounded up.
-    const BETWEEN: [f64; FITTED] = [1.083, 1.203, 1.415];
-    largest * BETWEEN[N - 1 - FIRST_DEGREE]
 }

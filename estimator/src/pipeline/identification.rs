@@ -308,13 +308,16 @@ impl OnlineIdentification {
                     } else {
                         [f64::NAN]
                     };
-                    let fit = self.differentiator.fit(highest, t, statistics, (sigma, 2));
+                    let fit = self.differentiator.fit(highest, statistics, (sigma, 2));
+                    let measured = (highest > 0).then(|| history.at(t, to)).flatten();
                     let mut measured_statistics = self.measured_statistics.iter_mut().skip(2 * dof);
                     let mut exact = |order: usize| {
                         let deviation = measured_statistics.next().map_or(0.0, |statistics| {
-                            self.differentiator.deviation(order, t, statistics)
+                            self.differentiator.deviation(order, statistics)
                         });
-                        (self.differentiator.value(order, t), deviation)
+                        let value =
+                            measured.and_then(|measured| measured.value.get(order).copied());
+                        (value.unwrap_or(f64::NAN), deviation)
                     };
                     let values = match highest {
                         0 => fit,
@@ -374,15 +377,14 @@ impl OnlineIdentification {
                             .get_mut(first + 3 * axis..first + 3 * axis + 3);
                         let [of_rate, of_angular, of_linear]: &mut [SignalStatistics; 3] =
                             own.and_then(|own| own.try_into().ok()).unwrap_or(&mut none);
-                        let gyro = self.differentiator.fit(3 + axis, t, of_rate, (sigma, 1));
+                        let gyro = self.differentiator.fit(3 + axis, of_rate, (sigma, 1));
                         let alpha = if self.differentiator.is_complete(6 + axis) {
-                            self.differentiator
-                                .fit(6 + axis, t, of_angular, (f64::NAN, 0))[0]
+                            self.differentiator.fit(6 + axis, of_angular, (f64::NAN, 0))[0]
                         } else {
                             gyro[1]
                         };
                         let acceleration =
-                            self.differentiator.fit(axis, t, of_linear, (f64::NAN, 0))[0];
+                            self.differentiator.fit(axis, of_linear, (f64::NAN, 0))[0];
                         let errors = self.current.errors.iter_mut().rev().skip(3 * axis);
                         for ((place, (value, error)), old) in [
                             (&mut measured.proper_acceleration[axis], acceleration),
@@ -638,7 +640,7 @@ mod tests {
             )
             .unwrap();
         assert!(centred.is_complete(0) && !centred.is_complete(1));
-        let found = centred.fit(0, centre, &mut statistics, (f64::NAN, 2));
+        let found = centred.fit(0, &mut statistics, (f64::NAN, 2));
         for (found, expected) in found.iter().zip([0.3, -0.5, 4.0]) {
             assert!(
                 (found.0 - expected).abs() < 1e-9,
@@ -674,7 +676,7 @@ mod tests {
                     Quality::UNTRUSTED_ENCODER,
                 )
                 .unwrap();
-            let [_, _, (acceleration, _)] = centred.fit(0, centre, &mut statistics, (f64::NAN, 2));
+            let [_, _, (acceleration, _)] = centred.fit(0, &mut statistics, (f64::NAN, 2));
             let error = (acceleration + size * w * w).abs();
             // The peak is 39.5 rad/s^2; a quadratic over the whole window would be off by 7.
             assert!(error < bound, "{error}");

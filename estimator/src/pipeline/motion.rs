@@ -27,6 +27,7 @@ use proprio_dynamics::{
     Solver, Structure,
 };
 use proprio_topics::Nanos;
+use pulp::{Arch, Simd, WithSimd};
 
 /// How long sensitivities are used before they are computed again.
 const POSTURE_PERIOD: Nanos = Nanos::from_millis(100);
@@ -60,6 +61,29 @@ pub(super) struct OperatingPoint<'a> {
     /// The solution, and the link where the kinematics start.
     pub(super) solver: &'a Solver,
     pub(super) base_link: usize,
+}
+
+/// Adds the squares of each column's first numbers, times its sigma.
+struct AddSquares<'a> {
+    columns: &'a [f64],
+    rows: usize,
+    sigma: &'a [f64],
+    sums: &'a mut [f64],
+}
+
+impl WithSimd for AddSquares<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        for (column, sigma) in self.columns.chunks_exact(self.rows).zip(self.sigma) {
+            if *sigma > 0.0 {
+                for (sum, s) in self.sums.iter_mut().zip(column) {
+                    *sum += (s * sigma) * (s * sigma);
+                }
+            }
+        }
+    }
 }
 
 fn has_jumped(before: &ContactSpec, now: &ContactSpec) -> bool {
@@ -182,13 +206,12 @@ impl MotionErrors {
                 self.compute_sensitivity(column, point)?;
             }
         }
-        for (column, sigma) in self.sensitivity.chunks_exact(self.rows).zip(&self.sigma) {
-            if *sigma > 0.0 {
-                for (sum, s) in self.deviation.iter_mut().zip(column) {
-                    *sum += (s * sigma).powi(2);
-                }
-            }
-        }
+        Arch::new().dispatch(AddSquares {
+            columns: &self.sensitivity,
+            rows: self.rows,
+            sigma: &self.sigma,
+            sums: &mut self.deviation,
+        });
         self.deviation.iter_mut().for_each(|sum| *sum = sum.sqrt());
         Ok(())
     }
@@ -290,8 +313,10 @@ impl MotionErrors {
         let first = self.deviation.len() + 6 * number;
         let mut covariance = Matrix6::zeros();
         for (column, sigma) in self.sensitivity.chunks_exact(self.rows).zip(&self.sigma) {
+            // Most joints do not move a sub-tree.
             if *sigma > 0.0
                 && let Some(six) = column.get(first..first + 6)
+                && *six != [0.0; 6]
             {
                 let six = Vector6::from_column_slice(six) * *sigma;
                 covariance += six * six.transpose();

@@ -393,15 +393,22 @@ impl SubtreeTest<'_> {
             declared
                 .chain(detected)
                 .for_each(|(column, weight)| least.push(column, weight));
-            least.factorise(&noise_factor(covariance));
-            let weight = least.unexplained();
-            let freedom = 6 - least.rank();
+            let lower = noise_factor(covariance);
+            let (square, residual, freedom) = if least.is_empty() {
+                // Nothing explains any of it.
+                let mut white = b;
+                lower.solve_lower_triangular_unchecked_mut(&mut white);
+                (white.norm_squared(), b, 6)
+            } else {
+                least.factorise(&lower);
+                // `b - A x` is what the weight gives back through the covariance.
+                let weighted = least.unexplained() * b;
+                (weighted.dot(&b), covariance * weighted, 6 - least.rank())
+            };
             if freedom == 0 {
                 return (f64::NAN, Vector6::zeros());
             }
-            // `b - A x` is what the weight gives back through the covariance.
-            let level = deviate((weight * b).dot(&b), freedom);
-            largest = (largest.0.max(level), covariance * weight * b);
+            largest = (largest.0.max(deviate(square, freedom)), residual);
         }
         largest
     }

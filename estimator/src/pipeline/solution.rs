@@ -196,10 +196,7 @@ impl Pipeline {
             let (mut reason, mut cause) = validity.reason_and_cause(dependence);
             let doubt = doubts.and_then(|doubts| doubts.get(dof));
             let least = doubt.map_or(0.0, |doubt| doubt.deviation);
-            let deviation = noise
-                .hypot(*model)
-                .hypot(*motion)
-                .hypot(*located)
+            let deviation = root_of_squares([*noise, *model, *motion, *located])
                 .max(least)
                 .max(*step);
             if reason == Reason::None && *certainty == Certainty::Assumed {
@@ -288,10 +285,7 @@ impl Pipeline {
             }
             let deviation: [f64; 6] = std::array::from_fn(|i| {
                 let motion = motion.get(i).copied().unwrap_or(0.0);
-                result.deviation[i]
-                    .hypot(model[i])
-                    .hypot(motion)
-                    .hypot(located[i])
+                root_of_squares([result.deviation[i], model[i], motion, located[i]])
                     .max(self.steps.contact(number, result.wrench.force_first()[i]))
             });
             let is_finite = result.wrench.is_finite() && deviation.iter().all(|x| x.is_finite());
@@ -329,4 +323,9 @@ impl Pipeline {
             };
         }
     }
+}
+
+/// The deviation of a sum of independent errors.
+pub(super) fn root_of_squares<const N: usize>(deviations: [f64; N]) -> f64 {
+    deviations.iter().map(|x| x * x).sum::<f64>().sqrt()
 }

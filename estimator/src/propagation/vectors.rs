@@ -15,13 +15,17 @@ pub(crate) type Lanes = [f32; LANES];
 /// The root of a link's covariance, upper triangular.
 pub(crate) type Root = [[f64; LINK_PARAMETERS]; LINK_PARAMETERS];
 
+/// Six numbers, padded with zeros to whole vector registers.
+pub(crate) type Six = [f64; 8];
+
 /// A covariance of a wrench [torque; force], symmetric.
-pub(crate) type Covariance6 = [[f64; 6]; 6];
+pub(crate) type Covariance6 = [Six; 6];
 
 /// A motion as six numbers [angular; linear].
-pub(crate) fn numbers(motion: &Motion) -> [f64; 6] {
+#[inline(always)]
+pub(crate) fn numbers(motion: &Motion) -> Six {
     let (n, v) = (&motion.angular, &motion.linear);
-    [n.x, n.y, n.z, v.x, v.y, v.z]
+    [n.x, n.y, n.z, v.x, v.y, v.z, 0.0, 0.0]
 }
 
 #[allow(clippy::cast_possible_truncation, reason = "single precision suffices")]
@@ -49,32 +53,78 @@ pub(crate) fn vectors_mut<S: Simd>(rows: &mut [Lanes]) -> &mut [S::f32s] {
     S::as_mut_simd_f32s(rows.as_flattened_mut()).0
 }
 
-/// `a^T C b`.
+/// `sum += a x`.
 #[inline(always)]
-pub(crate) fn bilinear_form(a: &[f64; 6], covariance: &Covariance6, b: &[f64; 6]) -> f64 {
-    let mut product = [0.0; 6];
-    for (row, a) in covariance.iter().zip(a) {
-        for (sum, value) in product.iter_mut().zip(row) {
-            *sum += a * value;
-        }
+fn add(sum: &mut Six, a: f64, x: &Six) {
+    for i in 0..8 {
+        sum[i] += a * x[i];
     }
-    product.iter().zip(b).map(|(x, y)| x * y).sum()
+}
+
+/// `sum += C`.
+#[inline(always)]
+pub(crate) fn add_covariance(sum: &mut Covariance6, covariance: &Covariance6) {
+    for (sum, row) in sum.iter_mut().zip(covariance) {
+        add(sum, 1.0, row);
+    }
+}
+
+/// `C a`.
+#[inline(always)]
+pub(crate) fn times(covariance: &Covariance6, a: &Six) -> Six {
+    let mut product = [0.0; 8];
+    for i in 0..6 {
+        add(&mut product, a[i], &covariance[i]);
+    }
+    product
+}
+
+/// `a . b`.
+#[inline(always)]
+pub(crate) fn dot(a: &Six, b: &Six) -> f64 {
+    let mut sum = 0.0;
+    for i in 0..6 {
+        sum += a[i] * b[i];
+    }
+    sum
 }
 
 /// Adds `A P A^T` of a link, `P = U^T U`.
+#[inline(always)]
 pub(crate) fn add_independent(out: &mut Covariance6, root: &Root, coefficients: &LinkRows) {
-    let columns: [[f64; 6]; LINK_PARAMETERS] =
-        std::array::from_fn(|c| std::array::from_fn(|axis| coefficients[axis][c]));
+    let [a, b, c, d, e, f] = coefficients;
+    let mut columns = [[0.0; 8]; LINK_PARAMETERS];
+    for (i, column) in columns.iter_mut().enumerate() {
+        *column = [a[i], b[i], c[i], d[i], e[i], f[i], 0.0, 0.0];
+    }
+    let mut sum = *out;
     for (first, row) in root.iter().enumerate() {
-        let mut wrench = [0.0; 6];
-        for (u, column) in row.iter().zip(&columns).skip(first) {
-            for (sum, value) in wrench.iter_mut().zip(column) {
-                *sum += u * value;
-            }
+        let mut wrench = [0.0; 8];
+        for c in first..LINK_PARAMETERS {
+            add(&mut wrench, row[c], &columns[c]);
         }
-        for (sums, a) in out.iter_mut().zip(wrench) {
-            for (sum, b) in sums.iter_mut().zip(wrench) {
-                *sum += a * b;
+        for i in 0..6 {
+            add(&mut sum[i], wrench[i], &wrench);
+        }
+    }
+    *out = sum;
+}
+
+/// Adds the covariance of a sensor's wrench at the origin, from the variances of its channels
+/// [torque; force].
+#[inline(always)]
+pub(crate) fn add_reading(out: &mut Covariance6, x_bm: &Pose, variances: &[f64; 6]) {
+    for channel in 0..3 {
+        let axis = x_bm.rotation.column(channel).into_owned();
+        let arm = x_bm.translation.cross(&axis);
+        let by_torque = [axis.x, axis.y, axis.z, 0.0, 0.0, 0.0, 0.0, 0.0];
+        let by_force = [arm.x, arm.y, arm.z, axis.x, axis.y, axis.z, 0.0, 0.0];
+        for (column, variance) in [
+            (by_torque, variances[channel]),
+            (by_force, variances[channel + 3]),
+        ] {
+            for i in 0..6 {
+                add(&mut out[i], variance * column[i], &column);
             }
         }
     }

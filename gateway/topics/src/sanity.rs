@@ -156,9 +156,12 @@ impl<const N: usize> Repeats<N> {
             self.all = false;
             return 0;
         }
-        axes.iter_mut()
-            .zip(values)
-            .for_each(|(axis, value)| axis.take(*value));
+        for (axis, value) in axes.iter_mut().zip(values) {
+            // One that is not measured, now or before, shows nothing.
+            if !(value.is_nan() && axis.last.is_nan()) {
+                axis.take(*value);
+            }
+        }
         // Axes that the sensor does not measure are not part of it.
         let measured = || axes.iter().filter(|axis| !axis.last.is_nan());
         let longest = measured().map(|axis| axis.run).max().unwrap_or(0);

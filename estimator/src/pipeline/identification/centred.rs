@@ -1,8 +1,9 @@
 //! Derivatives in the middle of a window of samples, for identification, which may wait for later
 //! samples.
 
-use crate::history::{History, KEPT};
+use crate::history::History;
 use proprio_topics::{Nanos, Quality, Reason};
+use pulp::{Arch, Simd, WithSimd};
 
 /// How far an identification instant lies before its estimate, and the half width of the window of
 /// samples that it is differentiated from.
@@ -32,30 +33,53 @@ pub(crate) const WINDOWS: [(f64, usize); 3] = [(0.32, 4), (0.6, 4), (1.0, 4)];
 /// than the noise variance of the narrower one. `b` is the difference between the two windows
 /// beyond their noise, as the root mean square of the last second ([`SignalStatistics`]). Where the
 /// noise of the samples is not known, the narrowest window is taken.
+///
+/// What depends on the stamps alone is kept for the next channel with equal stamps.
 pub(super) struct Centred {
-    pub(crate) count: usize,
-    pub(crate) width: usize,
-    pub(crate) stamps: [Nanos; KEPT],
-    pub(crate) values: [[f64; KEPT]; 9],
-    pub(crate) points: usize,
-    pub(crate) times: [f64; POINTS],
-    pub(crate) signal: [f64; POINTS],
-    pub(crate) current: [f64; POINTS],
-    pub(crate) previous: [f64; POINTS],
+    count: usize,
+    /// Number of samples in each point's mean.
+    share: usize,
+    points: usize,
+    times: [f64; POINTS],
+    signals: [[f64; POINTS]; 9],
+    /// The number of signals.
+    width: usize,
+    /// At rest, then in motion.
+    bases: [Basis; 1 + WINDOWS.len()],
+}
+
+/// The polynomials of one window.
+#[derive(Clone, Copy)]
+struct Basis {
+    /// The first point and their number, which is zero if there are too few.
+    first: usize,
+    points: usize,
+    degree: usize,
+    /// Of each point, padded to whole vectors.
+    values: [[f64; 8]; POINTS],
+    norms: [f64; 5],
+    /// Value and two derivatives of each at the instant.
+    at: [[f64; 3]; 5],
 }
 
 impl Default for Centred {
     fn default() -> Self {
+        let basis = Basis {
+            first: 0,
+            points: 0,
+            degree: 0,
+            values: [[0.0; 8]; POINTS],
+            norms: [0.0; 5],
+            at: [[0.0; 3]; 5],
+        };
         Self {
             count: 0,
-            width: 0,
-            stamps: [Nanos::ZERO; KEPT],
-            values: [[0.0; KEPT]; 9],
+            share: 1,
             points: 0,
             times: [0.0; POINTS],
-            signal: [0.0; POINTS],
-            current: [0.0; POINTS],
-            previous: [0.0; POINTS],
+            signals: [[0.0; POINTS]; 9],
+            width: 0,
+            bases: [basis; 1 + WINDOWS.len()],
         }
     }
 }
@@ -147,10 +171,15 @@ impl SignalStatistics {
 }
 
 impl Centred {
-    /// Copies the samples of a channel between two instants.
+    /// Averages the samples of a channel between two instants to at most [`POINTS`] points, with
+    /// times relative to the middle in units of [`DELAY`].
     ///
     /// # Errors
     /// Why they cannot be differentiated.
+    #[allow(
+        clippy::indexing_slicing,
+        reason = "there are at most POINTS groups, and nine signals"
+    )]
     pub(crate) fn gather<const D: usize>(
         &mut self,
         history: &History<D>,
@@ -159,25 +188,43 @@ impl Centred {
         max_silence: Nanos,
         untrusted: Quality,
     ) -> Result<(), Reason> {
-        (self.count, self.width) = (0, D);
+        let mut samples = history.within(from, to);
+        (self.count, self.width) = (samples.len(), D);
+        self.share = self.count.div_ceil(POINTS).max(1);
+        let centre = from + Nanos((to - from).0 / 2);
         let mut quality = Quality::GOOD;
         let mut newest = to;
         let mut gap = Nanos::ZERO;
-        for (t, value, q) in history.within(from, to) {
-            gap = gap.max(newest - t);
-            newest = t;
-            quality |= q;
-            if let Some(place) = self.stamps.get_mut(self.count) {
-                *place = t;
-            }
-            for (column, x) in self.values.iter_mut().zip(value) {
-                if let Some(place) = column.get_mut(self.count) {
-                    *place = *x;
+        let (mut points, mut is_same) = (0, true);
+        while samples.len() > 0 {
+            let (mut time, mut sums, mut count) = (0.0, [0.0; D], 0.0);
+            for (t, value, q) in samples.by_ref().take(self.share) {
+                gap = gap.max(newest - t);
+                newest = t;
+                quality |= q;
+                time += (t - centre).seconds();
+                for (sum, x) in sums.iter_mut().zip(value) {
+                    *sum += x;
                 }
+                count += 1.0;
             }
-            self.count += 1;
+            let of = 1.0 / count;
+            let time = time * of / DELAY.seconds();
+            is_same &= self.times[points] == time;
+            self.times[points] = time;
+            for (signal, sum) in self.signals.iter_mut().zip(sums) {
+                signal[points] = sum * of;
+            }
+            points += 1;
         }
         gap = gap.max(newest - from);
+        if !is_same || points != self.points {
+            self.points = points;
+            let windows = [REST_WINDOW].into_iter().chain(WINDOWS);
+            for (basis, (reach, degree)) in self.bases.iter_mut().zip(windows) {
+                basis.compute(&self.times[..points], reach, degree);
+            }
+        }
         match Reason::of_quality(quality, untrusted) {
             Reason::None if history.newest().is_none() => Err(Reason::NeverSeen),
             Reason::None if self.count < MIN_SAMPLES => Err(Reason::Starting),
@@ -190,50 +237,33 @@ impl Centred {
 
     /// Whether every sample has this signal.
     pub(crate) fn is_complete(&self, number: usize) -> bool {
-        let column = self.values.get(number).filter(|_| number < self.width);
-        let column = column.and_then(|column| column.get(..self.count));
-        column.is_some_and(|column| !column.is_empty() && column.iter().all(|x| x.is_finite()))
+        let signal = self.signals.get(number).filter(|_| number < self.width);
+        let signal = signal.and_then(|signal| signal.get(..self.points));
+        signal.is_some_and(|signal| !signal.is_empty() && signal.iter().all(|x| x.is_finite()))
     }
 
-    /// A signal at an instant, interpolated linearly.
-    pub(crate) fn value(&self, number: usize, t: Nanos) -> f64 {
-        let (Some(column), stamps) = (self.values.get(number), &self.stamps) else {
-            return f64::NAN;
-        };
-        // Newest first.
-        let pairs = stamps.iter().zip(column).take(self.count);
-        let mut later: Option<(Nanos, f64)> = None;
-        for (&stamp, &value) in pairs {
-            if stamp <= t {
-                return later.map_or(value, |(after, next)| {
-                    value + (t - stamp).seconds() / (after - stamp).seconds() * (next - value)
-                });
-            }
-            later = Some((stamp, value));
-        }
-        f64::NAN
-    }
-
-    /// A signal at `t`: value, first and second derivative, each with its standard error.
+    /// A signal in the middle: value, first and second derivative, each with its standard error.
     ///
     /// `statistics` are those of the signal. `by` selects the window: the standard deviation of the
     /// samples, NaN if it is not known, and the order of the derivative that matters. The standard
     /// errors use the noise at rest, because in motion a polynomial's residual is not noise alone.
     /// They are zero before the first instant at rest.
     pub(crate) fn fit(
-        &mut self,
+        &self,
         number: usize,
-        t: Nanos,
         statistics: &mut SignalStatistics,
         by: (f64, usize),
     ) -> [(f64, f64); 3] {
         const NONE: (f64, f64) = (f64::NAN, 0.0);
-        if self.count < MIN_SAMPLES || number >= self.values.len() {
+        if self.count < MIN_SAMPLES || number >= self.signals.len() {
             return [NONE; 3];
         }
-        let sigma = by.0 / (self.average(number, t) as f64).sqrt();
-        let rest = self.polynomial(REST_WINDOW.0, REST_WINDOW.1);
-        let [short, middle, wide] = WINDOWS.map(|(reach, degree)| self.polynomial(reach, degree));
+        let sigma = by.0 / (self.share as f64).sqrt();
+        let signal = &self.signals[number];
+        let [rest, short, middle, wide] = Arch::new().dispatch(Fits {
+            bases: &self.bases,
+            signal,
+        });
         // A fit with few degrees of freedom can seem exact by chance.
         let middle = middle.filter(|fit| fit.points > WINDOWS[1].1 + MIN_FREEDOM);
         let short = short.filter(|fit| fit.points > WINDOWS[0].1 + 3);
@@ -272,86 +302,54 @@ impl Centred {
         })
     }
 
-    /// Standard deviation of a signal's samples as found at rest, updated with those about `t`;
+    /// Standard deviation of a signal's samples as found at rest, updated with these;
     /// `statistics` as for [`Centred::fit`].
-    pub(crate) fn deviation(
-        &mut self,
-        number: usize,
-        t: Nanos,
-        statistics: &mut SignalStatistics,
-    ) -> f64 {
-        self.fit(number, t, statistics, (f64::NAN, 0));
+    pub(crate) fn deviation(&self, number: usize, statistics: &mut SignalStatistics) -> f64 {
+        self.fit(number, statistics, (f64::NAN, 0));
         // The polynomial was fitted to means of this many samples.
-        let share = self.count.div_ceil(POINTS).max(1);
         if statistics.rest_variance.is_nan() {
             0.0
         } else {
-            (statistics.rest_variance * share as f64).sqrt()
+            (statistics.rest_variance * self.share as f64).sqrt()
         }
     }
+}
 
-    /// Averages the samples to at most [`POINTS`] points, with times relative to `t` in units of
-    /// [`DELAY`]. Returns the number of samples in each point's mean.
-    #[allow(
-        clippy::indexing_slicing,
-        reason = "count is at most the arrays' length, and there are at most POINTS groups"
-    )]
-    pub(crate) fn average(&mut self, number: usize, t: Nanos) -> usize {
-        let n = self.count.min(KEPT);
-        let share = n.div_ceil(POINTS).max(1);
-        self.points = 0;
-        let groups = self.stamps[..n]
-            .chunks(share)
-            .zip(self.values[number][..n].chunks(share));
-        for (stamps, values) in groups {
-            let of = 1.0 / stamps.len() as f64;
-            let time: f64 = stamps.iter().map(|stamp| (*stamp - t).seconds()).sum();
-            self.times[self.points] = time * of / DELAY.seconds();
-            self.signal[self.points] = values.iter().sum::<f64>() * of;
-            self.points += 1;
-        }
-        share
-    }
-
-    /// The least-squares polynomial of this degree on the points within `reach` of the instant.
+impl Basis {
+    /// The polynomials up to this degree on the points within `reach` of the instant.
     #[allow(clippy::indexing_slicing, reason = "as many points as were averaged")]
-    pub(crate) fn polynomial(&mut self, reach: f64, degree: usize) -> Option<Fit> {
+    fn compute(&mut self, times: &[f64], reach: f64, degree: usize) {
+        (self.points, self.degree) = (0, degree);
         // Newest first.
-        let first = self.times[..self.points].iter().position(|u| *u <= reach)?;
-        let last = self.times[..self.points]
-            .iter()
-            .rposition(|u| *u >= -reach)?;
+        let first = times.iter().position(|u| *u <= reach);
+        let last = times.iter().rposition(|u| *u >= -reach);
+        let (Some(first), Some(last)) = (first, last) else {
+            return;
+        };
         if last < first + degree {
-            return None;
+            return;
         }
-        let (times, values) = (&self.times[first..=last], &self.signal[first..=last]);
+        self.first = first;
+        let times = &times[first..=last];
         let n = times.len();
-        let (current, previous) = (&mut self.current[..n], &mut self.previous[..n]);
-        current.fill(1.0);
-        previous.fill(0.0);
+        let (mut current, mut previous) = ([1.0; POINTS], [0.0; POINTS]);
         // The orthogonal polynomials of this degree and of the one below, each with its first two
         // derivatives, at the instant.
         let (mut at, mut below) = ([1.0, 0.0, 0.0], [0.0; 3]);
-        let (mut result, mut squares, mut norm_below) = ([0.0; 3], [0.0; 3], 1.0);
-        let level = values[0];
-        let mut left: f64 = values.iter().map(|x| (x - level) * (x - level)).sum();
+        let mut norm_below = 1.0;
         for k in 0..=degree {
-            let (mut norm, mut moment, mut product) = (0.0, 0.0, 0.0);
-            for ((p, u), x) in current.iter().zip(times).zip(values) {
+            let (mut norm, mut moment) = (0.0, 0.0);
+            for ((p, u), values) in current.iter().zip(times).zip(&mut self.values) {
+                values[k] = *p;
                 norm += p * p;
                 moment += u * p * p;
-                product += (x - level) * p;
             }
             if norm < 1e-14 * n as f64 {
-                return None;
+                return;
             }
-            left -= product * product / norm;
-            for ((sum, derivative_square), value) in result.iter_mut().zip(&mut squares).zip(at) {
-                *sum += product / norm * value;
-                *derivative_square += value * value / norm;
-            }
+            (self.norms[k], self.at[k]) = (norm, at);
             let (a, b) = (moment / norm, if k == 0 { 0.0 } else { norm / norm_below });
-            for ((p, old), u) in current.iter_mut().zip(previous.iter_mut()).zip(times) {
+            for ((p, old), u) in current.iter_mut().zip(&mut previous).zip(times) {
                 let next = (u - a) * *p - b * *old;
                 *old = std::mem::replace(p, next);
             }
@@ -363,8 +361,34 @@ impl Centred {
             below = std::mem::replace(&mut at, next);
             norm_below = norm;
         }
+        self.points = n;
+    }
+
+    /// The least-squares polynomial of a signal.
+    #[inline(always)]
+    #[allow(clippy::indexing_slicing, reason = "as many points as were averaged")]
+    fn fit(&self, signal: &[f64; POINTS]) -> Option<Fit> {
+        let (n, signal) = (self.points, &signal[self.first..]);
+        let level = signal.first().filter(|_| n > 0)?;
+        let (mut products, mut left) = ([0.0; 8], 0.0);
+        for (x, values) in signal[..n].iter().zip(&self.values) {
+            let x = x - level;
+            left += x * x;
+            for k in 0..8 {
+                products[k] += x * values[k];
+            }
+        }
+        let (mut result, mut squares) = ([0.0; 3], [0.0; 3]);
+        let fitted = products.iter().zip(&self.norms).take(self.degree + 1);
+        for ((product, norm), at) in fitted.zip(&self.at) {
+            left -= product * product / norm;
+            for ((result, square), value) in result.iter_mut().zip(&mut squares).zip(at) {
+                *result += product / norm * value;
+                *square += value * value / norm;
+            }
+        }
         let scale = DELAY.seconds();
-        let freedom = (n - degree - 1) as f64;
+        let freedom = (n - self.degree - 1) as f64;
         Some(Fit {
             at: [
                 result[0] + level,
@@ -381,6 +405,27 @@ impl Centred {
             freedom: freedom.max(1.0),
             points: n,
         })
+    }
+}
+
+/// The polynomials of all windows for a signal.
+struct Fits<'a> {
+    bases: &'a [Basis; 1 + WINDOWS.len()],
+    signal: &'a [f64; POINTS],
+}
+
+impl WithSimd for Fits<'_> {
+    type Output = [Option<Fit>; 1 + WINDOWS.len()];
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) -> Self::Output {
+        let [rest, short, middle, wide] = self.bases;
+        [
+            rest.fit(self.signal),
+            short.fit(self.signal),
+            middle.fit(self.signal),
+            wide.fit(self.signal),
+        ]
     }
 }
 
