@@ -28,8 +28,8 @@
 //! ([`Propagation::set_calibration_point`]).
 //!
 //! `W` is most of the work, and changes as the motion does: it is computed with the first
-//! estimate of each [`HELD`], of the stamps, and when base or covariance change, and held in
-//! between. All else is of the instant.
+//! estimate of each [`HELD`], of the stamps, and when base, covariance or the reading of a sensor
+//! with uncertain calibration change, and held in between. All else is of the instant.
 //!
 //! Loops over rows use the widest vector instructions of the processor, in a portable build too.
 //!
@@ -178,6 +178,10 @@ impl Propagation {
         {
             if matches!(column_block.what, Member::Sensor(own, _) if own == sensor) {
                 column_block.set_calibration_point(&corrected, kelvin);
+                // A reading may change at once.
+                if column_block.calibration.is_some() {
+                    self.held = None;
+                }
             }
         }
     }

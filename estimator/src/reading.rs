@@ -56,11 +56,11 @@ impl ReadingError {
 /// Reads a sample log (columns: [`proprio_topics::csv`]) and aligns its channels.
 ///
 /// Rows that cannot be read are skipped. Samples whose stamps go backward are excluded, as few as
-/// possible. [`Dataset::defects`] lists both.
+/// possible. [`Dataset::findings`] lists both.
 ///
 /// # Errors
 /// [`ReadingError`]: it is no log, or lacks a joint that is not locked, or the IMU of the base. A
-/// missing F/T sensor is a defect here; `proprio identify` refuses the log before.
+/// missing F/T sensor is a finding here; `proprio identify` refuses the log before.
 pub fn dataset(
     robot: &Robot,
     name: &str,

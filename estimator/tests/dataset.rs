@@ -220,8 +220,6 @@ fn log_of(
     }
 }
 
-/// In a log with large gaps and separate rows for torques, the rate is that of the torques while
-/// they are present.
 fn rms(errors: impl Iterator<Item = f64>) -> f64 {
     let (sum, count) = errors.fold((0.0, 0.0), |(s, n), e| (s + e * e, n + 1.0));
     (sum / count).sqrt()

@@ -207,6 +207,7 @@ proptest! {
         for (sensor, _) in readings.iter().enumerate() {
             got.set_calibration_point(sensor, &random.wrench(), 3.0);
         }
+        got.update(&structure, &solver, &kinematics, Nanos::ZERO).unwrap();
         for (sensor, reading) in readings.iter().enumerate() {
             got.set_calibration_point(sensor, reading, kelvin);
         }

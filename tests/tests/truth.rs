@@ -35,7 +35,8 @@ fn a_valid_torque_is_true() {
     }
     let kept = TROUBLES.iter().filter(|(name, _)| !OPEN.contains(name));
     for (name, _) in kept {
-        for (seed, outcome) in runs(name, [1, 3].into_iter()) {
+        // The robot of seed 5 stands on a foot.
+        for (seed, outcome) in runs(name, [1, 3, 5].into_iter()) {
             assert!(!outcome.is_broken(), "{name}, seed {seed}: {outcome:#?}");
         }
     }
@@ -55,11 +56,8 @@ fn torques_are_valid_where_nothing_is_wrong() {
                 outcome.use_of() >= 0.95,
                 "{name}, seed {seed}: {outcome:#?}"
             );
-            let joints = outcome.torques[0] / 4000;
-            assert!(
-                outcome.torques[0] >= joints * 4000 && joints > 2,
-                "{outcome:#?}"
-            );
+            assert!(!outcome.is_broken(), "{name}, seed {seed}: {outcome:#?}");
+            assert!(outcome.torques[0] > 12_000, "{outcome:#?}");
         }
     }
 }

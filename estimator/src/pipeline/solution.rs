@@ -4,6 +4,7 @@
 use super::Pipeline;
 use super::motion::OperatingPoint;
 use super::residuals;
+use crate::pipeline::estimate::root_of_squares;
 use crate::pipeline::validity::ValidityCheck;
 use proprio_dynamics::spatial::Pose;
 use proprio_dynamics::{Certainty, ContactSet, Dependence, DofSet, FrameMotion, JointState};
@@ -196,9 +197,8 @@ impl Pipeline {
             let (mut reason, mut cause) = validity.reason_and_cause(dependence);
             let doubt = doubts.and_then(|doubts| doubts.get(dof));
             let least = doubt.map_or(0.0, |doubt| doubt.deviation);
-            let deviation = root_of_squares([*noise, *model, *motion, *located])
-                .max(least)
-                .max(*step);
+            let own = root_of_squares([*noise, *model, *motion, *located]);
+            let deviation = own.max(least).max(*step);
             if reason == Reason::None && *certainty == Certainty::Assumed {
                 reason = Reason::Undetermined;
             }
@@ -233,7 +233,7 @@ impl Pipeline {
             if reason == Reason::None && least.is_infinite() {
                 reason = Reason::Uncertain;
             }
-            if !is_solved || !torque.is_finite() || deviation.is_nan() {
+            if !is_solved || !torque.is_finite() || own.is_nan() {
                 (reason, cause) = (Reason::NotFinite, NO_CAUSE);
             }
             let is_valid = reason == Reason::None;
@@ -323,9 +323,4 @@ impl Pipeline {
             };
         }
     }
-}
-
-/// The deviation of a sum of independent errors.
-pub(super) fn root_of_squares<const N: usize>(deviations: [f64; N]) -> f64 {
-    deviations.iter().map(|x| x * x).sum::<f64>().sqrt()
 }

@@ -336,10 +336,9 @@ mod tests {
             instant.estimate.standard_deviation = 0.4;
         }
         assert_eq!(compared.untrue(), [2]);
-        let torque = std::mem::replace(&mut compared.joints[0][1].estimate.torque, f64::NAN);
-        compared.joints[0][1].estimate.valid = 1;
+        compared.joints[0][0].estimate.valid = 1;
         assert_eq!(compared.untrue(), [3]);
-        compared.joints[0][1].estimate.torque = torque;
+        compared.joints[0][0].estimate.valid = 0;
         compared.joints[0][0].truth = 202.0;
         assert_eq!(compared.untrue(), [0]);
         assert_eq!(Phase::json(None, &[]), Json::Null);

@@ -14,8 +14,8 @@
 //! (`evidence.rs`).
 //!
 //! Ticks count in which something moves, for at rest nothing separates the hypotheses, and whose
-//! rows are learnt. Residuals beyond the stated noise are a misfit, which lasts: a second of them
-//! counts as one tick.
+//! rows are learnt. Residuals beyond the stated noise are a misfit, which lasts: three seconds of
+//! them count as one tick.
 //!
 //! # What follows
 //! Unless a hypothesis is less likely than an error beyond the promised four deviations, its
@@ -27,7 +27,8 @@
 //!
 //! The setup is taken as stated until something contradicts it: the prior odds of each hypothesis
 //! about it are small. Those of a contact since the start are not. Before the first two seconds of
-//! motion nothing is known about it, and the torques that it matters to are unknown.
+//! motion nothing is known about it, and the torques that it matters to are unknown. In the first
+//! second no torque is valid.
 
 mod evidence;
 pub(crate) mod hypothesis;
@@ -57,10 +58,14 @@ const POSTURES: usize = 20;
 const APART: usize = 5;
 /// Ticks in motion from which on torques are compared: those of 2 s.
 const SHOWN: usize = 20;
+/// Motion before which a component's solution is not used \[s\]. What is learnt from a few postures
+/// looks certain, and what is wrong with the setup does not show yet: of robots on a foot, gravity
+/// that is 20 degrees off shows within a second.
+const BEGUN: f64 = 1.0;
 /// Ticks that wait for the gate, at most: those of 3 s.
 const MOST_WAITING: usize = 30;
 /// The last ticks that are kept, those of 6 s: of them, the ones that a change is found in.
-const LATEST: usize = 60;
+pub(crate) const LATEST: usize = 60;
 /// Times that a change is weighed, in which its noise converges.
 const WEIGHINGS: usize = 10;
 /// Period of the ticks.
@@ -278,9 +283,9 @@ impl Bank {
         self.weigh();
     }
 
-    /// Whether a contact explains the readings of these slots better than other offsets do: a steady
-    /// force along the axes of the base. `ticks` are the newest. A push is more usual than a jump of
-    /// an offset, as much as no contact at the start than one.
+    /// Whether a contact explains the readings of these slots better than other offsets do: a
+    /// steady force along the axes of the base. `ticks` are the newest. A push is more usual than a
+    /// jump of an offset, as much as no contact at the start than one.
     ///
     /// A jump concerns some sub-trees of the component, a contact one; the others are as before.
     pub(crate) fn is_rather_a_contact(
@@ -368,9 +373,9 @@ impl Bank {
             };
             // The first postures of a motion do not show yet what is wrong, nor how far apart the
             // torques will be.
-            let ticks = unit.fits[0].ticks();
-            let is_begun = ticks > 0 && ticks < SHOWN;
-            let is_shown = ticks >= SHOWN && disturbed & bit(unit.component) == 0;
+            let learnt = solution.components[unit.component].motion;
+            let is_begun = learnt > 0.0 && learnt < BEGUN;
+            let is_shown = unit.fits[0].ticks() >= SHOWN && disturbed & bit(unit.component) == 0;
             if is_doubtful || is_begun || !is_settled {
                 let beyond = place.dofs(&measured_with(unit, units), None);
                 beyond.iter().for_each(|&dof| add(dof, f64::INFINITY));

@@ -2,7 +2,7 @@
 //! use.
 
 use crate::linear::information::{Information, Panel};
-use crate::online::bank::{self, Bank, Tick};
+use crate::online::bank::{self, Bank, LATEST, Tick};
 use crate::online::channel::{Channel, SecondMean};
 use crate::online::component::{Component, channels};
 use crate::online::parameters::Parameters;
@@ -523,7 +523,17 @@ impl Part {
                 let _ = panel.push_row(&dense, right);
             }
             self.rejected_slots.extend(rows.slots());
+            self.rejected_slots.dedup();
         }
+        // The bank has no older ticks.
+        let kept = (LATEST as f64 * bank::TICK.seconds() / self.period) as i64;
+        let newest = self
+            .rejected_slots
+            .iter()
+            .copied()
+            .max()
+            .unwrap_or_default();
+        self.rejected_slots.retain(|slot| slot + kept > newest);
         let _ = self.rejected_information.absorb(&mut panel);
         self.rejected_time += SOLVE.seconds();
         let tilted: Vec<usize> = (self.cosines.iter().enumerate())

@@ -49,8 +49,8 @@ impl Columns {
             .collect()
     }
 
-    /// The smallest wrench on the sub-tree that is what the reference leaves of its rows. Unlike the
-    /// rows, it does not depend on how the contacts were eliminated.
+    /// The smallest wrench on the sub-tree that is what the reference leaves of its rows. Unlike
+    /// the rows, it does not depend on how the contacts were eliminated.
     pub(super) fn wrench_left(&self, rows: &SubTreeRegressor) -> Option<Vector6<f64>> {
         let projections = projections(rows);
         let square = &projections * projections.transpose();
@@ -186,8 +186,6 @@ pub(super) struct Fit {
     gram: DMatrix<f64>,
     rows: f64,
     ticks: usize,
-    /// The number of ticks from which on it is weighed again.
-    weigh_from: usize,
     /// The log-evidence of unknowns that were forgotten.
     forgotten: f64,
 }
@@ -207,7 +205,6 @@ impl Fit {
             gram: DMatrix::zeros(0, 0),
             rows: 0.0,
             ticks: 0,
-            weigh_from: 1,
             forgotten: 0.0,
         }
     }
@@ -350,16 +347,6 @@ impl Fit {
             self.gram.column_mut(column).fill(0.0);
         }
         self.forgotten -= 0.5 * log_det(&factor, noise);
-        self.weigh_from = 0;
-    }
-
-    /// Finds each branch's most likely noise, and its evidence, if a twentieth more is known than
-    /// the last time, or [`LASTING`] ticks.
-    pub(super) fn weigh_news(&mut self, columns: &Columns) {
-        if self.ticks >= self.weigh_from {
-            self.weigh(columns);
-            self.weigh_from = self.ticks + (self.ticks / 20).clamp(1, LASTING as usize);
-        }
     }
 
     /// Finds each branch's most likely noise, and its evidence.
@@ -390,8 +377,8 @@ impl Fit {
         }
     }
 
-    /// What is estimated beside `[d | s]`, along the axis where it is largest: a share of [`FORCE`],
-    /// or what [`View::at`] takes.
+    /// What is estimated beside `[d | s]`, along the axis where it is largest: a share of
+    /// [`FORCE`], or what [`View::at`] takes.
     ///
     /// Of a force it is the root mean square. How uncertain a view is counts in the deviation of
     /// torques instead: the turn of a standing base about gravity is never known, and matters to

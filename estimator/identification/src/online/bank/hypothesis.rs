@@ -97,7 +97,7 @@ impl Hypothesis {
     /// The same, before anything is estimated.
     #[must_use]
     pub fn without_estimate(mut self) -> Self {
-        self.view = self.view.at(&vec![0.0; self.view.unknowns()]);
+        self.view = self.view.at(&[0.0; 3][..self.view.unknowns()]);
         self
     }
 

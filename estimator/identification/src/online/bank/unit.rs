@@ -39,6 +39,8 @@ pub(super) struct Unit {
     /// The first branch of the first one is that everything is as stated.
     pub(super) fits: Vec<Fit>,
     at_start: Vec<Fit>,
+    /// The number of ticks from which on it is weighed again.
+    weigh_from: usize,
     /// How much a tick counts: what exceeds the stated noise is a misfit, which lasts.
     share: f64,
 }
@@ -62,6 +64,7 @@ impl Unit {
             columns,
             fits: at_start.clone(),
             at_start,
+            weigh_from: 1,
             share: 1.0,
         }
     }
@@ -69,6 +72,7 @@ impl Unit {
     /// Drops everything that was learnt.
     pub(super) fn begin_anew(&mut self) {
         self.fits.clone_from(&self.at_start);
+        self.weigh_from = 1;
     }
 
     /// What is stated; with other offsets from now on; then with each contact that may begin now.
@@ -99,12 +103,19 @@ impl Unit {
     /// Forgets these unknowns: they have other values from now on.
     pub(super) fn forget(&mut self, unknowns: &[usize]) {
         self.fits.iter_mut().for_each(|fit| fit.forget(unknowns));
+        self.weigh_from = 0;
     }
 
-    /// Brings the evidence of all hypotheses up to date.
+    /// Brings the evidence of all hypotheses up to date, if a twentieth more is known than the last
+    /// time, or [`LASTING`] ticks more.
     pub(super) fn weigh(&mut self) {
+        let ticks = self.fits[0].ticks();
+        if ticks < self.weigh_from {
+            return;
+        }
+        self.weigh_from = ticks + (ticks / 20).clamp(1, LASTING as usize);
         let Self { columns, fits, .. } = self;
-        fits.iter_mut().for_each(|fit| fit.weigh_news(columns));
+        fits.iter_mut().for_each(|fit| fit.weigh(columns));
         let of_all = fits.iter().flat_map(|fit| &fit.branches);
         let likeliest = of_all
             .filter(|branch| !branch.is_refuted)
