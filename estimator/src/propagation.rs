@@ -27,9 +27,9 @@
 //! `T`: `U_s` becomes `U_s - U_E r + U_k (T - T0)` at each instant
 //! ([`Propagation::set_calibration_point`]).
 //!
-//! `W` is most of the work, and changes as the motion does: it is computed with the first
-//! estimate of each [`HELD`], of the stamps, and when base, covariance or the reading of a sensor
-//! with uncertain calibration change, and held in between. All else is of the instant.
+//! `W` is most of the work, and changes as the motion does: it is computed with the first estimate
+//! of each 5 ms, of the stamps, and when base, covariance or the reading of a sensor with uncertain
+//! calibration change, and held in between. All else is of the instant.
 //!
 //! Loops over rows use the widest vector instructions of the processor, in a portable build too.
 //!

@@ -8,7 +8,6 @@ const OPEN: &[&str] = &[
     "push where no contact is",
     "payload taken",
     "F/T gain 8 % off",
-    "F/T late 100 ms",
     "F/T saturated",
     "F/T sign",
     "F/T turned 5 deg",
@@ -16,6 +15,7 @@ const OPEN: &[&str] = &[
     "encoder in degrees",
     "encoder gear 20 % off",
     "encoder drifts",
+    "encoders swapped",
 ];
 
 /// The runs of `name` with these seeds; a robot without such a channel has none.
