@@ -32,59 +32,38 @@
 //! - Gravity, if the base stands still: its direction that leaves the least squares, if it is
 //!   nearer to another axis than to the configured one.
 
+mod fault;
+mod mounting;
+
 use crate::dataset::Role;
 use crate::dataset::observation::{Annotated, Observation};
-use crate::finding::{Finding, FindingCode, Severity};
+use crate::diagnose::configuration::fault::{Compared, Fault, slides, torque_faults, wrench_fault};
+use crate::diagnose::configuration::mounting::{Mounting, mountings};
+use crate::finding::{Finding, FindingCode};
 use crate::hypothesis::accepted;
 use crate::linear::nuisance::NuisanceFilter;
 use crate::measurement::channels::{attribute_to, sensor_name};
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::nuisance_prior;
 use crate::measurement::rows::Rows;
-use crate::online::bank::hypothesis::{View, quarter_turns};
+use crate::online::bank::hypothesis::{GRAVITY, View};
 use crate::parallel;
 use crate::robot::{BaseMotion, IdentificationInput, Robot};
 use crate::training::TrainingLog;
-use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Rotation3, Vector3, Vector6};
-use proprio_dynamics::model::{JointKind, MeasurementDirection, MeasurementFrame};
-use proprio_dynamics::spatial::{Mat3, Pose, Vec3, Wrench};
-use proprio_dynamics::{DynamicsError, SensorCut, Structure};
+use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
+use proprio_dynamics::spatial::Vec3;
+use proprio_dynamics::{DynamicsError, Structure};
 use std::ops::ControlFlow;
 
 /// Observations of a log that are used at most, and how many share offsets and friction.
 const MAX_OBSERVATIONS: usize = 2000;
 const STRETCH: usize = 500;
 
-/// Fewest values for a comparison with the prediction.
-const MIN_VALUES: f64 = 50.0;
-
-/// Readings above this multiple of the prediction have wrong units, and joint torques below its
-/// inverse.
-const FACTOR: f64 = 30.0;
-
-/// So have F/T readings below the prediction by this factor ...
-const SMALL: f64 = 300.0;
-
-/// ... and joint torques above this multiple of the largest prediction for any joint of the kind.
-const BEYOND: f64 = 100.0;
-
-/// Predicted joint torques below this fraction of the largest one are dominated by CAD's errors.
-const SLIGHT: f64 = 0.01;
-
-/// A ratio of F/T readings beyond this, or below its inverse, is reported.
-const ODD: f64 = 3.0;
-
-/// Least magnitude of the correlation of readings and prediction: they share half of the squares.
-const CORRELATED: f64 = 0.7;
-
 /// F/T readings are compared if the prediction's RMS exceeds this multiple of the noise.
 const ABOVE_NOISE: f64 = 5.0;
 
 /// Lever of the whole robot's weight \[m\].
 const LEVER: f64 = 1.0;
-
-/// Standard gravity \[m/s^2\].
-const GRAVITY: f64 = 9.80665;
 
 /// Fraction of the squared readings that CAD leaves unexplained, above which errors of the inertial
 /// parameters are not the cause: parameters wrong by a third leave a ninth.
@@ -189,23 +168,6 @@ impl Group {
                 .for_each(|&j| self.gram[(j, i)] += line[i] * line[j]);
         }
         self.rows += 1.0;
-    }
-
-    /// The reading, in these columns, and what CAD predicts for it.
-    fn compare(&self, reading: &DVector<f64>) -> Option<Compared> {
-        let mut prediction = reading.clone();
-        *prediction.iter_mut().next_back()? -= 1.0;
-        let product = |a: &DVector<f64>, b: &DVector<f64>| a.dot(&(&self.gram * b));
-        let [yy, xx, xy] = [
-            product(reading, reading),
-            product(&prediction, &prediction),
-            product(reading, &prediction),
-        ];
-        (self.rows >= MIN_VALUES && xx > 0.0).then(|| Compared {
-            predicted: (xx / self.rows).sqrt(),
-            ratio: (yy.max(0.0) / xx).sqrt(),
-            correlation: xy / (yy * xx).sqrt().max(f64::MIN_POSITIVE),
-        })
     }
 }
 
@@ -399,7 +361,7 @@ impl Evidence {
         torque[self.width() - 2] = 1.0;
         let compared: Vec<_> = self.groups[self.joint(0)..]
             .iter()
-            .map(|group| group.compare(&torque))
+            .map(|group| Compared::new(&group.gram, group.rows, &torque))
             .collect();
         let slides: Vec<bool> = (0..compared.len()).map(|dof| slides(robot, dof)).collect();
         let faults = torque_faults(&compared, &slides).into_iter().enumerate();
@@ -423,7 +385,8 @@ impl Evidence {
                         let own = |i: usize, _| if is_own(i) { 1.0 } else { 0.0 };
                         Matrix6::from_diagonal(&Vector6::from_fn(own))
                     });
-                    let compared = self.groups[1 + 2 * sensor + kind].compare(&reading)?;
+                    let group = &self.groups[1 + 2 * sensor + kind];
+                    let compared = Compared::new(&group.gram, group.rows, &reading)?;
                     (compared.predicted > ABOVE_NOISE * noise).then_some((compared, most))
                 });
             let fault = wrench_fault(&compared);
@@ -456,7 +419,7 @@ impl Evidence {
             changed[self.width() - 1] = 1.0;
             squares(gram, &changed)
         };
-        // In this order: signs, frames with a name, turned axes.
+        // Signs first; then, sensor by sensor, frames with a name before turned axes.
         let tried = |chosen: &[(usize, Mounting)]| {
             let is_open = |own: &usize| chosen.iter().all(|(other, _)| other != own);
             let open: Vec<usize> = (0..self.sensors).filter(is_open).collect();
@@ -551,347 +514,4 @@ fn entry(sensor: usize, i: usize, j: usize) -> usize {
 /// The square sum of a combination of columns.
 fn squares(gram: &DMatrix<f64>, of: &DVector<f64>) -> f64 {
     of.dot(&(gram * of))
-}
-
-fn slides(robot: &Robot, dof: usize) -> bool {
-    let joint = robot.model.dof_joint(dof);
-    let joint = joint.map(|joint| robot.model.joints()[joint]);
-    joint.is_some_and(|joint| matches!(joint.kind, JointKind::Prismatic(_)))
-}
-
-/// A reading beside its prediction, both without what offsets and friction explain.
-#[derive(Clone, Copy, Debug)]
-struct Compared {
-    /// RMS of the prediction.
-    predicted: f64,
-    /// RMS of the reading relative to it.
-    ratio: f64,
-    correlation: f64,
-}
-
-/// An error of a unit or sign, with the ratio of reading and prediction.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Fault {
-    Sign,
-    Unit(f64),
-    /// Possible, but unusual.
-    Odd,
-}
-
-/// The fault of each of these joint torques. `slides`: whether the joint is prismatic. Forces are
-/// compared with forces, torques with torques.
-fn torque_faults(compared: &[Option<Compared>], slides: &[bool]) -> Vec<Option<Fault>> {
-    let all = || compared.iter().zip(slides);
-    all()
-        .map(|(own, kind)| {
-            let alike = all().filter(|(_, other)| *other == kind);
-            let predicted = alike.filter_map(|(other, _)| Some(other.as_ref()?.predicted));
-            let greatest = predicted.fold(0.0, f64::max);
-            let Compared {
-                predicted,
-                ratio,
-                correlation,
-            } = (*own)?;
-            let beyond = ratio * predicted / greatest;
-            if beyond > BEYOND {
-                Some(Fault::Unit(beyond))
-            } else if predicted <= SLIGHT * greatest {
-                None
-            } else if ratio > FACTOR && correlation.abs() > CORRELATED || ratio < 1.0 / FACTOR {
-                Some(Fault::Unit(ratio))
-            } else {
-                let is_opposite = 4.0 * correlation * ratio < -(1.0 + ratio * ratio);
-                is_opposite.then_some(Fault::Sign)
-            }
-        })
-        .collect()
-}
-
-/// The fault of a sensor from its torques and forces, each with the largest change that the robot
-/// can cause.
-fn wrench_fault(both: &[Option<(Compared, f64)>; 2]) -> Option<Fault> {
-    let both = || both.iter().flatten();
-    let is_alike = |own: &Compared| own.correlation.abs() > CORRELATED;
-    let is_large = |own: &Compared, most: f64| {
-        own.ratio > FACTOR && is_alike(own) && own.ratio * own.predicted > most
-    };
-    let is_odd =
-        |own: &Compared| !(1.0 / ODD..=ODD).contains(&own.ratio) && own.correlation > CORRELATED;
-    let (first, _) = both().next()?;
-    if let Some((own, _)) = both().find(|(own, most)| is_large(own, *most)) {
-        Some(Fault::Unit(own.ratio))
-    } else if both().all(|(own, _)| own.ratio < 1.0 / SMALL && is_alike(own)) {
-        Some(Fault::Unit(first.ratio))
-    } else {
-        both().any(|(own, _)| is_odd(own)).then_some(Fault::Odd)
-    }
-}
-
-fn times(ratio: f64) -> String {
-    match ratio {
-        ratio if ratio >= 10.0 => format!("{ratio:.0} times"),
-        ratio if ratio >= 1.0 => format!("{ratio:.1} times"),
-        ratio if ratio > 0.0 => format!("1/{:.0}", 1.0 / ratio),
-        _ => "0 times".into(),
-    }
-}
-
-impl Fault {
-    /// Why a joint's torque is left out, and the finding.
-    fn of_torque(self, robot: &Robot, dof: usize) -> (String, Finding) {
-        let joint = robot.model.dof_name(dof);
-        let (unit, units) = if slides(robot, dof) {
-            ("N", "newtons")
-        } else {
-            ("Nm", "newton metres")
-        };
-        let (code, reason, what) = if let Self::Unit(ratio) = self {
-            let cause = if ratio > 1.0 {
-                format!("it is in counts or thousandths of {units}")
-            } else {
-                format!("its channel is dead, or it is in thousands of {units}")
-            };
-            let text = format!(
-                "is {} what the URDF's masses predict, and was excluded: {cause}; convert it to \
-                 {unit}",
-                times(ratio)
-            );
-            (FindingCode::WrongUnits, "units", text)
-        } else {
-            let text = "has the wrong sign: it is opposite to what the URDF's masses predict, and \
-                        was excluded; positive is along the joint's axis, by the parent on the \
-                        child. Check its sign, that of the encoder, and gravity_mps2";
-            (FindingCode::WrongSign, "sign", text.to_owned())
-        };
-        let finding = Finding::warning(
-            code,
-            format!("joint/{joint}/torque"),
-            format!("joint/{joint}/torque {what}"),
-        );
-        (format!("{reason} of the torque of {joint}"), finding)
-    }
-
-    fn of_wrench(self, name: &str, force: Option<f64>, torque: Option<f64>) -> Finding {
-        let both = [("forces", force), ("torques", torque)].into_iter();
-        let ratios = both.filter_map(|(word, ratio)| Some(format!("{word} {}", times(ratio?))));
-        let ratios = ratios.collect::<Vec<_>>().join(" and ");
-        let (severity, code, rest) = match self {
-            Self::Unit(ratio) if ratio > 1.0 => (
-                Severity::Refusal,
-                FindingCode::WrongUnits,
-                "it is in counts or in mN and mNm (convert it to N and Nm), or the URDF's masses \
-                 are not in kg",
-            ),
-            Self::Unit(_) => (
-                Severity::Refusal,
-                FindingCode::WrongUnits,
-                "it is in kN and kNm (convert it to N and Nm), or the URDF's masses are not in kg",
-            ),
-            _ => (
-                Severity::Warning,
-                FindingCode::Scale,
-                "the robot carries a load that the URDF lacks, or the URDF's masses are wrong by \
-                 this factor; or the units (1 kgf is 9.807 N) or the calibration are wrong, and \
-                 then so are the parameters: weigh the robot, or hang a known mass on it",
-            ),
-        };
-        Finding::new(
-            severity,
-            code,
-            format!("wrench/{name}"),
-            format!(
-                "wrench/{name} does not change as the URDF's masses predict ({ratios} as \
-                 large as predicted): {rest}"
-            ),
-        )
-    }
-}
-
-/// Another frame that a sensor's readings may be in.
-#[derive(Clone)]
-struct Mounting {
-    /// What the configuration should state; none: the opposite direction, all else unchanged.
-    instead: Option<String>,
-    /// From readings in that frame to readings as configured, [torque; force].
-    change: Matrix6<f64>,
-}
-
-impl Mounting {
-    fn opposite() -> Self {
-        Self {
-            instead: None,
-            change: -Matrix6::identity(),
-        }
-    }
-}
-
-/// Frames that have a name in the configuration; then axes rotated by right angles about the
-/// configured origin; all in both directions, the configured one first.
-fn mountings(robot: &Robot, sensor: usize) -> Vec<Mounting> {
-    let cut = &robot.structure.sensors()[sensor];
-    let joint = robot.model.joint_name(cut.joint());
-    let configured = *cut.pose();
-    let (same, other) = match cut.sign() < 0.0 {
-        true => ("child_to_parent", "parent_to_child"),
-        false => ("parent_to_child", "child_to_parent"),
-    };
-    let parent = SensorCut::new(
-        &robot.model,
-        joint,
-        MeasurementFrame::Parent,
-        MeasurementDirection::ChildToParent,
-        &Pose::identity(),
-        &cut.noise(),
-    );
-    let mut elements = robot.model.sensors().iter();
-    let element = elements.find(|element| element.joint == joint);
-    let mut poses: Vec<(String, Pose)> = vec![("frame = \"child\"".into(), Pose::identity())];
-    poses.extend(parent.map(|parent| ("frame = \"parent\"".to_owned(), *parent.pose())));
-    poses.extend(element.map(|element| {
-        let text = "frame = \"sensor\" (as the URDF poses it)";
-        (text.to_owned(), element.pose)
-    }));
-    let list = |values: [f64; 3]| {
-        let numbers = values.map(|value| format!("{}", (1e4 * value).round() / 1e4 + 0.0));
-        format!("[{}]", numbers.join(", "))
-    };
-    for turn in [Mat3::identity()].into_iter().chain(quarter_turns()) {
-        let rotation = configured.rotation * turn;
-        let (roll, pitch, yaw) = Rotation3::from_matrix_unchecked(rotation).euler_angles();
-        let text = format!(
-            "frame = \"sensor\", xyz_m = {}, rpy_rad = {}",
-            list(configured.translation.into()),
-            list([roll, pitch, yaw])
-        );
-        poses.push((
-            text,
-            Pose {
-                rotation,
-                ..configured
-            },
-        ));
-    }
-    let mut mountings = vec![
-        Mounting {
-            instead: None,
-            change: Matrix6::identity(),
-        },
-        Mounting::opposite(),
-    ];
-    for (sign, direction) in [(1.0, same), (-1.0, other)] {
-        for (text, pose) in &poses {
-            let change = Matrix6::from_columns(&std::array::from_fn::<_, 6, _>(|channel| {
-                let mut unit = [0.0; 6];
-                unit[channel] = sign;
-                let in_child = pose.wrench(&Wrench::from_torque_first(unit));
-                Vector6::from(configured.wrench_back(&in_child).torque_first())
-            }));
-            let is_new = |other: &Mounting| (change - other.change).amax() > 1e-6;
-            if mountings.iter().all(is_new) {
-                mountings.push(Mounting {
-                    instead: Some(format!("{text}, direction = \"{direction}\"")),
-                    change,
-                });
-            }
-        }
-    }
-    mountings.split_off(2)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::arithmetic::normals;
-
-    /// A reading of `scale` times the prediction, which is wrong by `wrong` times another motion;
-    /// with noise.
-    fn compared(size: f64, scale: f64, wrong: f64, noise: f64) -> Compared {
-        let mut gram = DMatrix::zeros(2, 2);
-        let deviates = normals(3, 1000);
-        for (i, deviate) in deviates.iter().enumerate() {
-            let t = 0.05 * i as f64;
-            let (x, other) = (8.0 * (0.9 * t).sin(), 8.0 * (1.7 * t + 1.0).sin());
-            let y = scale * (size * (x + wrong * other) + noise * deviate);
-            let row = DVector::from_column_slice(&[y, y - size * x]);
-            gram += &row * row.transpose();
-        }
-        let group = Group { gram, rows: 1000.0 };
-        group
-            .compare(&DVector::from_column_slice(&[1.0, 0.0]))
-            .expect("enough")
-    }
-
-    /// The fault of a torque that is the only one.
-    fn of_torque(scale: f64, wrong: f64, noise: f64) -> Option<Fault> {
-        torque_faults(&[Some(compared(1.0, scale, wrong, noise))], &[false])[0]
-    }
-
-    /// The fault of a sensor of a robot that weighs ten times the moved mass.
-    fn of_force(scale: f64, wrong: f64, noise: f64) -> Option<Fault> {
-        wrench_fault(&[None, Some((compared(1.0, scale, wrong, noise), 80.0))])
-    }
-
-    fn is_unit(fault: Option<Fault>, expected: f64) -> bool {
-        matches!(fault, Some(Fault::Unit(ratio)) if (0.7..1.5).contains(&(ratio / expected)))
-    }
-
-    #[test]
-    fn wrong_units_are_separated_from_a_wrong_model() {
-        for (wrong, noise) in [(0.0, 0.01), (0.5, 1.0), (1.5, 4.0)] {
-            assert_eq!(of_torque(1.0, wrong, noise), None, "{wrong} {noise}");
-            assert_eq!(of_force(1.0, wrong, noise), None, "{wrong} {noise}");
-        }
-        assert_eq!(of_torque(-1.0, 0.4, 1.0), Some(Fault::Sign));
-        // Cables and drifting offsets, with little motion, are not counts.
-        assert_eq!(of_force(1.0, 60.0, 1.0), None);
-        for (scale, times) in [(1000.0, 1000.0), (-1000.0, 1000.0), (0.001, 0.001)] {
-            assert!(is_unit(of_torque(scale, 0.3, 1.0), times), "{scale}");
-            assert!(is_unit(of_force(scale, 0.3, 1.0), times), "{scale}");
-        }
-        assert!(matches!(of_torque(0.0, 0.0, 0.0), Some(Fault::Unit(ratio)) if ratio < 1.0));
-        for kilograms in [0.102, 9.8] {
-            assert_eq!(of_force(kilograms, 0.3, 1.0), Some(Fault::Odd));
-        }
-    }
-
-    /// A gantry that carries a wrist: an error of the wrist's torque is found beside forces of a
-    /// thousand newtons, and these are not compared with torques. A joint that carries next to
-    /// nothing shows its unit only by far.
-    #[test]
-    fn torques_are_compared_with_torques() {
-        let all = |wrist: f64, idle: f64| {
-            let own = [
-                compared(200.0, 1.0, 0.2, 1.0),
-                compared(0.2, wrist, 0.2, 0.01),
-                compared(0.2, 1.0, 0.2, 0.01),
-                compared(1e-3, idle, 0.2, 0.1),
-            ];
-            torque_faults(&own.map(Some), &[true, false, false, false])
-        };
-        assert_eq!(all(1.0, 1.0), [None; 4]);
-        assert_eq!(all(-1.0, 1.0), [None, Some(Fault::Sign), None, None]);
-        let [None, small, None, None] = all(0.001, 1.0)[..] else {
-            panic!("another fault")
-        };
-        assert!(is_unit(small, 0.001));
-        assert!(matches!(
-            all(1.0, 1e4)[..],
-            [None, None, None, Some(Fault::Unit(_))]
-        ));
-    }
-
-    /// A gripper on a flange that the URDF lacks, or the opposite; a tool whose centre of mass is
-    /// elsewhere: unusual, but possible.
-    #[test]
-    fn errors_of_the_urdf_are_not_refused() {
-        let of_both = |force: f64, torque: f64| {
-            wrench_fault(&[torque, force].map(|scale| {
-                let own = compared(1.0, scale, 0.3, 1.0);
-                Some((own, 5000.0))
-            }))
-        };
-        for (force, torque) in [(40.0, 40.0), (0.02, 0.02), (1.1, 40.0), (1.1, 0.001)] {
-            assert_eq!(of_both(force, torque), Some(Fault::Odd), "{force} {torque}");
-        }
-    }
 }

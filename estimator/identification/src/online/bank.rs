@@ -336,8 +336,8 @@ impl Bank {
                 let others = evidence.iter().enumerate();
                 let others = others.filter(|(other, _)| *other != number);
                 let own = |(_, of_unit): (usize, &Vec<(View, Sight, f64)>)| {
-                    let mut same = of_unit.iter().filter(|own| (own.0, own.1) == (view, sight));
-                    same.next().map(|own| own.2)
+                    let same = of_unit.iter().find(|own| (own.0, own.1) == (view, sight));
+                    same.map(|own| own.2)
                 };
                 others.filter_map(own).sum()
             });
@@ -674,14 +674,13 @@ fn row(rows: &EstimateRows<'_>, dof: usize, columns: usize) -> Option<Vec<f64>> 
 mod tests {
     use super::*;
     use crate::arithmetic::normals;
+    use crate::online::bank::hypothesis::GRAVITY;
     use proprio_dynamics::model::{Frame, MeasurementDirection, MeasurementFrame};
     use proprio_dynamics::spatial::{Pose, Vec3};
     use proprio_dynamics::{
         ContactKind, ContactSpec, ExternalWrench, InverseDynamics, Noise, SensorCut,
     };
     use std::f64::consts::PI;
-
-    const GRAVITY: f64 = 9.80665;
 
     /// An arm of three moving links on a sensor, that can be touched at its tip.
     struct Arm {

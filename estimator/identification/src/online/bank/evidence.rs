@@ -311,7 +311,8 @@ impl Fit {
             self.gram.gemm_tr(1.0, &all, &all, 1.0);
             self.rows += count as f64;
             self.ticks += 1;
-            let takes_less = |branch: &Branch| branch.of_sensors.iter().any(|s| *s < 1.0);
+            let takes_less =
+                |branch: &Branch| !branch.is_refuted && branch.of_sensors.iter().any(|s| *s < 1.0);
             if self.branches.iter().any(takes_less) {
                 let parts = noise_parts(columns, now, &factor);
                 for (number, branch) in self.branches.iter().enumerate() {
@@ -355,14 +356,13 @@ impl Fit {
             return;
         }
         for number in 0..self.branches.len() {
+            if self.branches[number].is_refuted {
+                continue;
+            }
             // Two iterations: the noise converges while ticks come in.
-            for _ in 0..if self.branches[number].is_refuted {
-                0
-            } else {
-                2
-            } {
+            for _ in 0..2 {
                 let Some((factor, mut right)) = self.system(columns, number) else {
-                    continue;
+                    break;
                 };
                 factor.l_dirty().solve_lower_triangular_mut(&mut right);
                 let column = self.unknowns + number;

@@ -8,7 +8,7 @@ use std::f64::consts::PI;
 use std::fmt;
 
 /// Standard gravity \[m/s^2\].
-const GRAVITY: f64 = 9.80665;
+pub(crate) const GRAVITY: f64 = 9.80665;
 
 /// Standard deviation of each component of a turn of the base \[rad\].
 const TURN: f64 = 0.3;
