@@ -526,34 +526,38 @@ fn given_velocities_are_kept_and_differentiated() {
     assert!(velocity < 1e-6 && acceleration < 1e-5);
 }
 
-/// Accelerations that a controller has differenced are noise: those of the positions are better.
+/// Accelerations that a controller has differenced are noise: those of the positions are better, or
+/// those of recorded velocities.
 #[test]
 fn derivatives_that_are_noise_are_not_used() {
     let robot = robot("");
-    let mut table = log(&robot, 10.0, 100.0, 0.0, 0.0, 1);
-    (table.header).push("joint/elbow/acceleration".to_owned());
-    let mut noise = Random(3);
-    for (t, row) in &mut table.rows {
-        let given = motion(1, Nanos(*t).seconds())[2] + 12.0 * noise.normal();
-        row.push(if row[0].is_nan() { f64::NAN } else { given });
+    for (reference, has_velocity) in [("positions", false), ("velocities", true)] {
+        let mut table = log(&robot, 10.0, 100.0, 0.0, 0.0, 1);
+        (table.header).push("joint/elbow/acceleration".to_owned());
+        (table.header).extend(has_velocity.then(|| "joint/elbow/velocity".to_owned()));
+        let mut noise = Random(3);
+        for (t, row) in &mut table.rows {
+            let [_, velocity, acceleration] = motion(1, Nanos(*t).seconds());
+            let given = [acceleration + 12.0 * noise.normal(), velocity];
+            let given = given.map(|own| if row[0].is_nan() { f64::NAN } else { own });
+            row.extend_from_slice(&given[..1 + usize::from(has_velocity)]);
+        }
+        let instants = table.dataset(&robot);
+        let [noisy] = instants.findings() else {
+            panic!("{:?}", instants.findings());
+        };
+        let begin = format!("joint/elbow: the logged acceleration is not that of the {reference}: ");
+        let off: f64 = (noisy.text.strip_prefix(&begin))
+            .and_then(|rest| rest.split(' ').next()?.parse().ok())
+            .unwrap_or_else(|| panic!("{}", noisy.text));
+        assert!((off - 12.0).abs() < 1.5, "{off}");
+        let usable = instants
+            .observations()
+            .iter()
+            .filter(|i| i.has_motion(&robot.channels));
+        let error = rms(usable.map(|i| i.acceleration[1] - motion(1, i.t.seconds())[2]));
+        assert!(error < 0.1, "{error}");
     }
-    let instants = table.dataset(&robot);
-    let [noisy] = instants.findings() else {
-        panic!("{:?}", instants.findings());
-    };
-    let off = noisy
-        .text
-        .strip_prefix("joint/elbow: the logged acceleration is not that of the positions: ");
-    let off: f64 = off
-        .and_then(|rest| rest.split(' ').next()?.parse().ok())
-        .expect("a number");
-    assert!((off - 12.0).abs() < 1.5, "{off}");
-    let usable = instants
-        .observations()
-        .iter()
-        .filter(|i| i.has_motion(&robot.channels));
-    let error = rms(usable.map(|i| i.acceleration[1] - motion(1, i.t.seconds())[2]));
-    assert!(error < 0.1, "{error}");
 }
 
 /// The code of a finding.

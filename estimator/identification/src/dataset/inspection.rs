@@ -14,6 +14,9 @@ use std::ops::Range;
 const LEAST_SECONDS: f64 = 2.0;
 const LEAST_ROWS: u64 = 20;
 
+/// Least number of samples of a derivative that is compared.
+const LEAST_COMPARED: usize = 100;
+
 /// Checks all channels.
 pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
     let mut found = std::mem::take(&mut recording.findings);
@@ -38,12 +41,18 @@ pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
                     found.push(Finding::note(FindingCode::JointStill, channel, text));
                 }
                 let track = &mut recording.joints[dof];
+                // The velocity is the better reference for the acceleration, if it is a good one.
+                let mut reference = (track.position.clone(), 0);
                 let derivatives = [
                     ("velocity", "rad/s", 1, &mut track.velocity),
                     ("acceleration", "rad/s^2", 2, &mut track.acceleration),
                 ];
                 for (given, unit, order, stream) in derivatives {
-                    let Some(wrong) = wrong_derivative(&track.position, stream, order) else {
+                    let Some(wrong) = wrong_derivative(&reference.0, stream, order - reference.1)
+                    else {
+                        if order == 1 && stream.t.len() >= LEAST_COMPARED {
+                            reference = (stream.clone(), 1);
+                        }
                         continue;
                     };
                     let text = match wrong {
@@ -55,8 +64,9 @@ pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
                         Wrong::Noise(off) => {
                             *stream = Stream::default();
                             format!(
-                                "joint/{joint}: the logged {given} is not that of the positions: \
-                                 {off:.3} {unit} off, most of it noise; it is not used"
+                                "joint/{joint}: the logged {given} is not that of the {}: \
+                                 {off:.3} {unit} off, most of it noise; it is not used",
+                                ["positions", "velocities"][reference.1]
                             )
                         }
                     };
@@ -285,22 +295,22 @@ enum Wrong {
     Noise(f64),
 }
 
-/// Compares a recorded derivative with that of the positions; none if it fits, or if there is too
-/// little motion. It has another unit or sign if it follows the positions' by another factor. The
-/// positions tell it better if at least half of the square of the difference is noise of the given
-/// one (its scatter about its own smooth course), and the difference is a tenth of the motion or
-/// more. A smaller one changes no torque by more than a tenth of its inertial part.
+/// Compares a recorded derivative with that of a reference; none if it fits, or if there is too
+/// little motion. It has another unit or sign if it follows the reference's by another factor. The
+/// reference tells it better if at least half of the square of the difference is noise of the
+/// given one (its scatter about its own smooth course), and the difference is a tenth of the motion
+/// or more. A smaller one changes no torque by more than a tenth of its inertial part.
 ///
 /// Without it, accelerations that a controller differenced raise the error on held-out torques from
 /// .7 to 30 %.
-fn wrong_derivative(position: &Stream<1>, given: &Stream<1>, order: usize) -> Option<Wrong> {
+fn wrong_derivative(reference: &Stream<1>, given: &Stream<1>, order: usize) -> Option<Wrong> {
     const EDGE: f64 = 0.3;
     const MOST: usize = 2000;
     const NOTICEABLE: f64 = 0.1;
-    if given.t.len() < 100 || range(position.value.iter().map(|[v]| *v)) < 0.05 {
+    if given.t.len() < LEAST_COMPARED || range(reference.value.iter().map(|[v]| *v)) < 0.05 {
         return None;
     }
-    let (smooth, noise) = (position.smoother(0), given.smoother(0).sigma());
+    let (smooth, noise) = (reference.smoother(0), given.smoother(0).sigma());
     let mut scratch = Scratch::default();
     // Squares and product of the given one and that of the positions.
     let (mut uu, mut uv, mut vv, mut count) = (0.0, 0.0, 0.0, 0.0);

@@ -184,7 +184,8 @@ pub(crate) fn wrong_signs(
             &joint,
             format!(
                 "{joint}: wrong encoder sign, the data fit only with the position negated; negate \
-                 the encoder's reading, or the joint's axis in the URDF"
+                 the encoder's reading, or the joint's axis in the URDF. Encoder zeros and delays \
+                 were not tested: they cannot be told from a wrong sign"
             ),
         )
     };
