@@ -633,6 +633,12 @@ fn error_frames_reach_health_and_log() {
     });
     assert_eq!(told.buses()[0].interface.fd, 1);
 
+    // A bus-off with "back to active" in the same frame, as candleLight sends it, is only counted.
+    for _ in 0..5 {
+        can::run("cansend vcan0 20000044#004C0000007F7F00");
+    }
+    let told = health.wait("the reports", |h| errors(h, BusError::BusOff) == 5);
+    assert_eq!(told.buses()[0].link, LinkState::Up);
     can::run("cansend vcan0 20000040#0000000000000000");
     health.wait("bus-off", |h| h.buses()[0].link == LinkState::BusOff);
     can::run("cansend vcan0 20000100#0000000000000000");

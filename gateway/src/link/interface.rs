@@ -9,7 +9,7 @@ use nix::sys::socket::{
     AddressFamily, MsgFlags, SockFlag, SockProtocol, SockType, recv, send, setsockopt, socket,
 };
 use nix::sys::time::TimeVal;
-use proprio_topics::{Controller, InterfaceHealth};
+use proprio_topics::{Controller, InterfaceHealth, realtime};
 use std::os::fd::{AsRawFd, OwnedFd};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -268,6 +268,7 @@ impl Observer {
         };
         std::thread::Builder::new()
             .name("interfaces".to_owned())
+            .stack_size(realtime::SMALL_STACK)
             .spawn(body)?;
         Ok(this)
     }

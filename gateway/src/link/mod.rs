@@ -16,6 +16,7 @@ use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos};
 
 pub mod adapter;
+mod bus_off;
 pub mod error_frame;
 pub mod interface;
 pub mod replay;

@@ -11,6 +11,8 @@
 //! | too many errors: bus-off | [`LinkState::BusOff`] | controller restart (`restart-ms`) |
 //! | up without a carrier | [`LinkState::NoCarrier`] | when it has a carrier |
 //!
+//! What an adapter reports of bus-off is not always true (`bus_off.rs`).
+//!
 //! An adapter that is named by its serial number or port is looked for again in sysfs while it is
 //! gone: it may come back as another interface ([`super::adapter`]).
 //!
@@ -26,6 +28,7 @@
 //! its own buffers hold (`ip link set can0 txqueuelen 10` keeps that short).
 
 use super::adapter::{self, Adapter};
+use super::bus_off::BusOff;
 use super::error_frame::ErrorFrame;
 use super::socket::{
     RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, interface_flags, newly_dropped,
@@ -35,7 +38,7 @@ use crate::clock::{Clock, HardwareToMonotonic, Monotonic, sleep_until};
 use nix::errno::Errno;
 use nix::sys::socket::{MsgFlags, send, setsockopt, sockopt};
 use proprio_drivers::{Claim, Format, Frame, Id};
-use proprio_topics::{BusError, LinkState, Nanos};
+use proprio_topics::{LinkState, Nanos};
 use socketcan::{CanAddr, CanFdSocket, Socket, SocketOptions};
 use std::io;
 use std::os::fd::{AsFd, AsRawFd};
@@ -43,9 +46,6 @@ use std::path::{Path, PathBuf};
 
 /// Interval between queries of the interface's flags.
 const CHECK: Nanos = Nanos::from_millis(50);
-/// For this long after an error frame told of bus-off, flags with a carrier do not end it: the
-/// kernel's link watch updates them at most once a second. Half a second is for a busy machine.
-const LINK_WATCH: Nanos = Nanos::from_millis(1500);
 /// Maximum number of kernel filters (`CAN_RAW_FILTER_MAX`).
 const MOST_FILTERS: usize = 512;
 /// Sizes of `struct can_frame` and `struct canfd_frame`.
@@ -78,8 +78,7 @@ pub struct SocketCan {
     pending: Option<Frame>,
     /// Time of the next query of the flags.
     check: Nanos,
-    /// Until then bus-off is believed rather than a carrier.
-    bus_off_until: Nanos,
+    bus_off: BusOff,
     counters: LinkCounters,
 }
 
@@ -139,7 +138,7 @@ impl SocketCan {
             changed: false,
             pending: None,
             check: Nanos::ZERO,
-            bus_off_until: Nanos::ZERO,
+            bus_off: BusOff::default(),
             counters: LinkCounters::default(),
         })
     }
@@ -194,8 +193,8 @@ impl SocketCan {
         }
         let flags = interface_flags(self.socket.as_fd(), &self.interface);
         let carrier = matches!(flags, Ok(flags) if flags & libc::IFF_RUNNING != 0);
-        let bus_off = self.state == LinkState::BusOff && (!carrier || now < self.bus_off_until);
-        self.set_state(state_of(flags, bus_off))
+        self.bus_off.look(carrier, now);
+        self.set_state(state_of(flags, self.bus_off.is_off()))
     }
 
     /// Takes the next frame from the batch. `None`: the batch is empty.
@@ -213,14 +212,10 @@ impl SocketCan {
             let frame = frame.at(times.limit(stamp), kind);
             if let Some(error) = ErrorFrame::of(&frame) {
                 self.counters.error_frames += 1;
-                if error.reports(BusError::BusOff) {
-                    self.bus_off_until = Monotonic.now().saturating_add(LINK_WATCH);
-                    self.set_state(LinkState::BusOff);
-                } else if self.state == LinkState::BusOff
-                    && error.classes & (libc::CAN_ERR_RESTARTED | libc::CAN_ERR_CRTL) != 0
-                {
-                    // The controller has restarted, or counts errors again, as adapters that
-                    // restart automatically report.
+                // Adapters that restart a controller automatically report that it counts errors
+                // again.
+                self.bus_off.report(error, Monotonic.now());
+                if self.state == LinkState::BusOff && !self.bus_off.is_off() {
                     self.set_state(LinkState::Up);
                 }
                 return Some(Received::Error(frame));
@@ -228,6 +223,7 @@ impl SocketCan {
             // A controller that receives is on the bus. This does not hold if the interface was
             // lost: the frame may have been waiting since before the loss, which the system reports
             // only once.
+            self.bus_off.receive();
             if self.state == LinkState::BusOff && self.set_state(LinkState::Up) {
                 self.pending = Some(frame);
                 return Some(Received::StateChanged);
@@ -449,6 +445,9 @@ impl Link for SocketCan {
             .ok_or(SendError::Unsupported)?;
         if self.state != LinkState::Up {
             return Err(SendError::NotUp);
+        }
+        if self.bus_off.is_suspected() {
+            return Err(SendError::Full);
         }
         match send(self.socket.as_raw_fd(), bytes, MsgFlags::MSG_DONTWAIT) {
             Ok(_) => {
