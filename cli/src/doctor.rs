@@ -10,7 +10,7 @@ use proprio_gateway::link::adapter;
 use proprio_gateway::link::interface::{Interfaces as _, Netlink};
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, Received, send_by};
-use proprio_topics::ipc::{Domain, DomainConfig};
+use proprio_topics::ipc::{Domain, DomainConfig, memory_needed};
 use proprio_topics::{Controller, InterfaceHealth, Nanos};
 use serde_json::json;
 use std::fmt::Write as _;
@@ -318,12 +318,32 @@ fn shared_memory(domain: &DomainConfig) -> Finding {
             "set PROPRIO_RUNTIME_DIR to a folder in memory, the same for all programs: \
              /dev/shm/proprio",
         ),
-        Ok(()) => finding(
-            "shared memory",
-            Verdict::Ok,
-            format!("a domain opens in {}", probe.base.display()),
-            "",
-        ),
+        Ok(()) => {
+            let ([one, more], free) = memory_needed();
+            let (one, more) = (one.div_ceil(1 << 20), more.div_ceil(1 << 20));
+            let free = free >> 20;
+            let what = format!(
+                "a domain opens in {}; /dev/shm has {free} MB free, a robot needs {one} MB and \
+                 {more} MB for each bus",
+                probe.base.display()
+            );
+            let is_enough = free >= one + more;
+            finding(
+                "shared memory",
+                if is_enough {
+                    Verdict::Ok
+                } else {
+                    Verdict::Lacking
+                },
+                what,
+                if is_enough {
+                    ""
+                } else {
+                    "remove files in /dev/shm, or `mount -o remount,size=256M /dev/shm`; in a \
+                     container --shm-size"
+                },
+            )
+        }
         Err(error) => finding(
             "shared memory",
             Verdict::Failed,

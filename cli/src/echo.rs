@@ -118,6 +118,9 @@ fn follow<T: Topic>(
         if printed > before {
             (newest, is_told) = (monotonic(), false);
         } else if !is_told && monotonic() - newest > PATIENCE {
+            if !domain.is_intact() {
+                bail!("{}: start this again", domain.damage());
+            }
             eprintln!("waiting: nothing is published; `proprio status` says what is missing");
             is_told = true;
         }

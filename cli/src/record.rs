@@ -5,7 +5,7 @@ use crate::running::{Described, interrupted, next, one_robot, open};
 use anyhow::{Context, bail};
 use proprio_gateway::offline::InOrder;
 use proprio_topics::csv::{Columns, Series, Value, What, Writer};
-use proprio_topics::ipc::{DomainConfig, Reader, monotonic};
+use proprio_topics::ipc::{Domain, DomainConfig, Reader, monotonic};
 use proprio_topics::{
     ContactDeclaration, Description, MAX_CHANNELS, Nanos, Publisher, Role, Sample,
 };
@@ -201,16 +201,20 @@ impl Gaps {
     }
 }
 
+/// The gateway's description, which names its channels.
+fn gateway_of(domain: &Domain, robot: &str) -> anyhow::Result<Described> {
+    Described::by(domain, robot, Publisher::Gateway)?.context("the robot's gateway is not running")
+}
+
 /// Records samples and declared contacts.
 pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
     let stop = interrupted()?;
-    let domain = open(config)?;
+    let mut domain = open(config)?;
     let robot = one_robot(&domain, args.robot.as_deref())?;
     // The readers first: what comes while the table is prepared is recorded, too.
     let mut samples = Reader::<Sample>::open(&domain, &robot)?;
     let mut declarations = Reader::<ContactDeclaration>::open(&domain, &robot).ok();
-    let mut gateway = Described::by(&domain, &robot, Publisher::Gateway)?
-        .context("the robot's gateway is not running")?;
+    let mut gateway = gateway_of(&domain, &robot)?;
     let description = *gateway.newest();
     let estimator = Described::by(&domain, &robot, Publisher::Estimator)?;
     let estimator = estimator.as_ref().map(Described::newest);
@@ -236,7 +240,7 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
     let end = args
         .seconds
         .map(|seconds| began + Nanos::from_seconds(seconds));
-    let (mut count, mut others, mut next_flush) = (0_u64, 0_u64, began);
+    let (mut count, mut others, mut lost, mut next_flush) = (0_u64, 0_u64, 0_u64, began);
     while !stop.load(Relaxed) && end.is_none_or(|end| monotonic() < end) {
         while let Some(declared) = declarations.as_mut().map_or(Ok(None), next)? {
             let contact = Series {
@@ -283,6 +287,17 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
             // If this program is killed, the rows of the last moments are lost, not the table.
             next_flush = now + Nanos::from_millis(500);
             table.flush()?;
+            // Gateway and estimator make a damaged domain again; until they have, nothing comes.
+            if !domain.is_intact()
+                && let Ok(new) = open(config)
+                && let Ok(described) = gateway_of(&new, &robot)
+                && let Ok(reader) = Reader::open(&new, &robot)
+            {
+                lost += samples.lost();
+                (samples, gateway) = (reader, described);
+                declarations = Reader::open(&new, &robot).ok();
+                domain = new;
+            }
         }
         gaps.wait(now);
         samples.wait((now + Nanos::from_millis(100)).min(end.unwrap_or(Nanos::MAX)));
@@ -293,7 +308,7 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
         "{}: {count} samples in {:.1} s, {} lost, {} out of order",
         args.out.display(),
         (monotonic() - began).seconds(),
-        samples.lost(),
+        lost + samples.lost(),
         order.out_of_order()
     );
     let without = gaps.summary(monotonic());

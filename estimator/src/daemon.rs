@@ -17,7 +17,7 @@ use anyhow::{Context, anyhow};
 use proprio_identification::online::{Hypothesis, Online, Paused};
 use proprio_identification::robot::Robot;
 use proprio_topics::ipc::{
-    Domain, DomainConfig, DomainError, PortError, Reader, Topic, Watch, Writer, monotonic,
+    Domain, DomainConfig, DomainError, PortError, Reader, Renewal, Topic, Watch, Writer, monotonic,
     open_files_remedy,
 };
 use proprio_topics::{
@@ -123,7 +123,8 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
     let stop = Arc::new(AtomicBool::new(false));
     let last_turn = Arc::new(AtomicI64::new(monotonic().0));
     let (ready, is_ready) = mpsc::channel();
-    let (robot, realtime, domain) = (config.robot.clone(), config.realtime, Domain::open(domain)?);
+    let (robot, realtime) = (config.robot.clone(), config.realtime);
+    let mut domain = Domain::open(domain)?;
     let state_file = config.identification.state.clone().map(|file| StateFile {
         file,
         every: Nanos::from_seconds(config.identification.save_every_s),
@@ -133,7 +134,9 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
         .collect();
     let mut gateway_log = GatewayLog::new(&setup, &domain.config().name);
     let mut gateway = Watch::<GatewayHealth>::default();
+    let renewal = Arc::new(Renewal::default());
     let shared = Shared {
+        renewal: Arc::clone(&renewal),
         last_turn: Arc::clone(&last_turn),
         channels: Arc::clone(&channels),
     };
@@ -161,6 +164,7 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
     tracing::info!(robot = config.robot, "running");
     let _ = sd_notify::notify(&[NotifyState::Ready, NotifyState::Status("running")]);
     let watchdog = sd_notify::watchdog_enabled();
+    let (mut is_damaged, mut has_failed) = (false, false);
     let mut ticks = tokio::time::interval(Duration::from_millis(100));
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     let why = loop {
@@ -173,6 +177,26 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
             break "the data plane has ended";
         }
         let now = monotonic();
+        match domain.renewed() {
+            Some(renewed) => {
+                if !std::mem::replace(&mut is_damaged, true) {
+                    tracing::error!("{}", domain.damage());
+                }
+                match renewed {
+                    Ok(new) => {
+                        domain = new;
+                        renewal.pass(domain.clone());
+                        gateway = Watch::default();
+                    }
+                    Err(error) if !has_failed => {
+                        has_failed = true;
+                        tracing::error!("{error}; trying again");
+                    }
+                    Err(_) => {}
+                }
+            }
+            None => (is_damaged, has_failed) = (false, false),
+        }
         gateway_log.tell(gateway.look(&domain, &config.robot, now), &channels, now);
         if watchdog.is_some() && now - Nanos(last_turn.load(Relaxed)) < STALLED {
             let _ = sd_notify::notify(&[NotifyState::Watchdog]);
@@ -186,24 +210,65 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
         .map_err(|_| anyhow!("the data plane panicked; this is a bug in the program: report it"))
 }
 
-/// What the data plane tells the control plane, without a lock.
+/// What data plane and control plane tell each other, without a lock.
 struct Shared {
+    renewal: Arc<Renewal>,
     /// The time of the last turn of its loop.
     last_turn: Arc<AtomicI64>,
     /// Per channel of the configuration, what has come of it.
     channels: Arc<[ChannelStatus]>,
 }
 
-/// What the data-plane thread owns.
-struct DataPlane {
+/// The ports of the data plane.
+struct Ports {
     domain: Domain,
-    robot: String,
-    pipeline: Pipeline,
     samples: Option<Reader<Sample>>,
-    /// The samples taken at once, to be sorted by stamp; never grows.
-    inbox: Vec<Sample>,
     descriptions: Option<Reader<Description>>,
     declarations: Reader<ContactDeclaration>,
+    torques: Writer<TorqueEstimate>,
+    contacts: Writer<ContactEstimate>,
+    /// The identified parameters; none if identification is off.
+    inertias: Option<Writer<InertiaEstimate>>,
+    health: Writer<EstimatorHealth>,
+    description: Writer<Description>,
+}
+
+impl Ports {
+    fn open(domain: Domain, setup: &Setup, robot: &str, identifies: bool) -> anyhow::Result<Self> {
+        let epoch = domain.epoch();
+        // The health topic first: it admits one writer, so a second estimator of this robot fails
+        // here.
+        let health = Writer::create(&domain, robot, epoch)?;
+        let mut description = Writer::<Description>::create(&domain, robot, epoch)?;
+        description.send(&setup.description(), monotonic())?;
+        // Create the service here: then the reader is open before any program declares.
+        let creator = Writer::<ContactDeclaration>::create(&domain, robot, epoch)?;
+        let declarations = Reader::open(&domain, robot)?;
+        drop(creator);
+        Ok(Self {
+            samples: None,
+            descriptions: None,
+            declarations,
+            torques: Writer::create(&domain, robot, epoch)?,
+            contacts: Writer::create(&domain, robot, epoch)?,
+            inertias: match identifies {
+                true => Some(Writer::create(&domain, robot, epoch)?),
+                false => None,
+            },
+            health,
+            description,
+            domain,
+        })
+    }
+}
+
+/// What the data-plane thread owns.
+struct DataPlane {
+    robot: String,
+    pipeline: Pipeline,
+    ports: Ports,
+    /// The samples taken at once, to be sorted by stamp; never grows.
+    inbox: Vec<Sample>,
     unknown_contact_reported: bool,
     refusal_reported: bool,
     /// Consecutive health periods in which a sensor lacked the temperature that its calibration
@@ -213,12 +278,6 @@ struct DataPlane {
     map: Vec<Option<usize>>,
     /// The gateway's epoch that `map` belongs to.
     map_epoch: u64,
-    torques: Writer<TorqueEstimate>,
-    contacts: Writer<ContactEstimate>,
-    /// The identified parameters; none if identification is off.
-    inertias: Option<Writer<InertiaEstimate>>,
-    health_writer: Writer<EstimatorHealth>,
-    description_writer: Writer<Description>,
     health: EstimatorHealth,
     identification: Option<IdentificationThread>,
     first_look: FirstLook,
@@ -235,17 +294,11 @@ impl DataPlane {
         state_file: Option<StateFile>,
         shared: Shared,
     ) -> anyhow::Result<Self> {
-        let epoch = domain.epoch();
-        // The health topic first: it admits one writer, so a second estimator of this robot fails
-        // here.
-        let health_writer = Writer::create(&domain, robot, epoch)?;
-        let mut description_writer = Writer::<Description>::create(&domain, robot, epoch)?;
-        let torques = Writer::create(&domain, robot, epoch)?;
-        let contacts = Writer::create(&domain, robot, epoch)?;
-        let now = monotonic();
-        description_writer.send(&setup.description(), now)?;
         let first_look = FirstLook::start(&setup)?;
         let mut pipeline = Pipeline::new(setup);
+        let identifies = pipeline.identification().is_some();
+        // Before the state: another estimator of this robot may be using its file.
+        let ports = Ports::open(domain, pipeline.setup(), robot, identifies)?;
         if let Some(state_file) = &state_file {
             state_file.resume(&mut pipeline);
         }
@@ -256,44 +309,44 @@ impl DataPlane {
             .identification()
             .map(|online| IdentificationThread::start(online, &pipeline.setup().robot, state_file))
             .transpose()?;
-        let inertias = match identification {
-            Some(_) => Some(Writer::create(&domain, robot, epoch)?),
-            None => None,
-        };
         Ok(Self {
             robot: robot.to_owned(),
             pipeline,
+            ports,
             identification,
             first_look,
-            samples: None,
             inbox: Vec::with_capacity(INBOX),
-            descriptions: None,
-            // Create the service here: then the reader is open before any program declares.
-            declarations: {
-                let creator = Writer::<ContactDeclaration>::create(&domain, robot, epoch)?;
-                let reader = Reader::open(&domain, robot)?;
-                drop(creator);
-                reader
-            },
             unknown_contact_reported: false,
             refusal_reported: false,
             without_temperature: 0,
             map: Vec::with_capacity(proprio_topics::MAX_CHANNELS),
             map_epoch: 0,
-            torques,
-            contacts,
-            inertias,
-            health_writer,
-            description_writer,
             health: EstimatorHealth {
-                started: now,
+                started: monotonic(),
                 ..EstimatorHealth::default()
             },
             next_connect: Nanos::ZERO,
             next_health: Nanos::ZERO,
             shared,
-            domain,
         })
+    }
+
+    /// Opens all ports anew, in `domain`. What was identified stays.
+    #[cold]
+    fn renew(&mut self, domain: Domain) {
+        let identifies = self.ports.inertias.is_some();
+        match Ports::open(
+            domain.clone(),
+            self.pipeline.setup(),
+            &self.robot,
+            identifies,
+        ) {
+            Ok(ports) => self.ports = ports,
+            Err(error) => {
+                tracing::error!("estimates cannot be published: {error:#}");
+                domain.abandon();
+            }
+        }
     }
 
     fn run(&mut self, stop: &AtomicBool) {
@@ -301,10 +354,17 @@ impl DataPlane {
             let now = monotonic();
             self.shared.last_turn.store(now.0, Relaxed);
             self.health.last_turn = now;
+            if let Some(domain) = self.shared.renewal.take() {
+                self.renew(domain);
+            }
             if now >= self.next_connect {
                 self.next_connect = now + CONNECT_PERIOD;
-                connect(&mut self.samples, &self.domain, &self.robot);
-                connect(&mut self.descriptions, &self.domain, &self.robot);
+                connect(&mut self.ports.samples, &self.ports.domain, &self.robot);
+                connect(
+                    &mut self.ports.descriptions,
+                    &self.ports.domain,
+                    &self.robot,
+                );
             }
             self.take_declarations(now);
             if let Some(job) = self
@@ -334,12 +394,12 @@ impl DataPlane {
 
     /// Waits until the gateway publishes a sample, or something else is to be done.
     fn wait(&self) {
-        let is_connected = self.samples.is_some() && self.descriptions.is_some();
+        let is_connected = self.ports.samples.is_some() && self.ports.descriptions.is_some();
         let until = match is_connected {
             true => self.next_health,
             false => self.next_health.min(self.next_connect),
         };
-        match &self.samples {
+        match &self.ports.samples {
             Some(samples) => {
                 samples.wait(until);
             }
@@ -358,7 +418,7 @@ impl DataPlane {
         // would be late. So sort by stamp first.
         self.inbox.clear();
         while self.inbox.len() < INBOX
-            && let Some(taken) = self.samples.as_mut().map(Reader::try_take)
+            && let Some(taken) = self.ports.samples.as_mut().map(Reader::try_take)
         {
             match taken {
                 Ok(Some(sample)) => self.inbox.push(sample),
@@ -413,14 +473,14 @@ impl DataPlane {
     fn publish_estimates(&mut self) {
         while let Some(estimate) = self.pipeline.poll() {
             let now = monotonic();
-            let sent = self.torques.send(&estimate.torques, now).is_ok()
-                & self.contacts.send(&estimate.contacts, now).is_ok();
+            let sent = self.ports.torques.send(&estimate.torques, now).is_ok()
+                & self.ports.contacts.send(&estimate.contacts, now).is_ok();
             self.health.estimates += 1;
             self.health.publish_failures += u64::from(!sent);
             self.health.withheld +=
                 u64::from(estimate.torques.joints().iter().any(|j| j.valid != 1));
             self.health.last_estimate = estimate.t;
-            if let Some(inertias) = &mut self.inertias
+            if let Some(inertias) = &mut self.ports.inertias
                 && let Some(inertia) = self.pipeline.inertia()
             {
                 self.health.publish_failures += u64::from(inertias.send(inertia, now).is_err());
@@ -440,7 +500,9 @@ impl DataPlane {
 
     /// Maps the channel numbers of the gateway's description to the pipeline's channels.
     fn take_descriptions(&mut self) {
-        while let Some(Ok(Some(description))) = self.descriptions.as_mut().map(Reader::try_take) {
+        while let Some(Ok(Some(description))) =
+            self.ports.descriptions.as_mut().map(Reader::try_take)
+        {
             if description.publisher != Publisher::Gateway {
                 continue;
             }
@@ -461,7 +523,7 @@ impl DataPlane {
     }
 
     fn take_declarations(&mut self, now: Nanos) {
-        while let Ok(Some(declared)) = self.declarations.try_take() {
+        while let Ok(Some(declared)) = self.ports.declarations.try_take() {
             match self
                 .pipeline
                 .setup()
@@ -521,8 +583,8 @@ impl DataPlane {
             self.health.backward,
             self.health.not_finite,
         ) = (counts.late, counts.backward, counts.not_finite);
-        self.health.lost = self.samples.as_ref().map_or(0, Reader::lost);
-        self.health.epochs = self.samples.as_ref().map_or(0, Reader::epochs);
+        self.health.lost = self.ports.samples.as_ref().map_or(0, Reader::lost);
+        self.health.epochs = self.ports.samples.as_ref().map_or(0, Reader::epochs);
         if let (Some(identification), Some(online)) =
             (&mut self.identification, self.pipeline.identification())
         {
@@ -571,9 +633,9 @@ impl DataPlane {
             self.health.identification = sum;
         }
         // A failed send is not repeated: the next health message follows soon.
-        let _ = self.health_writer.send(&self.health, now);
-        let _ = self.description_writer.update_connections();
-        let _ = self.inertias.as_mut().map(Writer::update_connections);
+        let _ = self.ports.health.send(&self.health, now);
+        let _ = self.ports.description.update_connections();
+        let _ = self.ports.inertias.as_mut().map(Writer::update_connections);
     }
 }
 

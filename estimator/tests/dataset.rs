@@ -546,7 +546,8 @@ fn derivatives_that_are_noise_are_not_used() {
         let [noisy] = instants.findings() else {
             panic!("{:?}", instants.findings());
         };
-        let begin = format!("joint/elbow: the logged acceleration is not that of the {reference}: ");
+        let begin =
+            format!("joint/elbow: the logged acceleration is not that of the {reference}: ");
         let off: f64 = (noisy.text.strip_prefix(&begin))
             .and_then(|rest| rest.split(' ').next()?.parse().ok())
             .unwrap_or_else(|| panic!("{}", noisy.text));

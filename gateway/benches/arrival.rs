@@ -148,7 +148,12 @@ fn main() {
                     Writer::<Sample>::create(&domain, robot, domain.epoch()).expect("a port");
                 let link = VirtualBus::open(&link_domain, bus, &decoder.claims()).expect("a bus");
                 if kind == "proprio" {
-                    let mut bus = Bus::new(Box::new(link), decoder, Shared(writer), status);
+                    let mut bus = Bus::new(
+                        Box::new(link),
+                        decoder,
+                        Shared::new(writer, "robot", Arc::default()),
+                        status,
+                    );
                     let turn = || {
                         bus.turn(&Monotonic);
                     };

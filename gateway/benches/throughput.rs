@@ -187,7 +187,12 @@ fn frames_to_shared_memory(bencher: Bencher<'_, '_>) {
     let writer = Writer::<Sample>::create(&domain, "bench", domain.epoch()).unwrap();
     let mut sender = VirtualBus::open(&name, "arm", &[]).unwrap();
     let link = Waiting(VirtualBus::open(&name, "arm", &decoder.claims()).unwrap());
-    let bus = std::cell::RefCell::new(Bus::new(Box::new(link), decoder, Shared(writer), status));
+    let bus = std::cell::RefCell::new(Bus::new(
+        Box::new(link),
+        decoder,
+        Shared::new(writer, "robot", Arc::default()),
+        status,
+    ));
     let frames = frames();
     bencher
         .counter(ItemsCount::new(FRAMES))

@@ -93,12 +93,7 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
     let mut interrupt = signal(SignalKind::interrupt()).context("cannot catch SIGINT")?;
     let clock = Monotonic;
     let started = clock.now();
-    let domain = Domain::open(domain_config)?;
-    let epoch = domain.epoch();
-    // Health first: it admits one writer, so this fails if the robot already has a gateway.
-    let mut health_writer = Writer::<GatewayHealth>::create(&domain, &plan.robot, epoch)?;
-    let mut description_writer = Writer::<Description>::create(&domain, &plan.robot, epoch)?;
-    description_writer.send(&plan.description(), clock.now())?;
+    let mut ports = Ports::open(Domain::open(domain_config)?, &plan, clock.now())?;
 
     for bus in plan.buses.iter().filter(|bus| bus.load.is_high()) {
         tracing::warn!(
@@ -114,7 +109,7 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
     let mut threads = Vec::new();
     let mut failure = None;
     for (bus, number) in plan.buses.iter().zip(0_u32..) {
-        match BusThread::start(&plan, bus, number, &domain, epoch, &stop, replay_start) {
+        match BusThread::start(&plan, bus, number, &ports.domain, &stop, replay_start) {
             Ok(thread) => threads.push(thread),
             Err(error) => {
                 failure = Some(error.context(format!("bus {:?}", bus.name)));
@@ -145,14 +140,7 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
         }
     };
     let (ask, mut asked) = tokio::sync::mpsc::channel(control::MAX_CLIENTS);
-    let socket = match control::Socket::open(domain_config, &plan.robot, ask) {
-        Ok(socket) => Some(socket),
-        // Measuring is more important.
-        Err(error) => {
-            tracing::warn!("there is no control socket, and `proprio ctl` cannot work: {error}");
-            None
-        }
-    };
+    let mut socket = control_socket(domain_config, &plan.robot, &ask);
     let watched = Arc::new(Mutex::new(plan.clone()));
     if let Err(error) = watch::start(
         Arc::clone(&watched),
@@ -174,6 +162,7 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
 
     let mut health = Box::new(GatewayHealth::new(started));
     let mut health_log = HealthLog::default();
+    let (mut is_damaged, mut has_failed) = (false, false);
     let mut ticks = tokio::time::interval(HEALTH_PERIOD);
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     let why = loop {
@@ -184,7 +173,8 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
                 fill_health(&mut health, &statuses(&threads), &observer.newest());
                 operator.begin(asked, &mut threads, &health, clock.now());
                 if operator.has_reloaded() {
-                    let _ = description_writer.send(&operator.plan().description(), clock.now());
+                    let description = operator.plan().description();
+                    let _ = ports.description.send(&description, clock.now());
                     *watched.lock().unwrap_or_else(PoisonError::into_inner) =
                         operator.plan().clone();
                 }
@@ -203,8 +193,30 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
         health_log.log_changes(&health, &statuses);
         // A reader that cannot be reached now is no reason to stop; the next health follows in 0.1
         // s.
-        let _ = health_writer.send(&health, now);
-        let _ = description_writer.update_connections();
+        let _ = ports.health.send(&health, now);
+        let _ = ports.description.update_connections();
+        let renewed = ports.domain.renewed().map(|domain| {
+            if !std::mem::replace(&mut is_damaged, true) {
+                tracing::error!("{}", ports.domain.damage());
+            }
+            Ports::open(domain?, operator.plan(), now)
+        });
+        match renewed {
+            Some(Ok(new)) => {
+                ports = new;
+                for thread in &threads {
+                    thread.renewal.pass(ports.domain.clone());
+                }
+                drop(socket.take());
+                socket = control_socket(domain_config, &operator.plan().robot, &ask);
+            }
+            Some(Err(error)) if !has_failed => {
+                has_failed = true;
+                tracing::error!("{error:#}; trying again");
+            }
+            Some(Err(_)) => {}
+            None => (is_damaged, has_failed) = (false, false),
+        }
         operator.look(&mut threads, now);
         if threads.iter().any(BusThread::is_lost) {
             break "a bus thread has ended unexpectedly";
@@ -222,10 +234,47 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
     let _ = sd_notify::notify(&[NotifyState::Stopping]);
     let panicked = join(&mut threads, &stop);
     fill_health(&mut health, &statuses(&threads), &observer.newest());
-    let _ = health_writer.send(&health, clock.now());
+    let _ = ports.health.send(&health, clock.now());
     match panicked {
         None => Ok(()),
         Some(bus) => bail!("the thread of bus {bus:?} panicked: this is a bug in the program"),
+    }
+}
+
+/// The control plane's ports.
+struct Ports {
+    domain: Domain,
+    health: Writer<GatewayHealth>,
+    description: Writer<Description>,
+}
+
+impl Ports {
+    fn open(domain: Domain, plan: &Plan, now: Nanos) -> anyhow::Result<Self> {
+        let epoch = domain.epoch();
+        // Health first: it admits one writer, so this fails if the robot already has a gateway.
+        let health = Writer::create(&domain, &plan.robot, epoch)?;
+        let mut description = Writer::<Description>::create(&domain, &plan.robot, epoch)?;
+        description.send(&plan.description(), now)?;
+        Ok(Self {
+            domain,
+            health,
+            description,
+        })
+    }
+}
+
+fn control_socket(
+    domain: &DomainConfig,
+    robot: &str,
+    ask: &tokio::sync::mpsc::Sender<control::Asked>,
+) -> Option<control::Socket> {
+    match control::Socket::open(domain, robot, ask.clone()) {
+        Ok(socket) => Some(socket),
+        // Measuring is more important.
+        Err(error) => {
+            tracing::warn!("there is no control socket, and `proprio ctl` cannot work: {error}");
+            None
+        }
     }
 }
 

@@ -1,7 +1,8 @@
 //! Destinations of samples: shared memory, or a vector in tests.
 
-use proprio_topics::ipc::Writer;
+use proprio_topics::ipc::{Domain, Renewal, Writer};
 use proprio_topics::{Nanos, Sample};
+use std::sync::Arc;
 
 /// A sample could not be published. It is lost; the next one is not affected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -39,17 +40,50 @@ impl Sink for Memory {
 
 /// Shared memory: `<robot>/samples`.
 #[derive(Debug)]
-pub struct Shared(pub Writer<Sample>);
+pub struct Shared {
+    writer: Writer<Sample>,
+    robot: String,
+    renewal: Arc<Renewal>,
+}
+
+impl Shared {
+    /// Publishes the samples of `robot` with `writer`, until a `renewal`.
+    pub fn new(writer: Writer<Sample>, robot: &str, renewal: Arc<Renewal>) -> Self {
+        Self {
+            writer,
+            robot: robot.to_owned(),
+            renewal,
+        }
+    }
+
+    /// Makes the writer anew in `domain`; until it can be made, samples are lost and counted.
+    #[cold]
+    fn renew(&mut self, domain: &Domain) {
+        match Writer::create(domain, &self.robot, domain.epoch()) {
+            Ok(writer) => self.writer = writer,
+            Err(error) => {
+                tracing::error!("samples cannot be published: {error}");
+                domain.abandon();
+            }
+        }
+    }
+}
 
 impl Sink for Shared {
     fn publish(&mut self, sample: &mut Sample, now: Nanos) -> Result<u32, SinkError> {
-        let sent = self.0.send(sample, now).map_err(|_| SinkError)?;
+        if let Some(domain) = self.renewal.take() {
+            self.renew(&domain);
+        }
+        let sent = self.writer.send(sample, now).map_err(|_| SinkError)?;
         Ok(u32::try_from(sent.connected).unwrap_or(u32::MAX))
     }
 
     fn idle(&mut self) {
+        if let Some(domain) = self.renewal.take() {
+            self.renew(&domain);
+        }
         // A reader that cannot be connected now is connected, or counted as a failure, with the
         // next sample.
-        let _ = self.0.update_connections();
+        let _ = self.writer.update_connections();
     }
 }

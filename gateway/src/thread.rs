@@ -16,7 +16,7 @@ use crate::publish::Shared;
 use crate::status::BusStatus;
 use anyhow::{Context, anyhow};
 use proprio_drivers::{Claim, Mode};
-use proprio_topics::ipc::{Domain, Writer};
+use proprio_topics::ipc::{Domain, Renewal, Writer};
 use proprio_topics::realtime;
 use proprio_topics::{Nanos, Sample};
 use std::path::Path;
@@ -56,6 +56,8 @@ pub(crate) struct BusThread {
     ended: Arc<AtomicBool>,
     /// The way into its inbox.
     pub(crate) requests: Requests,
+    /// The way to a new domain.
+    pub(crate) renewal: Arc<Renewal>,
     /// The mode that overrides the devices' own.
     pub(crate) mode: Option<Mode>,
     thread: Finished,
@@ -96,7 +98,6 @@ impl BusThread {
         bus: &BusPlan,
         number: u32,
         domain: &Domain,
-        epoch: u64,
         stop: &Arc<AtomicBool>,
         replay_start: Nanos,
     ) -> anyhow::Result<Self> {
@@ -121,11 +122,13 @@ impl BusThread {
         let (requests, inbox) = inbox(bus.devices.len());
         let (ready, is_ready) = mpsc::channel();
         let (domain, robot, realtime) = (domain.clone(), plan.robot.clone(), bus.realtime);
+        let renewal = Arc::new(Renewal::default());
+        let renewal_there = Arc::clone(&renewal);
         let (stop, ended_there, status_there) =
             (Arc::clone(stop), Arc::clone(&ended), Arc::clone(&status));
         let body = move || {
             // A port belongs to the thread that creates it.
-            let writer = match Writer::<Sample>::create(&domain, &robot, epoch) {
+            let writer = match Writer::<Sample>::create(&domain, &robot, domain.epoch()) {
                 Ok(writer) => writer,
                 Err(error) => return drop(ready.send(Err(error))),
             };
@@ -134,7 +137,8 @@ impl BusThread {
                 .unwrap_or_default();
             let _ = ready.send(Ok(refused));
             let clock = Monotonic;
-            let mut bus = Bus::new(link, decoder, Shared(writer), status_there).with_inbox(inbox);
+            let sink = Shared::new(writer, &robot, renewal_there);
+            let mut bus = Bus::new(link, decoder, sink, status_there).with_inbox(inbox);
             while !stop.load(Acquire) {
                 if bus.turn(&clock) == Turn::Ended {
                     if let Some(note) = bus.link_note() {
@@ -154,6 +158,7 @@ impl BusThread {
         let name: String = format!("bus {}", bus.name).chars().take(15).collect();
         let thread = std::thread::Builder::new()
             .name(name)
+            .stack_size(realtime::SMALL_STACK)
             .spawn(body)
             .context("cannot start a thread")?;
         let refused = is_ready
@@ -170,6 +175,7 @@ impl BusThread {
             status,
             ended,
             requests,
+            renewal,
             mode,
             thread: Finished(Some(thread)),
         })
@@ -223,6 +229,7 @@ impl BusThread {
             status: Arc::new(BusStatus::new(0, bus)),
             ended: Arc::default(),
             requests,
+            renewal: Arc::default(),
             mode: matches!(bus.source, Source::Replay { .. }).then_some(Mode::Listen),
             thread: Finished(None),
         };
@@ -306,7 +313,7 @@ mod tests {
         let start = Monotonic.now() + Nanos::from_millis(300);
         let mut threads = Vec::new();
         for (bus, number) in plan.buses.iter().zip(0..) {
-            let thread = BusThread::start(&plan, bus, number, &domain, 1, &stop, start);
+            let thread = BusThread::start(&plan, bus, number, &domain, &stop, start);
             threads.push(thread.unwrap());
         }
         let mut reader = Reader::<Sample>::open(&domain, "r").unwrap();

@@ -27,7 +27,7 @@ use crate::plan::{BusPlan, Plan};
 use crate::scan::devices;
 use crate::status::BusStatus;
 use proprio_drivers::{Certainty, Claim, Frame, Mode, Spec, Traffic};
-use proprio_topics::{Nanos, Reading};
+use proprio_topics::{Nanos, Reading, realtime};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -73,7 +73,9 @@ pub(crate) fn start(plan: Shared, domain: String, stop: Arc<AtomicBool>) -> std:
             }
         }
     };
-    let thread = std::thread::Builder::new().name("watch".into());
+    let thread = std::thread::Builder::new()
+        .name("watch".into())
+        .stack_size(realtime::SMALL_STACK);
     thread.spawn(body).map(drop)
 }
 

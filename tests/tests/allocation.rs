@@ -363,7 +363,7 @@ fn a_bus_that_publishes_allocates_the_transports_loan_alone() {
             let writer =
                 Writer::<Sample>::create(&domain, &format!("bus{number}"), domain.epoch()).unwrap();
             reader = Some(Reader::<Sample>::open(&domain, &format!("bus{number}")).unwrap());
-            Shared(writer)
+            Shared::new(writer, "robot", Arc::default())
         });
         let sends = usize::try_from(published).unwrap();
         assert_eq!(

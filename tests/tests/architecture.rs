@@ -99,7 +99,7 @@ const BARE: [&str; 20] = [
 ];
 
 /// The files that may contain `unsafe`, with the reason.
-const UNSAFE: [(&str, &str); 6] = [
+const UNSAFE: [(&str, &str); 8] = [
     (
         "gateway/src/link/socket.rs",
         "recvmmsg without allocation, and an ioctl that no library wraps",
@@ -107,6 +107,14 @@ const UNSAFE: [(&str, &str); 6] = [
     (
         "gateway/topics/src/ipc/bell.rs",
         "an atomic word in memory that processes share",
+    ),
+    (
+        "gateway/topics/src/ipc/guard.rs",
+        "a signal handler that maps memory",
+    ),
+    (
+        "gateway/topics/src/realtime.rs",
+        "locks the mappings of a process",
     ),
     ("gateway/topics/tests/allocation.rs", "a counting allocator"),
     ("gateway/topics/tests/layout.rs", "the bytes of a payload"),

@@ -1,10 +1,11 @@
 //! Scheduling of real-time threads in gateway, estimator and control loops: processor affinity,
 //! SCHED_FIFO, locked memory.
 
+use nix::libc;
 use nix::sched::{CpuSet, sched_setaffinity};
-use nix::sys::mman::{MlockAllFlags, mlockall};
 use nix::unistd::Pid;
 use std::format;
+use std::fs;
 use std::io;
 use std::string::{String, ToString};
 use std::vec::Vec;
@@ -14,8 +15,50 @@ use thread_priority::unix::{
 };
 use thread_priority::{Error, ThreadPriority, ThreadPriorityValue};
 
+/// Stack of a thread that needs little \[bytes\]: all of it counts as locked memory. The usual two
+/// megabytes for each of sixteen buses would be most of what the gateway locks.
+pub const SMALL_STACK: usize = 512 << 10;
+
+/// Locks the memory that this process has now: code, data, heap, stacks, mapped shared memory. What
+/// has been touched stays in memory, and what is touched later stays from then on. (Pages of shared
+/// memory are allocated when its file is made.)
+///
+/// `mlockall` also counts address space that is only reserved, as by the C library for the heap of
+/// each thread: hundreds of megabytes, of which a few are used.
+#[allow(unsafe_code)]
+fn lock_memory() -> io::Result<()> {
+    let maps = || fs::read_to_string("/proc/self/maps");
+    for line in maps()?.lines() {
+        let Some((start, length)) = readable(line) else {
+            continue;
+        };
+        // SAFETY: a locked page differs from another in nothing that a program can see; a range
+        // that was unmapped meanwhile is an error.
+        if unsafe { libc::mlock2(start as *const _, length, libc::MLOCK_ONFAULT) } != 0 {
+            let error = io::Error::last_os_error();
+            let is_there = maps()?.lines().any(|other| other == line);
+            if is_there {
+                return Err(error);
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Start and length of a mapping that can be read, from a line of /proc/PID/maps; not of the
+/// kernel's own. Source: proc_pid_maps(5).
+fn readable(line: &str) -> Option<(usize, usize)> {
+    let (range, rest) = line.split_once(' ')?;
+    let (start, end) = range.split_once('-')?;
+    let address = |digits| usize::from_str_radix(digits, 16).ok();
+    let (start, end) = (address(start)?, address(end)?);
+    let is_kernels = rest.contains("[v");
+    (rest.starts_with('r') && !is_kernels).then(|| (start, end.saturating_sub(start)))
+}
+
 /// Binds the calling thread to `cpu`; gives it SCHED_FIFO `priority` (1 to 99) and locks the
-/// process's memory. `None` leaves a setting as it is. A setting that is not granted is not fatal.
+/// memory that the process has. `None` leaves a setting as it is. A setting that is not granted is
+/// not fatal.
 ///
 /// Returns one message per setting that was not granted, with the way to grant it.
 #[must_use]
@@ -33,7 +76,7 @@ pub fn apply(cpu: Option<usize>, priority: Option<i32>) -> Vec<String> {
         }
     }
     if let Some(priority) = priority {
-        if let Err(error) = mlockall(MlockAllFlags::MCL_CURRENT | MlockAllFlags::MCL_FUTURE) {
+        if let Err(error) = lock_memory() {
             refused.push(format!(
                 "locked memory: {error}; set LimitMEMLOCK=infinity in the systemd unit"
             ));
@@ -60,4 +103,17 @@ pub fn apply(cpu: Option<usize>, priority: Option<i32>) -> Vec<String> {
         }
     }
     refused
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_can_be_read_is_locked() {
+        let line = "7f00-8000 rw-s 00000000 00:1a 5 /dev/shm/proprio_0a_x.data";
+        assert_eq!(readable(line), Some((0x7f00, 0x100)));
+        assert_eq!(readable("7f00-8000 ---p 00000000 00:00 0 "), None);
+        assert_eq!(readable("7f00-8000 r-xp 00000000 00:00 0 [vdso]"), None);
+    }
 }

@@ -577,7 +577,7 @@ fn garbage_is_counted_and_skipped() {
         state >> 3 ^ state << 29
     };
     let mut bytes = [0; size_of::<Garbage>()];
-    let count = 500;
+    let count = Sample::QUALITY.buffer as u64 / 2;
     for _ in 0..count {
         bytes
             .chunks_mut(8)

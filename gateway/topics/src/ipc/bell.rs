@@ -16,6 +16,7 @@ use core::num::NonZeroU32;
 use core::sync::atomic::AtomicU32;
 use core::sync::atomic::Ordering::{AcqRel, Acquire};
 use memmap2::{MmapOptions, MmapRaw};
+use nix::fcntl::posix_fallocate;
 use rustix::io::Errno;
 use rustix::thread::futex::{self, Flags, Timespec};
 use std::fs::{DirBuilder, OpenOptions};
@@ -73,7 +74,12 @@ impl Bell {
             .open(Self::file(folder, service))?;
         // Whoever was killed between these two lines has left an empty file, which is as good as a
         // new one.
-        file.set_len(size_of::<Words>() as u64)?;
+        loop {
+            match posix_fallocate(&file, 0, size_of::<Words>() as i64) {
+                Err(nix::Error::EINTR) => {}
+                done => break done?,
+            }
+        }
         let memory = MmapOptions::new().len(size_of::<Words>()).map_raw(&file)?;
         Ok(Self { memory })
     }

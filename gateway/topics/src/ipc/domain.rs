@@ -2,7 +2,9 @@
 
 use super::bell::Bell;
 use super::error::{SHM, transport};
+use super::guard::Guard;
 use super::lock::Lock;
+use super::memory::{self, Made};
 use super::sweep::{self, Place, SweepCounts};
 use super::{DomainError, PortError};
 use iceoryx2::prelude::{
@@ -13,11 +15,13 @@ use iceoryx2::service::Service;
 use nix::unistd::{AccessFlags, access, geteuid};
 use std::borrow::ToOwned;
 use std::format;
-use std::fs::{self, DirBuilder, File, Metadata};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::fs::{self, DirBuilder, File, Metadata, Permissions};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::string::String;
-use std::sync::{Arc, Mutex, Once, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, Once, PoisonError};
+use std::time::Duration;
+use std::vec::Vec;
 
 /// Directory and name of a domain.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -169,6 +173,9 @@ struct Inner<S: Service> {
     folder: File,
     // `None` only during `drop`.
     node: Mutex<Option<Node<S>>>,
+    guard: Guard,
+    /// The files that this process has made.
+    made: Mutex<Vec<Made>>,
 }
 
 impl Domain {
@@ -234,11 +241,24 @@ impl<S: Service> Domain<S> {
             doing: "cannot create a node",
             problem,
         };
-        let node = NodeBuilder::new()
-            .config(&iceoryx)
-            .signal_handling_mode(SignalHandlingMode::Disabled)
-            .create::<S>()
-            .map_err(|e| failed(transport(e)))?;
+        memory::require(memory::BESIDE)?;
+        let guard = Guard::new();
+        let before = memory::files(&place)?;
+        let create = || {
+            NodeBuilder::new()
+                .config(&iceoryx)
+                .signal_handling_mode(SignalHandlingMode::Disabled)
+                .create::<S>()
+        };
+        // What all nodes share is one counter, which need not go on: if the file cannot be used,
+        // there will be a new one.
+        let created = create().or_else(|error| match remove_counter(&place) {
+            true => create(),
+            false => Err(error),
+        });
+        let node = created.map_err(|e| failed(transport(e)))?;
+        protect_counter(&place);
+        let made = memory::commit(&place, &before)?;
         let id = node.id().value();
         sweep::register(&place, id);
         let folder = File::open(&place.root).map_err(|cause| DomainError::Io {
@@ -254,6 +274,8 @@ impl<S: Service> Domain<S> {
             id,
             folder,
             node: Mutex::new(Some(node)),
+            guard,
+            made: Mutex::new(made),
         };
         Ok(Self {
             inner: Arc::new(inner),
@@ -282,33 +304,50 @@ impl<S: Service> Domain<S> {
         sweep::sweep(&self.inner.place, &self.inner.iceoryx)
     }
 
-    /// Runs `create` under the domain's lock, after a sweep.
+    /// Runs `create` under the domain's lock, after a sweep. It may make files of `needed` bytes in
+    /// all, which are allocated.
     pub(super) fn locked<R>(
         &self,
+        needed: u64,
         create: impl FnOnce(&Node<S>) -> Result<R, PortError>,
     ) -> Result<R, PortError> {
-        let _lock = Lock::take(&self.inner.place.lock)?;
-        sweep::sweep(&self.inner.place, &self.inner.iceoryx)?;
-        match &*self
-            .inner
-            .node
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-        {
-            Some(node) => create(node),
-            None => Err(self.gone().into()),
+        let place = &self.inner.place;
+        let _lock = Lock::take(&place.lock)?;
+        let damaged = || DomainError::Damaged {
+            root: place.root.clone(),
+        };
+        if !self.is_usable() {
+            return Err(damaged().into());
         }
+        sweep::sweep(place, &self.inner.iceoryx)?;
+        memory::require(needed)?;
+        let before = memory::files(place)?;
+        let node = self.inner.node.lock();
+        let created = match &*node.unwrap_or_else(PoisonError::into_inner) {
+            Some(node) => {
+                let created = self.inner.guard.survive(|| create(node));
+                created.ok_or_else(damaged)??
+            }
+            None => return Err(self.gone().into()),
+        };
+        self.inner.keep(memory::commit(place, &before)?);
+        Ok(created)
     }
 
-    /// Runs `change` under the domain's lock, after a sweep; `None` if another process holds it, or
-    /// if the domain's directory has gone. Never waits.
+    /// Runs `change` under the domain's lock, after a sweep; `None` if another process holds it, if
+    /// the domain's directory has gone, or without memory. Never waits.
     pub(super) fn try_locked<R>(&self, change: impl FnOnce() -> R) -> Option<R> {
-        let _lock = Lock::try_take(&self.inner.place.lock).ok()?;
-        if !self.is_there() {
+        let place = &self.inner.place;
+        let _lock = Lock::try_take(&place.lock).ok()?;
+        if !self.is_usable() {
             return None;
         }
-        sweep::sweep(&self.inner.place, &self.inner.iceoryx).ok()?;
-        Some(change())
+        sweep::sweep(place, &self.inner.iceoryx).ok()?;
+        memory::require(memory::BESIDE).ok()?;
+        let before = memory::files(place).ok()?;
+        let changed = change();
+        self.inner.keep(memory::commit(place, &before).ok()?);
+        Some(changed)
     }
 
     /// Drops a port under the domain's lock, so that no process sees it half removed.
@@ -316,6 +355,44 @@ impl<S: Service> Domain<S> {
         // If a stopped process holds the lock, drop without it: a program must be able to end.
         let _lock = Lock::take(&self.inner.place.lock);
         self.inner.drop_unless_replaced(port);
+        self.inner.made().retain(Made::exists);
+    }
+
+    /// Whether everything that this process has made in the domain is as it was: nobody has
+    /// deleted, replaced or shortened a file. Looks at each, so not for a data plane.
+    #[must_use]
+    pub fn is_intact(&self) -> bool {
+        self.is_usable() && self.inner.made().iter().all(Made::is_intact)
+    }
+
+    pub(super) fn guard(&self) -> &Guard {
+        &self.inner.guard
+    }
+
+    /// Whether ports may still be used: the directory is there, and no memory was found damaged.
+    pub(super) fn is_usable(&self) -> bool {
+        self.is_there() && self.inner.guard.is_sound()
+    }
+
+    /// What happened to a domain that is not intact, for a person.
+    #[must_use]
+    pub fn damage(&self) -> String {
+        format!(
+            "files of the shared-memory domain {:?} ({}, /dev/shm/{}*) were deleted, replaced or \
+             shortened by another program; they are made again",
+            self.inner.config.name,
+            self.inner.place.root.display(),
+            self.inner.place.prefix
+        )
+    }
+
+    /// Gives up a domain that is not intact: removes its directory, by which all its processes see
+    /// that they must open a new one.
+    pub fn abandon(&self) {
+        let _lock = Lock::take(&self.inner.place.lock);
+        if self.is_there() {
+            let _ = fs::remove_dir_all(&self.inner.place.root);
+        }
     }
 
     /// The bell of `service`.
@@ -331,6 +408,11 @@ impl<S: Service> Domain<S> {
     /// Whether the domain's directory is still the one that was opened.
     pub(super) fn is_there(&self) -> bool {
         self.inner.is_there()
+    }
+
+    #[cfg(test)]
+    pub(super) fn prefix(&self) -> &str {
+        &self.inner.place.prefix
     }
 
     pub(super) fn iceoryx(&self) -> &Config {
@@ -351,7 +433,37 @@ impl<S: Service> Domain<S> {
     }
 }
 
+/// The segment that counts a domain's nodes. iceoryx2 makes it writable for everybody.
+fn counters(place: &Place) -> impl Iterator<Item = PathBuf> {
+    let segments = place.segments().into_iter().flatten();
+    let is_counter = |path: &PathBuf| path.extension().is_some_and(|end| end == "global_mgmt");
+    segments.map(|(path, _)| path).filter(is_counter)
+}
+
+/// Removes the counter; returns whether there was one.
+fn remove_counter(place: &Place) -> bool {
+    counters(place)
+        .filter(|path| fs::remove_file(path).is_ok())
+        .count()
+        > 0
+}
+
+/// Leaves the counter to its owner.
+fn protect_counter(place: &Place) {
+    for path in counters(place) {
+        let _ = fs::set_permissions(path, Permissions::from_mode(0o600));
+    }
+}
+
 impl<S: Service> Inner<S> {
+    fn made(&self) -> MutexGuard<'_, Vec<Made>> {
+        self.made.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn keep(&self, made: Vec<Made>) {
+        self.made().extend(made);
+    }
+
     fn is_there(&self) -> bool {
         let inode = |meta: Metadata| (meta.dev(), meta.ino());
         let now = fs::metadata(&self.place.root).map(inode);
@@ -360,9 +472,10 @@ impl<S: Service> Inner<S> {
     }
 
     /// Drops a node or port. If the domain's directory was deleted, there is nothing to remove, and
-    /// iceoryx2 would remove the files of the same names in the directory that has replaced it.
+    /// iceoryx2 would remove the files of the same names in the directory that has replaced it. And
+    /// it would not find its way in damaged memory.
     fn drop_unless_replaced<P>(&self, resource: P) {
-        if self.is_there() {
+        if self.is_there() && self.guard.is_sound() {
             drop(resource);
         } else {
             std::mem::forget(resource);
@@ -417,6 +530,8 @@ fn iceoryx(place: &Place) -> Result<Config, DomainError> {
     config
         .global
         .set_root_path(&IoxPath::new(root).map_err(|e| failed(transport(e)))?);
+    // Nothing is half made under the lock: what looks so is damaged, and does not get better.
+    config.global.creation_timeout = Duration::from_millis(10);
     // `sweep` does all cleaning; iceoryx2's own runs without the lock.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;

@@ -3,7 +3,6 @@
 use crate::ROBOT_NAME;
 use core::fmt;
 use nix::sys::resource::{Resource, getrlimit};
-use nix::sys::statvfs::statvfs;
 use std::format;
 use std::io;
 use std::path::PathBuf;
@@ -32,15 +31,10 @@ pub(super) const SHM: &str = "/dev/shm";
 pub(super) fn transport(word: impl fmt::Display) -> String {
     /// More than it opens at once.
     const FILES: usize = 16;
-    /// Less than one port's segment of any topic.
-    const BYTES: u64 = 64 << 10;
     let limit = getrlimit(Resource::RLIMIT_NOFILE).map_or(u64::MAX, |(soft, _)| soft);
     let open = std::fs::read_dir("/proc/self/fd").map_or(usize::MAX, Iterator::count);
-    let room = statvfs(SHM).map_or(u64::MAX, |fs| fs.blocks_available() * fs.fragment_size());
     let cause = if open.saturating_add(FILES) as u64 > limit {
         TOO_MANY
-    } else if room < BYTES {
-        "/dev/shm is full: `df /dev/shm`; in a container --shm-size makes it larger"
     } else {
         "shared memory cannot be used; `proprio doctor` tests it; if it finds nothing, end all \
          processes of this domain and start them again"
@@ -87,6 +81,15 @@ pub enum DomainError {
         /// Its directory.
         root: PathBuf,
     },
+    /// Another program has deleted or damaged files of the domain since it was opened.
+    #[error(
+        "shared-memory domain: files of {} were deleted or damaged: open the domain again",
+        root.display()
+    )]
+    Damaged {
+        /// Its directory.
+        root: PathBuf,
+    },
     /// There is no /dev/shm, or it is not writable.
     #[error(
         "no shared memory: /dev/shm {problem}; in a container, give it one that all processes \
@@ -95,6 +98,18 @@ pub enum DomainError {
     NoSharedMemory {
         /// The error.
         problem: io::Error,
+    },
+    /// Shared memory is full.
+    #[error(
+        "/dev/shm is full: {} kB are needed, {} kB are free (`df /dev/shm`); remove files there, \
+         or make it larger: `mount -o remount,size=256M /dev/shm`, in a container --shm-size",
+        needed.div_ceil(1024), free / 1024
+    )]
+    NoRoom {
+        /// What is needed \[bytes\].
+        needed: u64,
+        /// What is free \[bytes\].
+        free: u64,
     },
     /// The directory or a file in it belongs to another user. Only the owner of iceoryx2's files
     /// can use them.
@@ -241,6 +256,7 @@ pub enum SendError {
     #[error("no free payload in shared memory")]
     OutOfMemory,
     /// A connection to a reader could not be made or is broken; the other readers have the payload.
+    /// Or the domain is damaged ([`Domain::is_intact`](super::Domain::is_intact)).
     #[error("a reader's connection failed")]
     Connection,
     /// Any other error of iceoryx2.
@@ -252,7 +268,8 @@ pub enum SendError {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum TakeError {
-    /// A connection to a writer could not be made; try again.
+    /// A connection to a writer could not be made, or the domain is damaged
+    /// ([`Domain::is_intact`](super::Domain::is_intact)); try again.
     #[error("a writer's connection failed")]
     Connection,
     /// Any other error of iceoryx2.

@@ -30,9 +30,12 @@ mod clock;
 mod domain;
 mod error;
 mod failures;
+mod guard;
 mod lock;
+mod memory;
 mod presence;
 mod reader;
+mod renewal;
 mod robot;
 mod sweep;
 mod topic;
@@ -41,8 +44,10 @@ mod writer;
 pub use clock::monotonic;
 pub use domain::{Domain, DomainConfig, fnv1a};
 pub use error::{DomainError, PortError, SendError, TakeError, open_files_remedy};
+pub use memory::memory_needed;
 pub use presence::{Presence, RobotPresence, Watch};
 pub use reader::{Freshness, Reader};
+pub use renewal::Renewal;
 pub use robot::{
     ChannelHandle, Contact, ContactHandle, Measured, Missing, RobotReader, Torque, TorqueHandle,
     Unavailable,

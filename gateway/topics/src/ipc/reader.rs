@@ -4,6 +4,7 @@ use super::bell::{Bell, Rings};
 use super::domain::service_name;
 use super::error::transport;
 use super::failures::Failures;
+use super::memory;
 use super::writer::explain;
 use super::{Domain, PortError, TakeError, Topic};
 use crate::{Header, Nanos};
@@ -119,22 +120,23 @@ impl<T: Topic, S: Service> Reader<T, S> {
             });
         }
         let failures = Failures::default();
-        let (subscriber, service, predecessors, (bell, changes)) = domain.locked(|node| {
-            let bell = domain.bell(&name)?;
-            let changes = bell.changes();
-            let service = node
-                .service_builder(&name)
-                .publish_subscribe::<T>()
-                .open()
-                .map_err(|e| explain::<T, _>(domain, &name, e))?;
-            let mut predecessors = Vec::new();
-            service.dynamic_config().list_publishers(|p| {
-                predecessors.push(p.publisher_id.value());
-                CallbackProgression::Continue
-            });
-            let subscriber = subscribe(&service, &failures)?;
-            Ok((subscriber, service, predecessors, (bell, changes)))
-        })?;
+        let (subscriber, service, predecessors, (bell, changes)) =
+            domain.locked(memory::BESIDE, |node| {
+                let bell = domain.bell(&name)?;
+                let changes = bell.changes();
+                let service = node
+                    .service_builder(&name)
+                    .publish_subscribe::<T>()
+                    .open()
+                    .map_err(|e| explain::<T, _>(domain, &name, e))?;
+                let mut predecessors = Vec::new();
+                service.dynamic_config().list_publishers(|p| {
+                    predecessors.push(p.publisher_id.value());
+                    CallbackProgression::Continue
+                });
+                let subscriber = subscribe(&service, &failures)?;
+                Ok((subscriber, service, predecessors, (bell, changes)))
+            })?;
         Ok(Self {
             ports: Some((subscriber, service)),
             domain: domain.clone(),
@@ -162,13 +164,16 @@ impl<T: Topic, S: Service> Reader<T, S> {
         let Some((subscriber, _)) = &self.ports else {
             return Err(TakeError::Internal);
         };
-        let rings = self.bell.rings();
+        let (rings, guard) = (self.bell.rings(), self.domain.guard());
         // No endless loop, even if a writer sends nonsense as fast as this reads.
         for _ in 0..T::QUALITY.buffer.saturating_mul(T::QUALITY.publishers) {
-            let sample = subscriber.receive().map_err(|e| match e {
-                ReceiveError::ConnectionFailure(_) => TakeError::Connection,
-                ReceiveError::ExceedsMaxBorrows => TakeError::Internal,
-            })?;
+            let received = guard.survive(|| subscriber.receive());
+            let sample = received
+                .ok_or(TakeError::Connection)?
+                .map_err(|e| match e {
+                    ReceiveError::ConnectionFailure(_) => TakeError::Connection,
+                    ReceiveError::ExceedsMaxBorrows => TakeError::Internal,
+                })?;
             let Some(sample) = sample else {
                 self.heard = rings;
                 if self.failures.is_due() {
@@ -178,7 +183,9 @@ impl<T: Topic, S: Service> Reader<T, S> {
             };
             let value = *sample.payload();
             let writer = sample.header().publisher_id().value();
-            drop(sample);
+            guard
+                .survive(|| drop(sample))
+                .ok_or(TakeError::Connection)?;
             if !value.is_valid() {
                 self.invalid += 1;
                 continue;
@@ -282,6 +289,11 @@ impl<T: Topic, S: Service> Reader<T, S> {
     /// A live writer: the number of its node, which no other start of a process has, and its
     /// process (0 if it is not known).
     pub(super) fn live_writer(&self) -> Option<(u128, i32)> {
+        let guard = self.domain.guard();
+        guard.survive(|| self.writer_that_lives()).flatten()
+    }
+
+    fn writer_that_lives(&self) -> Option<(u128, i32)> {
         let mut writer = None;
         if let Some((_, service)) = &self.ports {
             service.dynamic_config().list_publishers(|p| {
@@ -311,9 +323,10 @@ impl<T: Topic, S: Service> Reader<T, S> {
     /// port.
     #[must_use]
     pub fn writers(&self) -> usize {
-        self.ports.as_ref().map_or(0, |(_, service)| {
-            service.dynamic_config().number_of_publishers()
-        })
+        let ports = self.ports.as_ref();
+        let count = |(_, service): &Ports<T, S>| service.dynamic_config().number_of_publishers();
+        let counted = self.domain.guard().survive(|| ports.map_or(0, count));
+        counted.unwrap_or(0)
     }
 }
 

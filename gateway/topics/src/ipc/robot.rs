@@ -21,6 +21,7 @@ use core::sync::atomic::Ordering::{AcqRel, Acquire, Relaxed, Release};
 use iceoryx2::prelude::ipc_threadsafe;
 use std::borrow::ToOwned;
 use std::boxed::Box;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::string::{String, ToString};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -600,7 +601,8 @@ impl Attaching {
                     estimator: Watch::default(),
                 };
                 while !attacher.shared.stop.load(Acquire) {
-                    attacher.turn(monotonic());
+                    // Whatever it finds in damaged memory, the next turn opens the domain anew.
+                    let _ = catch_unwind(AssertUnwindSafe(|| attacher.turn(monotonic())));
                     thread::park_timeout(PERIOD);
                 }
             })?;
@@ -707,14 +709,15 @@ impl Attacher {
         if self
             .domain
             .as_ref()
-            .is_some_and(|domain| !domain.is_there())
+            .is_some_and(|domain| !domain.is_usable())
         {
-            // Somebody has deleted the domain's files, or the last other process has left it.
+            // Somebody has deleted or damaged the domain's files, or the last other process has
+            // left it.
             self.shared.recall.store(true, Relaxed);
             if self.passed.contains(&true) {
                 return Missing {
                     problem: Some(format!(
-                        "the files of the domain {:?} have been deleted; waiting for new ones",
+                        "files of the domain {:?} were deleted or damaged; waiting for new ones",
                         self.config.name
                     )),
                     ..Missing::default()

@@ -359,7 +359,7 @@ impl Place {
     }
 
     /// The domain's shared-memory segments that belong to this user.
-    fn segments(&self) -> Result<Vec<(PathBuf, Metadata)>, DomainError> {
+    pub(super) fn segments(&self) -> Result<Vec<(PathBuf, Metadata)>, DomainError> {
         let user = nix::unistd::geteuid().as_raw();
         let mut segments = list(Path::new(SHM))?;
         segments.retain(|(path, meta)| {

@@ -10,7 +10,8 @@ use zerocopy::FromBytes;
 
 /// The quality of service of one service; the first process to create the service fixes it.
 ///
-/// A publisher reserves `subscribers * (buffer + 2) + history` payloads in shared memory.
+/// A publisher reserves `subscribers * (buffer + 1) + history + 1` payloads in shared memory, which
+/// are allocated when it is created.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct QualityOfService {
     /// Maximum number of writers at one time; 1 where a second writer would be a mistake.
@@ -24,6 +25,19 @@ pub struct QualityOfService {
     /// Number of its last payloads that a writer gives to a reader that opens late.
     pub history: usize,
 }
+
+impl QualityOfService {
+    /// Number of payloads for which a writer has room: what all readers may hold at once, and the
+    /// one that it writes.
+    #[must_use]
+    pub fn payloads(&self) -> usize {
+        self.subscribers * (self.buffer + BORROWED) + self.history + LOANED
+    }
+}
+
+/// Number of payloads that a reader looks at, and that a writer writes, at one time.
+pub(super) const BORROWED: usize = 1;
+pub(super) const LOANED: usize = 1;
 
 /// A payload type with its own service `<robot>/<SUFFIX>`.
 ///
@@ -71,16 +85,17 @@ fn within<E>(count: u32, entries: &[E]) -> bool {
 
 const NODES: usize = 64;
 
-// One publisher per bus. 2048 samples are a second of 20 channels at 100 Hz per bus; 20 MB per bus.
+// One publisher per bus, 2 MB each. 256 samples are 32 ms of the 8000 frames a second that a bus of
+// 1 Mbit/s carries at most, and a quarter of a second of ten channels at 100 Hz.
 topic!(
     Sample,
     "samples",
     |sample| sample.reading().is_some(),
     QualityOfService {
         publishers: crate::MAX_BUSES,
-        subscribers: 40,
+        subscribers: 32,
         nodes: NODES,
-        buffer: 2048,
+        buffer: 256,
         history: 0
     }
 );
@@ -95,14 +110,13 @@ topic!(
     },
     QualityOfService {
         publishers: 4,
-        subscribers: 40,
+        subscribers: 32,
         nodes: NODES,
-        buffer: 4,
+        buffer: 1,
         history: 1
     }
 );
-// A control loop needs only the newest; 256 let a recorder pause for a quarter of a second at 1
-// kHz.
+// A control loop needs only the newest; 64 let a recorder pause for 64 ms at 1 kHz.
 topic!(
     TorqueEstimate,
     "estimate/torque",
@@ -113,7 +127,7 @@ topic!(
         publishers: 1,
         subscribers: 24,
         nodes: NODES,
-        buffer: 256,
+        buffer: 64,
         history: 0
     }
 );
@@ -131,7 +145,7 @@ topic!(
         publishers: 1,
         subscribers: 24,
         nodes: NODES,
-        buffer: 256,
+        buffer: 64,
         history: 0
     }
 );
@@ -145,7 +159,7 @@ topic!(
         publishers: 1,
         subscribers: 16,
         nodes: NODES,
-        buffer: 8,
+        buffer: 4,
         history: 1
     }
 );
@@ -179,7 +193,7 @@ topic!(
         publishers: 1,
         subscribers: 16,
         nodes: NODES,
-        buffer: 8,
+        buffer: 1,
         history: 1
     }
 );

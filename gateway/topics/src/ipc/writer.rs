@@ -4,6 +4,8 @@ use super::bell::Bell;
 use super::domain::service_name;
 use super::error::transport;
 use super::failures::Failures;
+use super::memory;
+use super::topic::{BORROWED, LOANED};
 use super::{Domain, PortError, SendError, Topic};
 use crate::{Header, Nanos};
 use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
@@ -66,7 +68,7 @@ impl<T: Topic> Writer<T> {
         let name = service_name(robot, T::SUFFIX)?;
         let quality = T::QUALITY;
         let failures = Failures::default();
-        let (publisher, service, bell) = domain.locked(|node| {
+        let (publisher, service, bell) = domain.locked(memory::needed::<T>(), |node| {
             let service = node
                 .service_builder(&name)
                 .publish_subscribe::<T>()
@@ -74,7 +76,7 @@ impl<T: Topic> Writer<T> {
                 .max_subscribers(quality.subscribers)
                 .max_nodes(quality.nodes)
                 .subscriber_max_buffer_size(quality.buffer)
-                .subscriber_max_borrowed_samples(2)
+                .subscriber_max_borrowed_samples(BORROWED)
                 .history_size(quality.history)
                 .enable_safe_overflow(true)
                 .open_or_create()
@@ -91,7 +93,7 @@ impl<T: Topic> Writer<T> {
             bell.change();
             let publisher = service
                 .publisher_builder()
-                .max_loaned_samples(1)
+                .max_loaned_samples(LOANED)
                 .backpressure_strategy(BackpressureStrategy::DiscardData)
                 .set_degradation_handler(failures.handler())
                 .create()
@@ -168,8 +170,10 @@ impl<T: Topic> Writer<T> {
         let Some((publisher, _)) = &self.ports else {
             return Err(SendError::Internal);
         };
-        publisher
-            .update_connections()
+        let guard = self.domain.guard();
+        let updated = guard.survive(|| publisher.update_connections());
+        updated
+            .ok_or(SendError::Connection)?
             .map_err(|_| SendError::Connection)?;
         // A new reader has the history now.
         self.bell.ring();
@@ -188,9 +192,10 @@ impl<T: Topic> Writer<T> {
     /// Number of readers now.
     #[must_use]
     pub fn readers(&self) -> usize {
-        self.ports.as_ref().map_or(0, |(_, service)| {
-            service.dynamic_config().number_of_subscribers()
-        })
+        let ports = self.ports.as_ref();
+        let count = |(_, service): &Ports<T>| service.dynamic_config().number_of_subscribers();
+        let counted = self.domain.guard().survive(|| ports.map_or(0, count));
+        counted.unwrap_or(0)
     }
 
     fn put(&mut self, value: &T, fill: impl FnOnce(&mut Header)) -> Result<Sent, SendError> {
@@ -199,14 +204,17 @@ impl<T: Topic> Writer<T> {
         let Some((publisher, _)) = &self.ports else {
             return Err(SendError::Internal);
         };
-        let mut sample = publisher
-            .loan_uninit()
-            .map_err(|e| send_error(e.into()))?
-            .write_payload(*value);
-        let header = sample.payload_mut().header_mut();
-        fill(header);
-        let sequence = header.sequence;
-        let readers = sample.send().map_err(send_error)?;
+        let sent = self.domain.guard().survive(|| {
+            let mut sample = publisher
+                .loan_uninit()
+                .map_err(|e| send_error(e.into()))?
+                .write_payload(*value);
+            let header = sample.payload_mut().header_mut();
+            fill(header);
+            let sequence = header.sequence;
+            Ok((sequence, sample.send().map_err(send_error)?))
+        });
+        let (sequence, readers) = sent.ok_or(SendError::Connection)??;
         self.bell.ring();
         if self.failures.any() {
             return Err(SendError::Connection);
@@ -327,4 +335,61 @@ pub(super) fn explain<T: Topic, S: Service>(
 
 fn describe(detail: &TypeDetail) -> String {
     format!("{} ({} bytes)", detail.type_name(), detail.size())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ipc::DomainConfig;
+    use crate::{
+        ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
+        InertiaEstimate, Sample, TorqueEstimate,
+    };
+    use std::fs;
+
+    /// The segments that a writer makes.
+    fn made<T: Topic>() -> u64 {
+        let base = tempfile::tempdir().unwrap();
+        let domain = Domain::open(&DomainConfig::new(base.path(), "test")).unwrap();
+        let length = || -> u64 {
+            let entries = fs::read_dir("/dev/shm").unwrap().flatten();
+            let own = entries.filter(|entry| {
+                let name = entry.file_name();
+                name.to_string_lossy().starts_with(domain.prefix())
+            });
+            own.map(|entry| entry.metadata().map_or(0, |meta| meta.len()))
+                .sum()
+        };
+        let before = length();
+        let _writer = Writer::<T>::create(&domain, "icub", 1).unwrap();
+        length() - before
+    }
+
+    #[test]
+    fn the_memory_that_a_writer_needs_is_known_before() {
+        fn compared<T: Topic>() -> (&'static str, u64, u64) {
+            (T::SUFFIX, made::<T>(), memory::needed::<T>())
+        }
+        for (topic, made, needed) in [
+            compared::<Sample>(),
+            compared::<Description>(),
+            compared::<TorqueEstimate>(),
+            compared::<ContactEstimate>(),
+            compared::<InertiaEstimate>(),
+            compared::<ContactDeclaration>(),
+            compared::<GatewayHealth>(),
+            compared::<EstimatorHealth>(),
+        ] {
+            std::println!("{topic}: {made} of {needed}");
+            // Connections to readers that exist come on top.
+            assert!(
+                made + memory::BESIDE / 4 < needed,
+                "{topic}: {made} of {needed}"
+            );
+            assert!(
+                needed < made + made / 4 + memory::BESIDE,
+                "{topic}: {made} of {needed}"
+            );
+        }
+    }
 }

@@ -1,0 +1,243 @@
+//! Survives shared memory that somebody else has shortened.
+//!
+//! Who touches a page beyond the end of a file is killed by the kernel (SIGBUS). A control loop
+//! must not die because another program has damaged a file that it only reads. So the signal's
+//! handler replaces what is missing of a domain's file by empty memory of this process, and counts
+//! that. An empty list of ports has no ports, an empty queue no payloads, and an empty payload is
+//! no valid one: the loop sees that nothing comes, until its ports are opened again. Where iceoryx2
+//! panics because of what it finds, that is caught ([`Guard::survive`]). Any other bus error goes
+//! to whoever would have got it without this handler.
+
+use core::ffi::CStr;
+use core::sync::atomic::Ordering::{Acquire, Relaxed, Release};
+use core::sync::atomic::{AtomicBool, AtomicU32};
+use nix::errno::Errno;
+use nix::fcntl::{OFlag, open};
+use nix::libc;
+use nix::sys::signal::{SaFlags, SigAction, SigHandler, SigSet, Signal, sigaction};
+use nix::sys::stat::Mode;
+use nix::unistd::read;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::OnceLock;
+
+/// A page of memory, on every machine that is supported.
+const PAGE: usize = 4096;
+
+/// The mappings that were damaged so far.
+static DAMAGES: AtomicU32 = AtomicU32::new(0);
+
+/// Who is asked if the handler is not responsible.
+static BEFORE: OnceLock<SigAction> = OnceLock::new();
+
+/// Whether a domain's memory is sound.
+#[derive(Debug)]
+pub(super) struct Guard {
+    /// [`damages`] before any of its files was mapped.
+    before: u32,
+    /// What was found in it could not be.
+    has_failed: AtomicBool,
+}
+
+impl Guard {
+    /// That of a domain of which nothing is mapped yet.
+    pub(super) fn new() -> Self {
+        install();
+        Self {
+            before: DAMAGES.load(Acquire),
+            has_failed: AtomicBool::new(false),
+        }
+    }
+
+    pub(super) fn is_sound(&self) -> bool {
+        DAMAGES.load(Acquire) == self.before && !self.has_failed.load(Relaxed)
+    }
+
+    /// Runs `call`, which works in the domain's memory, unless that is damaged. iceoryx2 panics
+    /// where what it finds can not be: then it is damaged too.
+    pub(super) fn survive<R>(&self, call: impl FnOnce() -> R) -> Option<R> {
+        if !self.is_sound() {
+            return None;
+        }
+        let survived = catch_unwind(AssertUnwindSafe(call)).ok();
+        if survived.is_none() {
+            self.has_failed.store(true, Relaxed);
+        }
+        survived
+    }
+}
+
+/// Installs the handler, once for the process.
+#[allow(unsafe_code)]
+fn install() {
+    BEFORE.get_or_init(|| {
+        let flags = SaFlags::SA_SIGINFO | SaFlags::SA_ONSTACK | SaFlags::SA_NODEFER;
+        let action = SigAction::new(SigHandler::SigAction(on_bus_error), flags, SigSet::empty());
+        let none = SigAction::new(SigHandler::SigDfl, SaFlags::empty(), SigSet::empty());
+        // SAFETY: the handler makes only calls that are async-signal-safe, and takes no lock.
+        unsafe { sigaction(Signal::SIGBUS, &action) }.unwrap_or(none)
+    });
+}
+
+#[allow(unsafe_code)]
+extern "C" fn on_bus_error(_: libc::c_int, info: *mut libc::siginfo_t, _: *mut libc::c_void) {
+    let errno = Errno::last_raw();
+    // SAFETY: the kernel passes a valid pointer to a handler with SA_SIGINFO.
+    let address = unsafe { (*info).si_addr() } as usize;
+    match damaged(address) {
+        Some(end) => {
+            let start = address / PAGE * PAGE;
+            let access = libc::PROT_READ | libc::PROT_WRITE;
+            let kind = libc::MAP_PRIVATE | libc::MAP_ANONYMOUS | libc::MAP_FIXED;
+            // SAFETY: the range is the end of a mapping of a domain's file. The kernel has no
+            // memory for it any more, so nothing is lost, and nobody can hold a reference that
+            // was valid. Its users expect that others change its content at any time.
+            unsafe { libc::mmap(start as *mut _, end - start, access, kind, -1, 0) };
+            DAMAGES.fetch_add(1, Release);
+        }
+        // The instruction is repeated, and fails again, for the handler before this one.
+        None => {
+            if let Some(before) = BEFORE.get() {
+                // SAFETY: that handler was installed before.
+                let _ = unsafe { sigaction(Signal::SIGBUS, before) };
+            }
+        }
+    }
+    Errno::set_raw(errno);
+}
+
+/// The end of the mapping at `address`, if it is one of a domain's file. Without allocation.
+fn damaged(address: usize) -> Option<usize> {
+    const MAPS: &CStr = c"/proc/self/maps";
+    let file = open(MAPS, OFlag::O_RDONLY | OFlag::O_CLOEXEC, Mode::empty()).ok()?;
+    let mut lines = Lines::default();
+    let mut chunk = [0; 1024];
+    loop {
+        let length = match read(&file, &mut chunk) {
+            Ok(0) | Err(_) => return None,
+            Ok(length) => length,
+        };
+        for &byte in chunk.iter().take(length) {
+            if let Some(mapping) = lines.take(byte).and_then(mapping)
+                && (mapping.start..mapping.end).contains(&address)
+            {
+                return mapping.is_of_domain.then_some(mapping.end);
+            }
+        }
+    }
+}
+
+/// Cuts text into lines; of a line that is too long, the rest is lost.
+struct Lines {
+    line: [u8; 512],
+    length: usize,
+    is_whole: bool,
+}
+
+impl Default for Lines {
+    fn default() -> Self {
+        Self {
+            line: [0; 512],
+            length: 0,
+            is_whole: false,
+        }
+    }
+}
+
+impl Lines {
+    /// The line that `byte` ends.
+    fn take(&mut self, byte: u8) -> Option<&[u8]> {
+        if core::mem::take(&mut self.is_whole) {
+            self.length = 0;
+        }
+        if byte == b'\n' {
+            self.is_whole = true;
+            return self.line.get(..self.length);
+        }
+        if let Some(place) = self.line.get_mut(self.length) {
+            *place = byte;
+            self.length += 1;
+        }
+        None
+    }
+}
+
+#[derive(Debug, PartialEq, Eq)]
+struct Mapping {
+    start: usize,
+    end: usize,
+    is_of_domain: bool,
+}
+
+/// A line of /proc/PID/maps (proc_pid_maps(5)).
+fn mapping(line: &[u8]) -> Option<Mapping> {
+    let text = core::str::from_utf8(line).ok()?;
+    let (range, rest) = text.split_once(' ')?;
+    let (start, end) = range.split_once('-')?;
+    let address = |digits| usize::from_str_radix(digits, 16).ok();
+    Some(Mapping {
+        start: address(start)?,
+        end: address(end)?,
+        is_of_domain: rest.contains(" /dev/shm/proprio_") || rest.contains("/bells/"),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use memmap2::MmapOptions;
+    use std::fs::File;
+    use std::io::Write as _;
+    use std::vec;
+
+    #[test]
+    fn lines_of_the_kernel_are_read() {
+        let text = b"7f00-8000 rw-s 00000000 00:1a 5 /dev/shm/proprio_0a_x.data\n\
+                     8000-a000 r--p 00000000 00:1a 6 /lib/libc.so\nb000-c000 rw-p 0 00:00 0\n";
+        let mut lines = Lines::default();
+        let mut found = vec![];
+        for byte in text {
+            found.extend(lines.take(*byte).and_then(mapping));
+        }
+        let of = |start, end, is_of_domain| Mapping {
+            start,
+            end,
+            is_of_domain,
+        };
+        let expected = [
+            of(0x7f00, 0x8000, true),
+            of(0x8000, 0xa000, false),
+            of(0xb000, 0xc000, false),
+        ];
+        assert_eq!(found, expected);
+    }
+
+    #[test]
+    #[allow(unsafe_code)]
+    fn what_was_cut_off_reads_as_zero() {
+        let guard = Guard::new();
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join("bells")).unwrap();
+        let path = folder.path().join("bells/one");
+        File::create(&path)
+            .unwrap()
+            .write_all(&[7; 5 * PAGE])
+            .unwrap();
+        let file = File::options().write(true).read(true).open(&path).unwrap();
+        let map = MmapOptions::new().map_raw(&file).unwrap();
+        // SAFETY: within the mapping.
+        let at = |place: usize| unsafe { map.as_ptr().add(place).read_volatile() };
+        assert_eq!(at(4 * PAGE), 7);
+        file.set_len(2 * PAGE as u64).unwrap();
+        assert!(guard.is_sound());
+        assert_eq!([at(PAGE), at(2 * PAGE), at(5 * PAGE - 1)], [7, 0, 0]);
+        assert!(!guard.is_sound() && Guard::new().is_sound());
+    }
+
+    #[test]
+    fn what_panics_is_not_used_again() {
+        let guard = Guard::new();
+        assert_eq!(guard.survive(|| 5), Some(5));
+        assert_eq!(guard.survive(|| panic!("as iceoryx2 does")), None::<u8>);
+        assert_eq!(guard.survive(|| 5), None);
+    }
+}

@@ -1,0 +1,162 @@
+//! The memory behind a domain's files: allocated when a file is made, and watched while it is used.
+//!
+//! A file of shared memory is sparse as iceoryx2 makes it: the kernel finds a page when a process
+//! first touches it, and kills the process (SIGBUS) if /dev/shm is full by then. So what is made
+//! is allocated at once, before anybody uses it; a lack is an error of whoever starts or attaches.
+//! Before iceoryx2 makes a file, which touches its first pages, there must be room for all of it.
+
+use super::error::SHM;
+use super::sweep::Place;
+use super::{DomainError, Topic};
+use crate::{
+    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
+    InertiaEstimate, Sample, TorqueEstimate,
+};
+use nix::fcntl::posix_fallocate;
+use nix::sys::statvfs::statvfs;
+use std::collections::BTreeSet;
+use std::fs::{self, OpenOptions};
+use std::io;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::vec::Vec;
+
+/// What a port or a process needs beside payloads: the lists of a service's ports, the connections
+/// to those that exist, directories \[bytes\].
+pub(super) const BESIDE: u64 = 512 << 10;
+
+/// The bytes that are free in shared memory; no limit if its file system has none.
+pub(super) fn free() -> u64 {
+    statvfs(SHM).map_or(u64::MAX, |system| match system.blocks() {
+        0 => u64::MAX,
+        _ => system.blocks_available() * system.fragment_size(),
+    })
+}
+
+/// The bytes of shared memory that a writer needs: payloads, each with iceoryx2's header and its
+/// place in the lists of free ones, and what is beside them.
+pub(super) fn needed<T: Topic>() -> u64 {
+    const BESIDE_PAYLOAD: usize =
+        size_of::<iceoryx2::service::header::publish_subscribe::Header>() + 24;
+    let payload = (size_of::<T>() + BESIDE_PAYLOAD).next_multiple_of(align_of::<T>());
+    (T::QUALITY.payloads() * payload) as u64 + BESIDE
+}
+
+/// Shared memory \[bytes\]: what the gateway and the estimator of a robot need, that of each bus,
+/// and what is free.
+#[must_use]
+pub fn memory_needed() -> ([u64; 2], u64) {
+    let robot = 2 * needed::<Description>()
+        + needed::<GatewayHealth>()
+        + needed::<EstimatorHealth>()
+        + needed::<TorqueEstimate>()
+        + needed::<ContactEstimate>()
+        + needed::<InertiaEstimate>()
+        + needed::<ContactDeclaration>();
+    ([robot, needed::<Sample>()], free())
+}
+
+/// Fails if there is no room for `needed` bytes.
+pub(super) fn require(needed: u64) -> Result<(), DomainError> {
+    let free = free();
+    match needed <= free {
+        true => Ok(()),
+        false => Err(DomainError::NoRoom { needed, free }),
+    }
+}
+
+/// A file of the domain as it was when this process made it.
+#[derive(Debug)]
+pub(super) struct Made {
+    path: PathBuf,
+    inode: u64,
+    length: u64,
+}
+
+impl Made {
+    fn of(path: PathBuf) -> Option<Self> {
+        let meta = fs::metadata(&path).ok()?;
+        Some(Self {
+            inode: meta.ino(),
+            length: meta.len(),
+            path,
+        })
+    }
+
+    /// Whether it is still the same file, and not shorter.
+    pub(super) fn is_intact(&self) -> bool {
+        fs::metadata(&self.path)
+            .is_ok_and(|meta| meta.ino() == self.inode && meta.len() >= self.length)
+    }
+
+    pub(super) fn exists(&self) -> bool {
+        self.path.exists()
+    }
+}
+
+/// The files of the domain at this moment. A connection's file is left out: the reader at its other
+/// end may remove it.
+pub(super) fn files(place: &Place) -> Result<BTreeSet<PathBuf>, DomainError> {
+    let mut files: BTreeSet<PathBuf> = place
+        .segments()?
+        .into_iter()
+        .map(|(path, _)| path)
+        .filter(|path| path.extension().is_none_or(|end| end != "connection"))
+        .collect();
+    for folder in ["services", "nodes", "bells"] {
+        files.extend(entries(&place.root.join(folder)));
+    }
+    Ok(files)
+}
+
+fn entries(folder: &Path) -> impl Iterator<Item = PathBuf> {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    entries.map(|entry| entry.path())
+}
+
+/// Allocates all segments of the domain, and returns the files that are not among those `before`.
+pub(super) fn commit(place: &Place, before: &BTreeSet<PathBuf>) -> Result<Vec<Made>, DomainError> {
+    for (path, meta) in place.segments()? {
+        // 512 is the unit of st_blocks on every file system (stat(2)).
+        if meta.blocks() * 512 < meta.len() {
+            allocate(&path, meta.len() - meta.blocks() * 512)?;
+        }
+    }
+    let made = files(place)?.into_iter();
+    Ok(made
+        .filter(|path| !before.contains(path))
+        .filter_map(Made::of)
+        .collect())
+}
+
+fn allocate(path: &Path, needed: u64) -> Result<(), DomainError> {
+    let file = match OpenOptions::new().read(true).write(true).open(path) {
+        // Its owner has just removed it.
+        Err(cause) if cause.kind() == io::ErrorKind::NotFound => return Ok(()),
+        other => other.map_err(|cause| io_error(path, cause))?,
+    };
+    let length = file
+        .metadata()
+        .map_err(|cause| io_error(path, cause))?
+        .len();
+    let length = i64::try_from(length).unwrap_or(i64::MAX);
+    loop {
+        match posix_fallocate(&file, 0, length) {
+            Ok(()) => return Ok(()),
+            Err(nix::Error::EINTR) => {}
+            Err(nix::Error::ENOSPC) => {
+                let free = free();
+                return Err(DomainError::NoRoom { needed, free });
+            }
+            Err(cause) => return Err(io_error(path, cause.into())),
+        }
+    }
+}
+
+fn io_error(path: &Path, cause: io::Error) -> DomainError {
+    DomainError::Io {
+        doing: "cannot allocate",
+        path: path.to_path_buf(),
+        cause,
+    }
+}

@@ -1,0 +1,141 @@
+//! Another program deletes, empties or shortens the files of a running domain. Nobody dies of it:
+//! gateway and estimator say so and make the files again, and a control loop in this process has
+//! valid torques again without a restart. Meanwhile its values are stale, never wrong.
+#![allow(missing_docs)]
+
+use proprio_tests::{Arm, PATIENCE, Rig, now, until};
+use proprio_topics::Nanos;
+use proprio_topics::ipc::{RobotReader, Unavailable};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+const ROBOT: &str = "icub_left_arm";
+
+/// Sets the length of each of these files to a part of what it was.
+fn shorten(files: &[PathBuf], kind: &str, part: u64) {
+    for path in files
+        .iter()
+        .filter(|path| path.to_string_lossy().ends_with(kind))
+    {
+        // Files that their owners may only read belong to the same user all the same.
+        let mut permissions = fs::metadata(path).expect("a file").permissions();
+        #[allow(clippy::permissions_set_readonly_false, reason = "a test's own file")]
+        permissions.set_readonly(false);
+        fs::set_permissions(path, permissions).expect("its permissions");
+        let file = fs::OpenOptions::new()
+            .write(true)
+            .open(path)
+            .expect("a file");
+        let length = file.metadata().expect("its length").len();
+        file.set_len(length * part / 100).expect("another length");
+    }
+}
+
+fn below(folder: &Path) -> Vec<PathBuf> {
+    let mut all = Vec::new();
+    for entry in fs::read_dir(folder).expect("a folder").flatten() {
+        let path = entry.path();
+        if path.is_dir() {
+            all.extend(below(&path));
+        } else {
+            all.push(path);
+        }
+    }
+    all
+}
+
+#[test]
+fn whatever_is_deleted_or_shortened_is_made_again() {
+    let rig = Rig::new();
+    let arm = Arm::new()
+        .periods(4, 10, 4)
+        .on_virtual(["a", "b"])
+        .write(&rig.path("robot"));
+    let mut simulator = rig.start(&["simulate", "--robot", &arm.folder]);
+    let mut gateway = rig.start(&["gateway", "--config", &arm.gateway]);
+    let mut estimator = rig.start(&["estimator", "--config", &arm.estimator]);
+    let domain = rig.domain.clone();
+    let root = domain.base.join(&domain.name);
+    let mut robot = RobotReader::new(&domain, ROBOT, Nanos::from_millis(100)).expect("a thread");
+    let elbow = robot.torque_handle("l_elbow");
+    // A valid torque that was acquired after `since`, as a loop of 1 kHz reads it.
+    let mut valid_after = |since: Nanos| {
+        until(PATIENCE, || {
+            robot.update(now());
+            match robot.torque(elbow) {
+                Ok(torque) => (now() - torque.age > since).then_some(()),
+                Err(Unavailable::Unknown) => panic!("a name is lost"),
+                Err(_) => None,
+            }
+        })
+        .is_some()
+    };
+    assert!(valid_after(Nanos::ZERO), "the chain does not start");
+
+    let segments = || -> Vec<PathBuf> {
+        let names = rig.segments().into_iter();
+        names.map(|name| Path::new("/dev/shm").join(name)).collect()
+    };
+    let delete = |files: &[PathBuf]| files.iter().for_each(|path| drop(fs::remove_file(path)));
+    type Damage<'a> = (&'a str, &'a dyn Fn());
+    let damages: [Damage<'_>; 10] = [
+        ("the folder is deleted", &|| {
+            // A process that makes it again at the same time leaves nothing to remove.
+            let _ = fs::remove_dir_all(&root);
+        }),
+        ("what is in the folder is deleted", &|| {
+            delete(&below(&root));
+        }),
+        ("the segments are deleted", &|| {
+            delete(&segments());
+        }),
+        ("payloads are emptied", &|| {
+            shorten(&segments(), ".data", 0);
+        }),
+        ("payloads are halved", &|| {
+            shorten(&segments(), ".data", 50);
+        }),
+        ("connections are emptied", &|| {
+            shorten(&segments(), ".connection", 0);
+        }),
+        ("connections are halved", &|| {
+            shorten(&segments(), ".connection", 50);
+        }),
+        ("lists of ports are emptied", &|| {
+            shorten(&segments(), ".dynamic", 0);
+        }),
+        ("bells are emptied", &|| {
+            shorten(&below(&root.join("bells")), "", 0);
+        }),
+        ("all segments are emptied", &|| {
+            shorten(&segments(), "", 0);
+        }),
+    ];
+    for (what, damage) in damages {
+        let before = now();
+        damage();
+        let damaged = now();
+        let recovered = valid_after(damaged + Nanos::from_millis(300));
+        let logs = || {
+            format!(
+                "gateway:\n{}\nestimator:\n{}",
+                gateway.log(),
+                estimator.log()
+            )
+        };
+        assert!(recovered, "{what}: no torque any more\n{}", logs());
+        println!("{what}: {} s", now() - before);
+    }
+    for process in [&mut simulator, &mut gateway, &mut estimator] {
+        process.assert_runs();
+    }
+    assert!(
+        gateway.log().contains("by another program"),
+        "{}",
+        gateway.log()
+    );
+    drop(robot);
+    for process in [&mut simulator, &mut gateway, &mut estimator] {
+        process.end();
+    }
+}
