@@ -32,7 +32,9 @@
 //! are paired first in, first out, and given once there are as many second halves as first ones.
 //! A lost half therefore costs up to four readings, and none is wrong, unless a first half is lost
 //! within four readings of a second one. The driver itself sends a request only after the replies
-//! to the last one, or 30 ms after a request that was not answered.
+//! to the last one, or 30 ms after a request that was not answered. A reply more than there were
+//! requests, as from a bridge that repeats frames, makes all readings of a second DEVICE_FAULT: any
+//! of them may be an old one.
 //!
 //! If another program polls the sensor (`listen_only`, or a recorded log), its requests tell which
 //! row of the matrix a reply holds. So a log of such a program's start decodes without any key.

@@ -24,6 +24,9 @@ const ANSWER: Nanos = Nanos::from_millis(10);
 /// Then its answer may still come for this long: nothing is asked.
 const LATE: Nanos = Nanos::from_millis(20);
 
+/// For this long after a reply too many, readings are marked as faulty: each may be an old one.
+const UNTRUSTED: Nanos = Nanos::from_millis(1000);
+
 /// A first half: status and gauges 0, 2, 4.
 #[derive(Debug, Clone, Copy)]
 struct First {
@@ -44,6 +47,10 @@ pub(super) struct Netcanoem {
     seconds: ArrayVec<[i16; 3], DEPTH>,
     /// Nothing was heard yet: the first second half may belong to a request before.
     joined: bool,
+    /// Requests that were seen and have had no reply; `None` before the first.
+    asked: Option<usize>,
+    /// Until then each reply may be an old one.
+    untrusted: Nanos,
     /// The request under way: when it is given up.
     open: Option<Nanos>,
     /// When the next is due.
@@ -68,6 +75,8 @@ impl Netcanoem {
             firsts: ArrayVec::new(),
             seconds: ArrayVec::new(),
             joined: true,
+            asked: None,
+            untrusted: Nanos::MIN,
             open: None,
             next: Nanos::MIN,
             outcome: None,
@@ -98,6 +107,15 @@ impl Netcanoem {
         out: &mut Decoded,
     ) {
         self.joined = false;
+        match &mut self.asked {
+            // Which of the replies is that to the last request is not known.
+            Some(0) => {
+                self.untrusted = frame.t + UNTRUSTED;
+                out.fault(Counter::Unexpected, 1, frame.id);
+            }
+            Some(asked) => *asked -= 1,
+            None => {}
+        }
         let in_time = self
             .firsts
             .first()
@@ -139,7 +157,8 @@ impl Netcanoem {
         self.open = None;
         let (firsts, seconds) = (self.firsts.take(), self.seconds.take());
         for (first, second) in firsts.into_iter().zip(seconds) {
-            give(first, second, frame, link, out);
+            let is_trusted = frame.t >= self.untrusted;
+            give(first, second, is_trusted, frame, link, out);
         }
     }
 }
@@ -148,6 +167,7 @@ impl Netcanoem {
 fn give(
     first: First,
     second: [i16; 3],
+    is_trusted: bool,
     frame: &Frame,
     link: &mut Link<Calibration>,
     out: &mut Decoded,
@@ -172,7 +192,7 @@ fn give(
         out.fault(Counter::Saturated, 1, frame.id);
     }
     let unnamed = first.status & (STATUS_ANY | STATUS_BUS) == STATUS_ANY;
-    if first.status & STATUS_FAULTS != 0 || unnamed {
+    if first.status & STATUS_FAULTS != 0 || unnamed || !is_trusted {
         quality |= Quality::DEVICE_FAULT;
         out.fault(Counter::DeviceFault, 1, frame.id);
     }
@@ -198,7 +218,8 @@ impl Family for Netcanoem {
             return;
         };
         match (opcode, data) {
-            (opcode::GAUGES, []) | (opcode::COUNTS | opcode::UNITS, []) => {}
+            (opcode::GAUGES, []) => self.asked = Some((self.asked.unwrap_or(0) + 1).min(DEPTH)),
+            (opcode::COUNTS | opcode::UNITS, []) => {}
             (opcode::GAUGES, data) if data.len() == 8 => self.first(data, frame, link, out),
             (opcode::GAUGES_SECOND, data) if data.len() == 6 => {
                 self.second(data, frame, link, out);
@@ -238,6 +259,7 @@ impl Family for Netcanoem {
             return None;
         }
         self.open = Some(now + ANSWER);
+        self.asked = Some(1);
         self.next = next_in_step(self.next, self.period, now);
         Some(Frame::new(id(self.base, opcode::GAUGES), &[]))
     }

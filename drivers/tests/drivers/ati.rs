@@ -667,6 +667,42 @@ fn a_request_is_open_until_it_is_answered() {
     assert_eq!(count(&out.faults, Counter::Lost), 0);
 }
 
+/// Each reply comes again 50 ms later, and would be taken for the answer to a request of then.
+#[test]
+fn replies_that_come_again_are_not_trusted() {
+    let mut device = asking(KEYS);
+    let (mut good, mut faulty, mut unexpected, mut n) = (0, 0, 0, 0_i16);
+    for ms in (1000..3000).step_by(2) {
+        let t = f64::from(ms);
+        ask(
+            &mut *device,
+            "200#",
+            at(i64::from(ms)),
+            Ok(at(i64::from(ms))),
+        );
+        n += 1;
+        let repeats = (1050..1500).contains(&ms);
+        let old = halves(n - 25, 0, t + 0.2).into_iter().filter(|_| repeats);
+        let frames: Vec<Frame> = old.chain(halves(n, 0, t + 0.6)).collect();
+        let (readings, faults) = decode(&mut *device, &frames);
+        unexpected += count(&faults, Counter::Unexpected);
+        for reading in &readings {
+            let is_faulty = reading.quality.contains(Quality::DEVICE_FAULT);
+            faulty += u32::from(is_faulty);
+            good += u32::from(!is_faulty);
+            // The first that comes again can not be told.
+            let is_old = values(&reading.reading)[0] < f64::from(n) * 0.01 - 1e-9;
+            assert!(is_faulty || !is_old || ms == 1050, "{ms}: {reading:?}");
+        }
+    }
+    assert_eq!(unexpected, 225);
+    // The second after the last one too many is not trusted either.
+    assert!(
+        (25 + 240..=25 + 255).contains(&good),
+        "{good} good, {faulty} faulty"
+    );
+}
+
 /// Another program repeats its questions, before and after they are answered, and asks for a row
 /// that there is none of.
 #[test]

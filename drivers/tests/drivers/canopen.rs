@@ -819,6 +819,30 @@ fn lost_and_late_process_data_never_mix_two_cycles() {
     }
 }
 
+/// An adapter gives each frame twice, also of a joint that stands still: nothing changes but the
+/// count.
+#[test]
+fn process_data_that_come_twice_are_counted_once() {
+    for moves in [1, 0] {
+        let frames: Vec<Frame> = (1..=6)
+            .flat_map(|n| both(5 + moves * n, f64::from(n) * 10.0))
+            .collect();
+        let twice = |f: &Frame| [*f, f.at(f.t + Nanos::from_micros(100), f.stamp)];
+        let doubled: Vec<Frame> = (frames.iter().filter(|f| f.id.raw() != 0x80))
+            .flat_map(twice)
+            .chain(frames.iter().filter(|f| f.id.raw() == 0x80).copied())
+            .collect();
+        let mut doubled = doubled;
+        doubled.sort_by_key(|f| f.t);
+        let (once, _) = decode(&mut *pair(1), &frames);
+        let (readings, faults) = decode(&mut *pair(1), &doubled);
+        assert_eq!(cycles(&readings), cycles(&once));
+        assert_eq!(readings.len(), 6);
+        assert_eq!(count(&faults, Counter::Unexpected), 12);
+        assert_eq!(count(&faults, Counter::Unpaired), 0);
+    }
+}
+
 #[test]
 fn values_of_other_events_are_held_for_a_time() {
     let mut device = pair(0);

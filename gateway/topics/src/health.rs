@@ -25,7 +25,7 @@ pub enum Counter {
     Unpaired = 4,
     /// Lost readings, from gaps in the device's own sequence number.
     Lost = 5,
-    /// Replies without a request.
+    /// Frames too many: replies without a request, a frame that has come before.
     Unexpected = 6,
     /// Configuration replies that contradict an earlier one: the device's settings have changed.
     Changed = 7,
