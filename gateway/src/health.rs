@@ -172,6 +172,8 @@ struct BusRuns {
     /// It was told that the bus is nearly full.
     full: bool,
     errors: [Run; BusError::ALL.len()],
+    /// Ticks for which nothing could be sent because the link's queue was full.
+    blocked: u32,
 }
 
 /// The increase of a counter that starts again at zero with its program.
@@ -200,6 +202,7 @@ impl HealthLog {
             dropped: Run::NONE,
             full: false,
             errors: [Run::NONE; BusError::ALL.len()],
+            blocked: 0,
         };
         self.buses.resize(health.buses().len(), none);
         for (i, (bus, runs)) in health.buses().iter().zip(&mut self.buses).enumerate() {
@@ -231,6 +234,7 @@ impl HealthLog {
             }
             log_controller(bus, before);
             log_load(bus, &mut runs.full);
+            log_blocked(bus, before, &mut runs.blocked);
             // One frame may report several causes: it is told once.
             let mut told: Vec<ErrorFrame> = Vec::new();
             for (cause, run) in BusError::ALL.into_iter().zip(&mut runs.errors) {
@@ -379,6 +383,37 @@ fn log_doubts(device: &DeviceHealth, before: Option<&DeviceHealth>, runs: &mut D
         } else if *doubted && run.is_over() {
             *doubted = false;
             tracing::info!(device = name, "no longer {}", counter.word());
+        }
+    }
+}
+
+/// Logs a bus on which nothing can be sent, and when something can be again. Half a thousand frames
+/// leave a queue in half a second at 125 kbit/s; the kernel's default is a queue of ten.
+fn log_blocked(bus: &BusHealth, before: Option<&BusHealth>, blocked: &mut u32) {
+    /// \[ticks\], 1 s.
+    const BLOCKED: u32 = 10;
+    let since = |of: fn(&BusHealth) -> u64| increase(of(bus), before.map(of));
+    let name = bus.name.as_str();
+    if since(|b| b.sent) > 0 {
+        if std::mem::take(blocked) >= BLOCKED {
+            tracing::info!(bus = name, "frames are sent again");
+        }
+    } else if since(|b| b.queue_full) > 0 {
+        *blocked += 1;
+        if *blocked == BLOCKED {
+            match since(|b| b.frames) {
+                0 => tracing::error!(
+                    bus = name,
+                    "nothing can be sent, and nothing is received: no other node acknowledges \
+                     (cable, power of the boards, bit rate, termination)"
+                ),
+                _ => tracing::error!(
+                    bus = name,
+                    "nothing can be sent, although frames are received: the queue of the interface \
+                     is full and does not empty. The adapter or its driver hangs: `ip link set \
+                     INTERFACE down` and `up`, or plug the adapter in again"
+                ),
+            }
         }
     }
 }
@@ -596,6 +631,44 @@ mod tests {
                 assert!(line.contains(told), "{line}, not {told}");
             }
         }
+    }
+
+    /// A full queue that does not empty is told with what else the bus does, once.
+    #[test]
+    fn a_bus_that_does_not_send_is_told_from_one_without_nodes() {
+        let mut log = HealthLog::default();
+        let mut health = health(BusHealth::EMPTY);
+        let mut run = |sent: u64, full: u64, frames: u64, ticks: u32| {
+            logged(|| {
+                for _ in 0..ticks {
+                    let bus = &mut health.buses[0];
+                    bus.sent += sent;
+                    bus.queue_full += full;
+                    bus.frames += frames;
+                    log.log_changes(&health, &[]);
+                }
+            })
+        };
+        assert_eq!(run(5, 0, 50, 20), [""; 0]);
+        assert_eq!(run(0, 0, 50, 50), [""; 0], "nothing is to be sent");
+        assert_eq!(run(1, 90, 50, 50), [""; 0], "slow, but it sends");
+        assert_eq!(run(0, 90, 50, 9), [""; 0]);
+        let lines = run(0, 90, 50, 100);
+        assert_eq!(lines.len(), 1, "{lines:?}");
+        assert!(
+            lines[0].contains("although frames are received"),
+            "{lines:?}"
+        );
+        let lines = run(1, 0, 50, 5);
+        assert!(
+            lines.len() == 1 && lines[0].contains("sent again"),
+            "{lines:?}"
+        );
+        let lines = run(0, 90, 0, 100);
+        assert!(
+            lines.len() == 1 && lines[0].contains("acknowledges"),
+            "{lines:?}"
+        );
     }
 
     /// One line when it falls silent, one after each doubled time, one when it comes.

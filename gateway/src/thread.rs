@@ -5,7 +5,7 @@ use crate::clock::Monotonic;
 use crate::config::Source;
 use crate::decoder::Decoder;
 use crate::inbox::{Requests, inbox};
-use crate::link::adapter;
+use crate::link::adapter::{self, Adapter};
 use crate::link::interface::{Interfaces, Netlink};
 use crate::link::replay::Replay;
 use crate::link::socketcan::SocketCan;
@@ -19,6 +19,8 @@ use proprio_drivers::{Claim, Mode};
 use proprio_topics::ipc::{Domain, Renewal, Writer};
 use proprio_topics::realtime;
 use proprio_topics::{Nanos, Sample};
+use std::os::linux::net::SocketAddrExt as _;
+use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -58,6 +60,8 @@ pub(crate) struct BusThread {
     pub(crate) requests: Requests,
     /// The way to a new domain.
     pub(crate) renewal: Arc<Renewal>,
+    /// What tells other gateways that this one commands boards on the interface.
+    _claim: Option<UnixDatagram>,
     /// The mode that overrides the devices' own.
     pub(crate) mode: Option<Mode>,
     thread: Finished,
@@ -118,6 +122,10 @@ impl BusThread {
         if bus.listen_only {
             link = Box::new(ListenOnly(link));
         }
+        let claim = match &bus.source {
+            Source::SocketCan(adapter) if !listens => claim_interface(adapter),
+            _ => None,
+        };
         let ended = Arc::new(AtomicBool::new(false));
         let (requests, inbox) = inbox(bus.devices.len());
         let (ready, is_ready) = mpsc::channel();
@@ -176,9 +184,32 @@ impl BusThread {
             ended,
             requests,
             renewal,
+            _claim: claim,
             mode,
             thread: Finished(Some(thread)),
         })
+    }
+}
+
+/// Claims the interface of `adapter` for a gateway that commands boards, and warns if another one
+/// has: when either ends, it stops the boards of both. The claim is an abstract socket's name, which
+/// belongs to the network namespace as the interface does, and which no death of a process leaves
+/// behind.
+fn claim_interface(adapter: &Adapter) -> Option<UnixDatagram> {
+    let interface = adapter.resolve(Path::new(adapter::SYS)).ok()?;
+    let name = format!("proprio/commands/{interface}");
+    let address = SocketAddr::from_abstract_name(name).ok()?;
+    match UnixDatagram::bind_addr(&address) {
+        Ok(claim) => Some(claim),
+        Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {
+            tracing::warn!(
+                interface,
+                "another gateway commands boards on this interface: whichever ends stops the \
+                 boards of both; end one of them, or set listen_only = true for its bus"
+            );
+            None
+        }
+        Err(_) => None,
     }
 }
 
@@ -230,6 +261,7 @@ impl BusThread {
             ended: Arc::default(),
             requests,
             renewal: Arc::default(),
+            _claim: None,
             mode: matches!(bus.source, Source::Replay { .. }).then_some(Mode::Listen),
             thread: Finished(None),
         };
@@ -258,6 +290,17 @@ mod tests {
         assert!(thread.is_stuck(turn + STUCK + Nanos(1)));
         thread.ended.store(true, Release);
         assert!(!thread.is_stuck(turn + STUCK + Nanos(1)));
+    }
+
+    #[test]
+    fn an_interface_is_claimed_by_one_gateway_at_a_time() {
+        let own = Adapter::Interface(format!("none{}", std::process::id()));
+        let other = Adapter::Interface(format!("other{}", std::process::id()));
+        let first = claim_interface(&own);
+        assert!(first.is_some() && claim_interface(&own).is_none());
+        assert!(claim_interface(&other).is_some());
+        drop(first);
+        assert!(claim_interface(&own).is_some());
     }
 
     #[test]
