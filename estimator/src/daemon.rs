@@ -36,6 +36,8 @@ use tokio::signal::unix::{SignalKind, signal};
 
 /// How often the data plane tries to open services that are not open yet.
 const CONNECT_PERIOD: Nanos = Nanos::from_millis(50);
+/// How often ports are tried to be opened anew.
+const RENEWAL_PERIOD: Nanos = Nanos::from_millis(100);
 /// How often the health message is published.
 const HEALTH_PERIOD: Nanos = Nanos::from_millis(100);
 /// A missing temperature is reported after this number of health periods: boards send it every few
@@ -267,8 +269,14 @@ struct DataPlane {
     robot: String,
     pipeline: Pipeline,
     ports: Ports,
+    /// The domain in which the ports are still to be opened, and when that is tried again.
+    renewing: Option<(Domain, Nanos)>,
+    /// Losses and epochs of the readers of domains before.
+    lost: u64,
+    epochs: u64,
     /// The samples taken at once, to be sorted by stamp; never grows.
     inbox: Vec<Sample>,
+    renewal_reported: bool,
     unknown_contact_reported: bool,
     refusal_reported: bool,
     /// Consecutive health periods in which a sensor lacked the temperature that its calibration
@@ -313,9 +321,13 @@ impl DataPlane {
             robot: robot.to_owned(),
             pipeline,
             ports,
+            renewing: None,
+            lost: 0,
+            epochs: 0,
             identification,
             first_look,
             inbox: Vec::with_capacity(INBOX),
+            renewal_reported: false,
             unknown_contact_reported: false,
             refusal_reported: false,
             without_temperature: 0,
@@ -331,9 +343,21 @@ impl DataPlane {
         })
     }
 
-    /// Opens all ports anew, in `domain`. What was identified stays.
+    /// Opens all ports anew if a domain was passed, or tries it again. What was identified stays.
+    fn look_for_renewal(&mut self, now: Nanos) {
+        if let Some(domain) = self.shared.renewal.take() {
+            self.renewing = Some((domain, now));
+        }
+        if self.renewing.as_ref().is_some_and(|(_, t)| *t <= now) {
+            self.renew(now);
+        }
+    }
+
     #[cold]
-    fn renew(&mut self, domain: Domain) {
+    fn renew(&mut self, now: Nanos) {
+        let Some((domain, _)) = self.renewing.take() else {
+            return;
+        };
         let identifies = self.ports.inertias.is_some();
         match Ports::open(
             domain.clone(),
@@ -341,10 +365,19 @@ impl DataPlane {
             &self.robot,
             identifies,
         ) {
-            Ok(ports) => self.ports = ports,
+            Ok(ports) => {
+                if let Some(samples) = &self.ports.samples {
+                    self.lost += samples.lost();
+                    self.epochs += samples.epochs();
+                }
+                self.ports = ports;
+                self.renewal_reported = false;
+            }
             Err(error) => {
-                tracing::error!("estimates cannot be published: {error:#}");
-                domain.abandon();
+                if !std::mem::replace(&mut self.renewal_reported, true) {
+                    tracing::error!("estimates cannot be published: {error:#}; trying again");
+                }
+                self.renewing = Some((domain, now + RENEWAL_PERIOD));
             }
         }
     }
@@ -354,9 +387,7 @@ impl DataPlane {
             let now = monotonic();
             self.shared.last_turn.store(now.0, Relaxed);
             self.health.last_turn = now;
-            if let Some(domain) = self.shared.renewal.take() {
-                self.renew(domain);
-            }
+            self.look_for_renewal(now);
             if now >= self.next_connect {
                 self.next_connect = now + CONNECT_PERIOD;
                 connect(&mut self.ports.samples, &self.ports.domain, &self.robot);
@@ -583,8 +614,8 @@ impl DataPlane {
             self.health.backward,
             self.health.not_finite,
         ) = (counts.late, counts.backward, counts.not_finite);
-        self.health.lost = self.ports.samples.as_ref().map_or(0, Reader::lost);
-        self.health.epochs = self.ports.samples.as_ref().map_or(0, Reader::epochs);
+        self.health.lost = self.lost + self.ports.samples.as_ref().map_or(0, Reader::lost);
+        self.health.epochs = self.epochs + self.ports.samples.as_ref().map_or(0, Reader::epochs);
         if let (Some(identification), Some(online)) =
             (&mut self.identification, self.pipeline.identification())
         {

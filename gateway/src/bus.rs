@@ -152,7 +152,7 @@ impl<S: Sink> Bus<S> {
                 // Until then nothing had arrived. The clock itself may be later, if this thread
                 // was not scheduled meanwhile, and then frames may be waiting again.
                 self.advance(clock.now().min(deadline).max(now), clock);
-                self.sink.idle();
+                self.sink.idle(clock.now());
             }
             Received::StateChanged => {}
             Received::Ended => {

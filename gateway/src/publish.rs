@@ -18,8 +18,8 @@ pub trait Sink {
     /// [`SinkError`]: the sample was not published.
     fn publish(&mut self, sample: &mut Sample, now: Nanos) -> Result<u32, SinkError>;
 
-    /// Called when there has been nothing to do for a while.
-    fn idle(&mut self) {}
+    /// Called when there has been nothing to do for a while, at `now`.
+    fn idle(&mut self, _now: Nanos) {}
 }
 
 /// Keeps all samples: for tests.
@@ -44,7 +44,13 @@ pub struct Shared {
     writer: Writer<Sample>,
     robot: String,
     renewal: Arc<Renewal>,
+    /// The domain in which the writer is still to be made, and when that is tried again.
+    next: Option<(Domain, Nanos)>,
+    has_failed: bool,
 }
+
+/// How often a writer is tried to be made.
+const RETRY: Nanos = Nanos::from_millis(100);
 
 impl Shared {
     /// Publishes the samples of `robot` with `writer`, until a `renewal`.
@@ -53,17 +59,37 @@ impl Shared {
             writer,
             robot: robot.to_owned(),
             renewal,
+            next: None,
+            has_failed: false,
         }
     }
 
-    /// Makes the writer anew in `domain`; until it can be made, samples are lost and counted.
+    /// Makes the writer anew if a domain was passed; until it can be made, samples are lost and
+    /// counted.
+    fn look(&mut self, now: Nanos) {
+        if let Some(domain) = self.renewal.take() {
+            self.next = Some((domain, now));
+        }
+        if self.next.as_ref().is_some_and(|(_, t)| *t <= now) {
+            self.renew(now);
+        }
+    }
+
     #[cold]
-    fn renew(&mut self, domain: &Domain) {
-        match Writer::create(domain, &self.robot, domain.epoch()) {
-            Ok(writer) => self.writer = writer,
+    fn renew(&mut self, now: Nanos) {
+        let Some((domain, _)) = self.next.take() else {
+            return;
+        };
+        match Writer::create(&domain, &self.robot, domain.epoch()) {
+            Ok(writer) => {
+                self.writer = writer;
+                self.has_failed = false;
+            }
             Err(error) => {
-                tracing::error!("samples cannot be published: {error}");
-                domain.abandon();
+                if !std::mem::replace(&mut self.has_failed, true) {
+                    tracing::error!("samples cannot be published: {error}; trying again");
+                }
+                self.next = Some((domain, now + RETRY));
             }
         }
     }
@@ -71,17 +97,13 @@ impl Shared {
 
 impl Sink for Shared {
     fn publish(&mut self, sample: &mut Sample, now: Nanos) -> Result<u32, SinkError> {
-        if let Some(domain) = self.renewal.take() {
-            self.renew(&domain);
-        }
+        self.look(now);
         let sent = self.writer.send(sample, now).map_err(|_| SinkError)?;
         Ok(u32::try_from(sent.connected).unwrap_or(u32::MAX))
     }
 
-    fn idle(&mut self) {
-        if let Some(domain) = self.renewal.take() {
-            self.renew(&domain);
-        }
+    fn idle(&mut self, now: Nanos) {
+        self.look(now);
         // A reader that cannot be connected now is connected, or counted as a failure, with the
         // next sample.
         let _ = self.writer.update_connections();

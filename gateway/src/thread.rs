@@ -192,9 +192,8 @@ impl BusThread {
 }
 
 /// Claims the interface of `adapter` for a gateway that commands boards, and warns if another one
-/// has: when either ends, it stops the boards of both. The claim is an abstract socket's name, which
-/// belongs to the network namespace as the interface does, and which no death of a process leaves
-/// behind.
+/// has: when either ends, it stops the boards of both. The claim is the name of an abstract socket.
+/// It belongs to the network namespace as the interface does, and ends with its process.
 fn claim_interface(adapter: &Adapter) -> Option<UnixDatagram> {
     let interface = adapter.resolve(Path::new(adapter::SYS)).ok()?;
     let name = format!("proprio/commands/{interface}");

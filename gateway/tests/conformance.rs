@@ -1075,9 +1075,14 @@ fn error_frames_are_handed_on_and_set_the_state() {
         (link.state(), link.counters().error_frames),
         (LinkState::Up, 1)
     );
+    // Until it is believed nothing is sent.
     error("20000040", none);
     assert!(error_frame(&mut link).reports(BusError::BusOff));
-    assert_eq!(link.state(), LinkState::BusOff);
+    assert_eq!(
+        link.send(&Frame::new(Id::standard(7), &[])),
+        Err(SendError::Full)
+    );
+    changes_to(&mut link, LinkState::BusOff);
     assert_eq!(
         link.send(&Frame::new(Id::standard(7), &[])),
         Err(SendError::NotUp)
@@ -1088,14 +1093,14 @@ fn error_frames_are_handed_on_and_set_the_state() {
     // A controller that has restarted automatically and counts errors again is up too.
     error("20000040", none);
     error_frame(&mut link);
-    assert_eq!(link.state(), LinkState::BusOff);
+    changes_to(&mut link, LinkState::BusOff);
     error("20000004", none);
     error_frame(&mut link);
     assert_eq!(link.state(), LinkState::Up);
     // Received frames show it as well, and none of them is lost.
     error("20000040", none);
     error_frame(&mut link);
-    assert_eq!(link.state(), LinkState::BusOff);
+    changes_to(&mut link, LinkState::BusOff);
     let wanted = Frame::new(Id::standard(7), &[1]);
     own.peer_sends(&wanted);
     assert_eq!(
@@ -1127,6 +1132,7 @@ fn bus_off_ends_while_there_is_a_carrier() {
     );
     assert!(error_frame(&mut link).reports(BusError::BusOff));
     let since = now();
+    changes_to(&mut link, LinkState::BusOff);
     changes_to(&mut link, LinkState::Up);
     // The flags of a real controller lag behind by up to a second.
     assert!(now() - since > Nanos::from_millis(1000));

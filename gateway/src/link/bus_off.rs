@@ -4,7 +4,7 @@
 //! Some adapters report one that is none (candleLight firmware, whenever a controller comes back to
 //! error active). To believe it would start all boards again. So a report that contradicts itself
 //! is counted only, and any other is believed when the carrier has gone, or when nothing was
-//! received for a while. That while doubles whenever a frame shows that the belief was wrong, so
+//! received for a while. That while doubles whenever a frame or a carrier refutes the belief, so
 //! that an adapter that goes on so does not start boards more than once in two seconds.
 
 use super::error_frame::ErrorFrame;
@@ -48,13 +48,15 @@ impl Default for BusOff {
 impl BusOff {
     /// An error frame has arrived.
     pub(super) fn report(&mut self, error: ErrorFrame, now: Nanos) {
-        // A controller in one of these states is on the bus.
-        let mut states = [BusError::Active, BusError::Warning, BusError::Passive].into_iter();
-        let is_on = error.reports(BusError::Restarted) || states.any(|s| error.reports(s));
+        let reports = |cause| error.reports(cause);
+        let is_off = reports(BusError::BusOff);
+        // A controller that counts errors is on the bus; but one that goes bus-off has just counted
+        // some.
+        let counts = error.classes & libc::CAN_ERR_CRTL != 0;
+        let is_on = reports(BusError::Restarted) || reports(BusError::Active) || counts && !is_off;
         self.state = match self.state {
             _ if is_on => State::OnTheBus,
-            State::OnTheBus if error.reports(BusError::BusOff) => State::Suspected(now),
-            State::Off(_) if error.reports(BusError::BusOff) => State::Off(now),
+            State::OnTheBus if is_off => State::Suspected(now),
             unchanged => unchanged,
         };
     }
@@ -62,9 +64,14 @@ impl BusOff {
     /// A frame has arrived.
     pub(super) fn receive(&mut self) {
         if let State::Off(_) = self.state {
-            self.patience = (self.patience + self.patience).min(MOST_PATIENCE);
+            self.be_patient();
         }
         self.state = State::OnTheBus;
+    }
+
+    /// A belief was wrong.
+    fn be_patient(&mut self) {
+        self.patience = (self.patience + self.patience).min(MOST_PATIENCE);
     }
 
     /// The interface has a carrier, or has none, at `now`.
@@ -76,7 +83,11 @@ impl BusOff {
             State::Suspected(since) if !has_carrier || now - since >= self.patience => {
                 State::Off(since)
             }
-            State::Off(since) if has_carrier && now - since >= LINK_WATCH => State::OnTheBus,
+            // No frame has refuted it: boards that only answer were not asked meanwhile.
+            State::Off(since) if has_carrier && now - since >= LINK_WATCH => {
+                self.be_patient();
+                State::OnTheBus
+            }
             unchanged => unchanged,
         };
     }

@@ -3,6 +3,7 @@
 
 use crate::Nanos;
 use nix::time::{ClockId, clock_gettime};
+use std::time::Duration;
 
 /// CLOCK_MONOTONIC now \[ns\], the clock of `Header::acquired` and `Header::published`.
 #[must_use]
@@ -15,4 +16,10 @@ pub fn monotonic() -> Nanos {
                 .saturating_add(t.tv_nsec()),
         )
     })
+}
+
+/// Sleeps until the clock shows `deadline` \[ns\].
+pub(super) fn sleep_until(deadline: Nanos) {
+    let left = deadline.saturating_sub(monotonic()).0;
+    std::thread::sleep(Duration::from_nanos(u64::try_from(left).unwrap_or(0)));
 }

@@ -3,7 +3,7 @@
 use super::bell::Bell;
 use super::error::{SHM, transport};
 use super::guard::Guard;
-use super::lock::Lock;
+use super::lock::{FEW_STEPS, Lock, STEPS};
 use super::memory::{self, Made};
 use super::sweep::{self, Place, SweepCounts};
 use super::{DomainError, PortError};
@@ -174,6 +174,8 @@ struct Inner<S: Service> {
     // `None` only during `drop`.
     node: Mutex<Option<Node<S>>>,
     guard: Guard,
+    /// For how long it waits for the lock.
+    steps: u32,
     /// The files that this process has made.
     made: Mutex<Vec<Made>>,
 }
@@ -182,13 +184,14 @@ impl Domain {
     /// Opens the domain, or creates it. Removes the files that dead processes have left in it.
     ///
     /// Sets iceoryx2's log level in this process to `Fatal`, unless `IOX2_LOG_LEVEL` is set.
-    /// Installs no signal handlers.
+    /// Installs a handler of SIGBUS, which replaces memory of the domain that another program has
+    /// taken away, and leaves all else to the handler before it; no other signal handlers.
     ///
     /// # Errors
     /// [`DomainError`]: a bad name or directory, no shared memory, no permission, another owner, or
     /// another process that holds the lock.
     pub fn open(config: &DomainConfig) -> Result<Self, DomainError> {
-        Self::create(config)
+        Self::create(config, STEPS)
     }
 
     /// Opens the domain for reading: it must exist, and nothing is created if it does not.
@@ -224,17 +227,17 @@ impl<S: Service> Domain<S> {
         if !root.exists() {
             return Err(DomainError::NotYet { root });
         }
-        Self::create(config)
+        Self::create(config, STEPS)
     }
 
-    /// As [`Domain::open`].
-    fn create(config: &DomainConfig) -> Result<Self, DomainError> {
+    /// As [`Domain::open`]. It and its ports wait for the domain's lock for so many `steps`.
+    pub(super) fn create(config: &DomainConfig, steps: u32) -> Result<Self, DomainError> {
         static QUIET: Once = Once::new();
         QUIET.call_once(|| set_log_level_from_env_or(LogLevel::Fatal));
 
         let place = config.place()?;
         let iceoryx = iceoryx(&place)?;
-        let _lock = Lock::take(&place.lock)?;
+        let _lock = Lock::take_within(&place.lock, steps)?;
         sweep::sweep(&place, &iceoryx)?;
         let failed = |problem: String| DomainError::Transport {
             root: place.root.clone(),
@@ -275,6 +278,7 @@ impl<S: Service> Domain<S> {
             folder,
             node: Mutex::new(Some(node)),
             guard,
+            steps,
             made: Mutex::new(made),
         };
         Ok(Self {
@@ -312,7 +316,7 @@ impl<S: Service> Domain<S> {
         create: impl FnOnce(&Node<S>) -> Result<R, PortError>,
     ) -> Result<R, PortError> {
         let place = &self.inner.place;
-        let _lock = Lock::take(&place.lock)?;
+        let _lock = Lock::take_within(&place.lock, self.inner.steps)?;
         let damaged = || DomainError::Damaged {
             root: place.root.clone(),
         };
@@ -352,6 +356,9 @@ impl<S: Service> Domain<S> {
 
     /// Drops a port under the domain's lock, so that no process sees it half removed.
     pub(super) fn drop_locked<P>(&self, port: P) {
+        if !self.is_usable() {
+            return std::mem::forget(port);
+        }
         // If a stopped process holds the lock, drop without it: a program must be able to end.
         let _lock = Lock::take(&self.inner.place.lock);
         self.inner.drop_unless_replaced(port);
@@ -389,10 +396,13 @@ impl<S: Service> Domain<S> {
     /// Gives up a domain that is not intact: removes its directory, by which all its processes see
     /// that they must open a new one.
     pub fn abandon(&self) {
-        let _lock = Lock::take(&self.inner.place.lock);
+        let place = &self.inner.place;
+        let _lock = Lock::take_within(&place.lock, FEW_STEPS);
         if self.is_there() {
-            let _ = fs::remove_dir_all(&self.inner.place.root);
+            let _ = fs::remove_dir_all(&place.root);
         }
+        // Ports of a damaged domain are not dropped, so their memory is given back here.
+        memory::give_back(&place.prefix);
     }
 
     /// The bell of `service`.

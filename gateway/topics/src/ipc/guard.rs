@@ -8,26 +8,25 @@
 //! panics because of what it finds, that is caught ([`Guard::survive`]). Any other bus error goes
 //! to whoever would have got it without this handler.
 
-use core::ffi::CStr;
 use core::sync::atomic::Ordering::{Acquire, Relaxed, Release};
 use core::sync::atomic::{AtomicBool, AtomicU32};
 use nix::errno::Errno;
 use nix::fcntl::{OFlag, open};
 use nix::libc;
-use nix::sys::signal::{SaFlags, SigAction, SigHandler, SigSet, Signal, sigaction};
+use nix::sys::signal::{SaFlags, SigAction, SigHandler, SigSet, Signal, raise, sigaction};
 use nix::sys::stat::Mode;
-use nix::unistd::read;
+use nix::sys::uio::pread;
+use nix::unistd::{SysconfVar, sysconf};
+use std::os::fd::OwnedFd;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::OnceLock;
+use std::sync::{Once, OnceLock};
 
-/// A page of memory, on every machine that is supported.
-const PAGE: usize = 4096;
+/// What the handler needs and must not ask for: the bytes of a page, this process's mappings, and
+/// who is asked if it is not responsible.
+static PREPARED: OnceLock<(usize, OwnedFd, SigAction)> = OnceLock::new();
 
 /// The mappings that were damaged so far.
 static DAMAGES: AtomicU32 = AtomicU32::new(0);
-
-/// Who is asked if the handler is not responsible.
-static BEFORE: OnceLock<SigAction> = OnceLock::new();
 
 /// Whether a domain's memory is sound.
 #[derive(Debug)]
@@ -66,15 +65,24 @@ impl Guard {
     }
 }
 
-/// Installs the handler, once for the process.
+/// Installs the handler, once for the process; not without a list of the process's mappings.
 #[allow(unsafe_code)]
 fn install() {
-    BEFORE.get_or_init(|| {
+    static ONCE: Once = Once::new();
+    ONCE.call_once(|| {
+        let page = sysconf(SysconfVar::PAGE_SIZE).ok().flatten();
+        let page = page.and_then(|page| usize::try_from(page).ok());
+        let flags = OFlag::O_RDONLY | OFlag::O_CLOEXEC;
+        let maps = open("/proc/self/maps", flags, Mode::empty());
+        let (Some(page), Ok(maps)) = (page, maps) else {
+            return;
+        };
         let flags = SaFlags::SA_SIGINFO | SaFlags::SA_ONSTACK | SaFlags::SA_NODEFER;
         let action = SigAction::new(SigHandler::SigAction(on_bus_error), flags, SigSet::empty());
-        let none = SigAction::new(SigHandler::SigDfl, SaFlags::empty(), SigSet::empty());
         // SAFETY: the handler makes only calls that are async-signal-safe, and takes no lock.
-        unsafe { sigaction(Signal::SIGBUS, &action) }.unwrap_or(none)
+        if let Ok(before) = unsafe { sigaction(Signal::SIGBUS, &action) } {
+            let _ = PREPARED.set((page, maps, before));
+        }
     });
 }
 
@@ -82,45 +90,55 @@ fn install() {
 extern "C" fn on_bus_error(_: libc::c_int, info: *mut libc::siginfo_t, _: *mut libc::c_void) {
     let errno = Errno::last_raw();
     // SAFETY: the kernel passes a valid pointer to a handler with SA_SIGINFO.
-    let address = unsafe { (*info).si_addr() } as usize;
-    match damaged(address) {
-        Some(end) => {
-            let start = address / PAGE * PAGE;
-            let access = libc::PROT_READ | libc::PROT_WRITE;
-            let kind = libc::MAP_PRIVATE | libc::MAP_ANONYMOUS | libc::MAP_FIXED;
-            // SAFETY: the range is the end of a mapping of a domain's file. The kernel has no
-            // memory for it any more, so nothing is lost, and nobody can hold a reference that
-            // was valid. Its users expect that others change its content at any time.
-            unsafe { libc::mmap(start as *mut _, end - start, access, kind, -1, 0) };
-            DAMAGES.fetch_add(1, Release);
+    let (address, code) = unsafe { ((*info).si_addr() as usize, (*info).si_code) };
+    let Some((page, maps, before)) = PREPARED.get() else {
+        return;
+    };
+    let is_fault = code > 0;
+    match damaged(maps, address).filter(|_| is_fault) {
+        Some(mapping) if replace(address / page * page, mapping.end) => {
+            // What was deleted belongs to a domain that has been given up.
+            if !mapping.is_deleted {
+                DAMAGES.fetch_add(1, Release);
+            }
         }
-        // The instruction is repeated, and fails again, for the handler before this one.
-        None => {
-            if let Some(before) = BEFORE.get() {
-                // SAFETY: that handler was installed before.
-                let _ = unsafe { sigaction(Signal::SIGBUS, before) };
+        _ => {
+            // The instruction is repeated, and fails again, for the handler before this one.
+            // SAFETY: that handler was installed before.
+            let _ = unsafe { sigaction(Signal::SIGBUS, before) };
+            if !is_fault {
+                let _ = raise(Signal::SIGBUS);
             }
         }
     }
     Errno::set_raw(errno);
 }
 
-/// The end of the mapping at `address`, if it is one of a domain's file. Without allocation.
-fn damaged(address: usize) -> Option<usize> {
-    const MAPS: &CStr = c"/proc/self/maps";
-    let file = open(MAPS, OFlag::O_RDONLY | OFlag::O_CLOEXEC, Mode::empty()).ok()?;
-    let mut lines = Lines::default();
-    let mut chunk = [0; 1024];
+/// Replaces a range of the end of a damaged mapping by empty memory; returns whether it could.
+#[allow(unsafe_code)]
+fn replace(start: usize, end: usize) -> bool {
+    let access = libc::PROT_READ | libc::PROT_WRITE;
+    let kind = libc::MAP_PRIVATE | libc::MAP_ANONYMOUS | libc::MAP_FIXED;
+    // SAFETY: the kernel has no memory for the range any more, so nothing is lost, and nobody can
+    // hold a reference that was valid. Its users expect that others change its content at any time.
+    let mapped = unsafe { libc::mmap(start as *mut _, end - start, access, kind, -1, 0) };
+    mapped != libc::MAP_FAILED
+}
+
+/// The mapping at `address`, if it is one of a domain's file. Without allocation.
+fn damaged(maps: &OwnedFd, address: usize) -> Option<Mapping> {
+    let (mut lines, mut chunk, mut place) = (Lines::default(), [0; 1024], 0);
     loop {
-        let length = match read(&file, &mut chunk) {
+        let length = match pread(maps, &mut chunk, place) {
             Ok(0) | Err(_) => return None,
             Ok(length) => length,
         };
+        place += i64::try_from(length).ok()?;
         for &byte in chunk.iter().take(length) {
             if let Some(mapping) = lines.take(byte).and_then(mapping)
                 && (mapping.start..mapping.end).contains(&address)
             {
-                return mapping.is_of_domain.then_some(mapping.end);
+                return mapping.is_of_domain.then_some(mapping);
             }
         }
     }
@@ -166,6 +184,7 @@ struct Mapping {
     start: usize,
     end: usize,
     is_of_domain: bool,
+    is_deleted: bool,
 }
 
 /// A line of /proc/PID/maps (proc_pid_maps(5)).
@@ -178,6 +197,7 @@ fn mapping(line: &[u8]) -> Option<Mapping> {
         start: address(start)?,
         end: address(end)?,
         is_of_domain: rest.contains(" /dev/shm/proprio_") || rest.contains("/bells/"),
+        is_deleted: rest.ends_with(" (deleted)"),
     })
 }
 
@@ -188,6 +208,9 @@ mod tests {
     use std::fs::File;
     use std::io::Write as _;
     use std::vec;
+
+    /// Several pages of any machine.
+    const PAGE: usize = 1 << 16;
 
     #[test]
     fn lines_of_the_kernel_are_read() {
@@ -202,6 +225,7 @@ mod tests {
             start,
             end,
             is_of_domain,
+            is_deleted: false,
         };
         let expected = [
             of(0x7f00, 0x8000, true),

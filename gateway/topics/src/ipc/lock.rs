@@ -10,7 +10,10 @@ use std::time::Duration;
 /// How long to wait for the lock, about five seconds: a hundred times the duration of a creation
 /// on a busy machine.
 const STEP: Duration = Duration::from_millis(1);
-const STEPS: u32 = 5000;
+pub(super) const STEPS: u32 = 5000;
+
+/// How long a process waits that has other things to do, and tries again: 20 ms.
+pub(super) const FEW_STEPS: u32 = 20;
 
 /// The lock, held until dropped.
 #[derive(Debug)]
@@ -31,7 +34,8 @@ impl Lock {
         Self::take_within(path, 0)
     }
 
-    fn take_within(path: &Path, mut steps: u32) -> Result<Self, DomainError> {
+    /// As [`Lock::take`], waiting for so many steps.
+    pub(super) fn take_within(path: &Path, mut steps: u32) -> Result<Self, DomainError> {
         let io = |doing| {
             move |cause| DomainError::Io {
                 doing,

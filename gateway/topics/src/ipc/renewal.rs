@@ -4,6 +4,7 @@
 //! passes a new one to each data plane ([`Renewal`]). The old directory is removed, by which all
 //! other processes see that they must open the new one.
 
+use super::lock::FEW_STEPS;
 use super::{Domain, DomainError};
 use core::sync::atomic::AtomicBool;
 use core::sync::atomic::Ordering::{Acquire, Release};
@@ -11,14 +12,15 @@ use std::sync::{Mutex, PoisonError};
 
 impl Domain {
     /// `None` if the domain is intact ([`Domain::is_intact`]). Else gives it up, and opens it anew:
-    /// all ports must be created again in the new one.
+    /// all ports must be created again in the new one. Neither this nor they wait long for another
+    /// process: what fails is tried again.
     ///
     /// # Errors
     /// As [`Domain::open`]: call it again later.
     pub fn renewed(&self) -> Option<Result<Self, DomainError>> {
         (!self.is_intact()).then(|| {
             self.abandon();
-            Self::open(self.config())
+            Self::create(self.config(), FEW_STEPS)
         })
     }
 }
@@ -33,12 +35,14 @@ pub struct Renewal {
 impl Renewal {
     /// Passes `domain`.
     pub fn pass(&self, domain: Domain) {
-        *self.domain.lock().unwrap_or_else(PoisonError::into_inner) = Some(domain);
+        let mut place = self.domain.lock().unwrap_or_else(PoisonError::into_inner);
+        let before = place.replace(domain);
+        drop(place);
+        drop(before);
         self.is_due.store(true, Release);
     }
 
-    /// A domain that was passed. One load from memory if there is none. The data plane that cannot
-    /// create its ports in it abandons it ([`Domain::abandon`]), and gets another one.
+    /// A domain that was passed. One load from memory if there is none.
     #[must_use]
     pub fn take(&self) -> Option<Domain> {
         if !self.is_due.load(Acquire) {

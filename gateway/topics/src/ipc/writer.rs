@@ -255,8 +255,10 @@ impl<T: Topic> Writer<T> {
 
 impl<T: Topic> Drop for Writer<T> {
     fn drop(&mut self) {
-        self.bell.change();
-        self.bell.say_farewell();
+        if self.domain.is_usable() {
+            self.bell.change();
+            self.bell.say_farewell();
+        }
         let ports = self.ports.take();
         self.domain.drop_locked(ports);
     }
