@@ -327,22 +327,15 @@ fn shared_memory(domain: &DomainConfig) -> Finding {
                  {more} MB for each bus",
                 probe.base.display()
             );
-            let is_enough = free >= one + more;
-            finding(
-                "shared memory",
-                if is_enough {
-                    Verdict::Ok
-                } else {
-                    Verdict::Lacking
-                },
-                what,
-                if is_enough {
-                    ""
-                } else {
+            let (verdict, remedy) = match free >= one + more {
+                true => (Verdict::Ok, ""),
+                false => (
+                    Verdict::Lacking,
                     "remove files in /dev/shm, or `mount -o remount,size=256M /dev/shm`; in a \
-                     container --shm-size"
-                },
-            )
+                     container --shm-size",
+                ),
+            };
+            finding("shared memory", verdict, what, remedy)
         }
         Err(error) => finding(
             "shared memory",

@@ -2,9 +2,9 @@
 //! supervises it.
 //!
 //! The data-plane thread waits for samples in shared memory. Once its ports are open it takes no
-//! lock, and allocates nothing but the 48 bytes with which iceoryx2 lends each payload. It retries
-//! services that are not there yet, so gateway and estimator can start in any order, and either can
-//! be killed and started again.
+//! lock, and allocates nothing but the 48 bytes with which iceoryx2 lends each payload. (Ports of a
+//! damaged domain are opened anew, which does both.) It retries services that are not there yet, so
+//! gateway and estimator can start in any order, and either can be killed and started again.
 
 use crate::check::{Check, Posture};
 use crate::config::{Config, ConfigError};
@@ -17,8 +17,8 @@ use anyhow::{Context, anyhow};
 use proprio_identification::online::{Hypothesis, Online, Paused};
 use proprio_identification::robot::Robot;
 use proprio_topics::ipc::{
-    Domain, DomainConfig, DomainError, PortError, Reader, Renewal, Topic, Watch, Writer, monotonic,
-    open_files_remedy,
+    Domain, DomainConfig, DomainError, PortError, Reader, Renewal, Renewing, Topic, Watch, Writer,
+    monotonic, open_files_remedy,
 };
 use proprio_topics::{
     ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
@@ -36,8 +36,6 @@ use tokio::signal::unix::{SignalKind, signal};
 
 /// How often the data plane tries to open services that are not open yet.
 const CONNECT_PERIOD: Nanos = Nanos::from_millis(50);
-/// How often ports are tried to be opened anew.
-const RENEWAL_PERIOD: Nanos = Nanos::from_millis(100);
 /// How often the health message is published.
 const HEALTH_PERIOD: Nanos = Nanos::from_millis(100);
 /// A missing temperature is reported after this number of health periods: boards send it every few
@@ -138,18 +136,19 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
     let mut gateway = Watch::<GatewayHealth>::default();
     let renewal = Arc::new(Renewal::default());
     let shared = Shared {
-        renewal: Arc::clone(&renewal),
         last_turn: Arc::clone(&last_turn),
         channels: Arc::clone(&channels),
     };
     let (stop_there, domain_there) = (Arc::clone(&stop), domain.clone());
+    let renewing = Renewing::new(Arc::clone(&renewal));
     let thread = std::thread::Builder::new()
         .name("estimate".into())
         .spawn(move || {
-            let mut plane = match DataPlane::open(domain_there, &robot, setup, state_file, shared) {
-                Ok(plane) => plane,
-                Err(error) => return drop(ready.send(Err(error))),
-            };
+            let mut plane =
+                match DataPlane::open(domain_there, &robot, setup, state_file, shared, renewing) {
+                    Ok(plane) => plane,
+                    Err(error) => return drop(ready.send(Err(error))),
+                };
             let refused = realtime
                 .map(|r| realtime::apply(r.cpu, r.priority))
                 .unwrap_or_default();
@@ -214,7 +213,6 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
 
 /// What data plane and control plane tell each other, without a lock.
 struct Shared {
-    renewal: Arc<Renewal>,
     /// The time of the last turn of its loop.
     last_turn: Arc<AtomicI64>,
     /// Per channel of the configuration, what has come of it.
@@ -269,14 +267,12 @@ struct DataPlane {
     robot: String,
     pipeline: Pipeline,
     ports: Ports,
-    /// The domain in which the ports are still to be opened, and when that is tried again.
-    renewing: Option<(Domain, Nanos)>,
+    renewing: Renewing,
     /// Losses and epochs of the readers of domains before.
     lost: u64,
     epochs: u64,
     /// The samples taken at once, to be sorted by stamp; never grows.
     inbox: Vec<Sample>,
-    renewal_reported: bool,
     unknown_contact_reported: bool,
     refusal_reported: bool,
     /// Consecutive health periods in which a sensor lacked the temperature that its calibration
@@ -301,6 +297,7 @@ impl DataPlane {
         setup: Setup,
         state_file: Option<StateFile>,
         shared: Shared,
+        renewing: Renewing,
     ) -> anyhow::Result<Self> {
         let first_look = FirstLook::start(&setup)?;
         let mut pipeline = Pipeline::new(setup);
@@ -321,13 +318,12 @@ impl DataPlane {
             robot: robot.to_owned(),
             pipeline,
             ports,
-            renewing: None,
+            renewing,
             lost: 0,
             epochs: 0,
             identification,
             first_look,
             inbox: Vec::with_capacity(INBOX),
-            renewal_reported: false,
             unknown_contact_reported: false,
             refusal_reported: false,
             without_temperature: 0,
@@ -343,42 +339,23 @@ impl DataPlane {
         })
     }
 
-    /// Opens all ports anew if a domain was passed, or tries it again. What was identified stays.
-    fn look_for_renewal(&mut self, now: Nanos) {
-        if let Some(domain) = self.shared.renewal.take() {
-            self.renewing = Some((domain, now));
-        }
-        if self.renewing.as_ref().is_some_and(|(_, t)| *t <= now) {
-            self.renew(now);
-        }
-    }
-
-    #[cold]
+    /// Opens all ports anew if a domain was passed. What was identified stays.
     fn renew(&mut self, now: Nanos) {
-        let Some((domain, _)) = self.renewing.take() else {
-            return;
-        };
+        let (setup, robot) = (self.pipeline.setup(), &self.robot);
         let identifies = self.ports.inertias.is_some();
-        match Ports::open(
-            domain.clone(),
-            self.pipeline.setup(),
-            &self.robot,
-            identifies,
-        ) {
-            Ok(ports) => {
+        let open = |domain: &Domain| Ports::open(domain.clone(), setup, robot, identifies);
+        match self.renewing.ports(now, open) {
+            Some(Ok(ports)) => {
                 if let Some(samples) = &self.ports.samples {
                     self.lost += samples.lost();
                     self.epochs += samples.epochs();
                 }
                 self.ports = ports;
-                self.renewal_reported = false;
             }
-            Err(error) => {
-                if !std::mem::replace(&mut self.renewal_reported, true) {
-                    tracing::error!("estimates cannot be published: {error:#}; trying again");
-                }
-                self.renewing = Some((domain, now + RENEWAL_PERIOD));
+            Some(Err(error)) => {
+                tracing::error!("estimates cannot be published: {error:#}; trying again");
             }
+            None => {}
         }
     }
 
@@ -387,7 +364,7 @@ impl DataPlane {
             let now = monotonic();
             self.shared.last_turn.store(now.0, Relaxed);
             self.health.last_turn = now;
-            self.look_for_renewal(now);
+            self.renew(now);
             if now >= self.next_connect {
                 self.next_connect = now + CONNECT_PERIOD;
                 connect(&mut self.ports.samples, &self.ports.domain, &self.robot);

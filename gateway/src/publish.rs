@@ -1,6 +1,6 @@
 //! Destinations of samples: shared memory, or a vector in tests.
 
-use proprio_topics::ipc::{Domain, Renewal, Writer};
+use proprio_topics::ipc::{Domain, Renewal, Renewing, Writer};
 use proprio_topics::{Nanos, Sample};
 use std::sync::Arc;
 
@@ -43,14 +43,8 @@ impl Sink for Memory {
 pub struct Shared {
     writer: Writer<Sample>,
     robot: String,
-    renewal: Arc<Renewal>,
-    /// The domain in which the writer is still to be made, and when that is tried again.
-    next: Option<(Domain, Nanos)>,
-    has_failed: bool,
+    renewing: Renewing,
 }
-
-/// How often a writer is tried to be made.
-const RETRY: Nanos = Nanos::from_millis(100);
 
 impl Shared {
     /// Publishes the samples of `robot` with `writer`, until a `renewal`.
@@ -58,39 +52,21 @@ impl Shared {
         Self {
             writer,
             robot: robot.to_owned(),
-            renewal,
-            next: None,
-            has_failed: false,
+            renewing: Renewing::new(renewal),
         }
     }
 
     /// Makes the writer anew if a domain was passed; until it can be made, samples are lost and
     /// counted.
     fn look(&mut self, now: Nanos) {
-        if let Some(domain) = self.renewal.take() {
-            self.next = Some((domain, now));
-        }
-        if self.next.as_ref().is_some_and(|(_, t)| *t <= now) {
-            self.renew(now);
-        }
-    }
-
-    #[cold]
-    fn renew(&mut self, now: Nanos) {
-        let Some((domain, _)) = self.next.take() else {
-            return;
-        };
-        match Writer::create(&domain, &self.robot, domain.epoch()) {
-            Ok(writer) => {
-                self.writer = writer;
-                self.has_failed = false;
+        let robot = &self.robot;
+        let create = |domain: &Domain| Writer::create(domain, robot, domain.epoch());
+        match self.renewing.ports(now, create) {
+            Some(Ok(writer)) => self.writer = writer,
+            Some(Err(error)) => {
+                tracing::error!("samples cannot be published: {error}; trying again");
             }
-            Err(error) => {
-                if !std::mem::replace(&mut self.has_failed, true) {
-                    tracing::error!("samples cannot be published: {error}; trying again");
-                }
-                self.next = Some((domain, now + RETRY));
-            }
+            None => {}
         }
     }
 }

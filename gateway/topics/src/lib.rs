@@ -40,6 +40,8 @@ pub mod health;
 pub mod inertia;
 #[cfg(feature = "ipc")]
 pub mod ipc;
+#[cfg(feature = "ipc")]
+mod maps;
 pub mod reading;
 #[cfg(feature = "ipc")]
 pub mod realtime;

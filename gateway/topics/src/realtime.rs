@@ -1,6 +1,7 @@
 //! Scheduling of real-time threads in gateway, estimator and control loops: processor affinity,
 //! SCHED_FIFO, locked memory.
 
+use crate::maps::Mapping;
 use nix::libc;
 use nix::sched::{CpuSet, sched_setaffinity};
 use nix::unistd::Pid;
@@ -29,12 +30,13 @@ pub const SMALL_STACK: usize = 512 << 10;
 fn lock_memory() -> io::Result<()> {
     let maps = || fs::read_to_string("/proc/self/maps");
     for line in maps()?.lines() {
-        let Some((start, length)) = readable(line) else {
+        let Some(mapping) = Mapping::parse(line).filter(Mapping::is_readable) else {
             continue;
         };
+        let (start, length) = (mapping.start as *const _, mapping.length());
         // SAFETY: a locked page differs from another in nothing that a program can see; a range
         // that was unmapped meanwhile is an error.
-        if unsafe { libc::mlock2(start as *const _, length, libc::MLOCK_ONFAULT) } != 0 {
+        if unsafe { libc::mlock2(start, length, libc::MLOCK_ONFAULT) } != 0 {
             let error = io::Error::last_os_error();
             let is_there = maps()?.lines().any(|other| other == line);
             if is_there {
@@ -43,17 +45,6 @@ fn lock_memory() -> io::Result<()> {
         }
     }
     Ok(())
-}
-
-/// Start and length of a mapping that can be read, from a line of /proc/PID/maps; not of the
-/// kernel's own. Source: proc_pid_maps(5).
-fn readable(line: &str) -> Option<(usize, usize)> {
-    let (range, rest) = line.split_once(' ')?;
-    let (start, end) = range.split_once('-')?;
-    let address = |digits| usize::from_str_radix(digits, 16).ok();
-    let (start, end) = (address(start)?, address(end)?);
-    let is_kernels = rest.contains("[v");
-    (rest.starts_with('r') && !is_kernels).then(|| (start, end.saturating_sub(start)))
 }
 
 /// Binds the calling thread to `cpu`; gives it SCHED_FIFO `priority` (1 to 99) and locks the
@@ -103,17 +94,4 @@ pub fn apply(cpu: Option<usize>, priority: Option<i32>) -> Vec<String> {
         }
     }
     refused
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_can_be_read_is_locked() {
-        let line = "7f00-8000 rw-s 00000000 00:1a 5 /dev/shm/proprio_0a_x.data";
-        assert_eq!(readable(line), Some((0x7f00, 0x100)));
-        assert_eq!(readable("7f00-8000 ---p 00000000 00:00 0 "), None);
-        assert_eq!(readable("7f00-8000 r-xp 00000000 00:00 0 [vdso]"), None);
-    }
 }

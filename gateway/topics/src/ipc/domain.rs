@@ -395,7 +395,7 @@ impl<S: Service> Domain<S> {
 
     /// Gives up a domain that is not intact: removes its directory, by which all its processes see
     /// that they must open a new one.
-    pub fn abandon(&self) {
+    pub(super) fn abandon(&self) {
         let place = &self.inner.place;
         let _lock = Lock::take_within(&place.lock, FEW_STEPS);
         if self.is_there() {

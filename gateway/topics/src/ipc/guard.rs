@@ -8,6 +8,7 @@
 //! panics because of what it finds, that is caught ([`Guard::survive`]). Any other bus error goes
 //! to whoever would have got it without this handler.
 
+use crate::maps::Mapping;
 use core::sync::atomic::Ordering::{Acquire, Relaxed, Release};
 use core::sync::atomic::{AtomicBool, AtomicU32};
 use nix::errno::Errno;
@@ -96,9 +97,9 @@ extern "C" fn on_bus_error(_: libc::c_int, info: *mut libc::siginfo_t, _: *mut l
     };
     let is_fault = code > 0;
     match damaged(maps, address).filter(|_| is_fault) {
-        Some(mapping) if replace(address / page * page, mapping.end) => {
+        Some((end, is_deleted)) if replace(address / page * page, end) => {
             // What was deleted belongs to a domain that has been given up.
-            if !mapping.is_deleted {
+            if !is_deleted {
                 DAMAGES.fetch_add(1, Release);
             }
         }
@@ -125,8 +126,9 @@ fn replace(start: usize, end: usize) -> bool {
     mapped != libc::MAP_FAILED
 }
 
-/// The mapping at `address`, if it is one of a domain's file. Without allocation.
-fn damaged(maps: &OwnedFd, address: usize) -> Option<Mapping> {
+/// The end of the mapping at `address` if it is one of a domain's file, and whether that file has
+/// been deleted. Without allocation.
+fn damaged(maps: &OwnedFd, address: usize) -> Option<(usize, bool)> {
     let (mut lines, mut chunk, mut place) = (Lines::default(), [0; 1024], 0);
     loop {
         let length = match pread(maps, &mut chunk, place) {
@@ -135,13 +137,21 @@ fn damaged(maps: &OwnedFd, address: usize) -> Option<Mapping> {
         };
         place += i64::try_from(length).ok()?;
         for &byte in chunk.iter().take(length) {
-            if let Some(mapping) = lines.take(byte).and_then(mapping)
+            let line = lines
+                .take(byte)
+                .and_then(|line| core::str::from_utf8(line).ok());
+            if let Some(mapping) = line.and_then(Mapping::parse)
                 && (mapping.start..mapping.end).contains(&address)
             {
-                return mapping.is_of_domain.then_some(mapping);
+                return is_of_domain(&mapping).then_some((mapping.end, mapping.is_deleted()));
             }
         }
     }
+}
+
+/// Whether a mapping is that of a segment or a bell.
+fn is_of_domain(mapping: &Mapping<'_>) -> bool {
+    mapping.rest.contains(" /dev/shm/proprio_") || mapping.rest.contains("/bells/")
 }
 
 /// Cuts text into lines; of a line that is too long, the rest is lost.
@@ -179,28 +189,6 @@ impl Lines {
     }
 }
 
-#[derive(Debug, PartialEq, Eq)]
-struct Mapping {
-    start: usize,
-    end: usize,
-    is_of_domain: bool,
-    is_deleted: bool,
-}
-
-/// A line of /proc/PID/maps (proc_pid_maps(5)).
-fn mapping(line: &[u8]) -> Option<Mapping> {
-    let text = core::str::from_utf8(line).ok()?;
-    let (range, rest) = text.split_once(' ')?;
-    let (start, end) = range.split_once('-')?;
-    let address = |digits| usize::from_str_radix(digits, 16).ok();
-    Some(Mapping {
-        start: address(start)?,
-        end: address(end)?,
-        is_of_domain: rest.contains(" /dev/shm/proprio_") || rest.contains("/bells/"),
-        is_deleted: rest.ends_with(" (deleted)"),
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -219,18 +207,16 @@ mod tests {
         let mut lines = Lines::default();
         let mut found = vec![];
         for byte in text {
-            found.extend(lines.take(*byte).and_then(mapping));
+            let line = lines
+                .take(*byte)
+                .map(|line| core::str::from_utf8(line).unwrap());
+            let mapping = line.and_then(Mapping::parse);
+            found.extend(mapping.map(|own| (own.start, own.end, is_of_domain(&own))));
         }
-        let of = |start, end, is_of_domain| Mapping {
-            start,
-            end,
-            is_of_domain,
-            is_deleted: false,
-        };
         let expected = [
-            of(0x7f00, 0x8000, true),
-            of(0x8000, 0xa000, false),
-            of(0xb000, 0xc000, false),
+            (0x7f00, 0x8000, true),
+            (0x8000, 0xa000, false),
+            (0xb000, 0xc000, false),
         ];
         assert_eq!(found, expected);
     }

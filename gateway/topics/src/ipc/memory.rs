@@ -8,6 +8,7 @@
 use super::error::SHM;
 use super::sweep::Place;
 use super::{DomainError, Topic};
+use crate::maps::Mapping;
 use crate::{
     ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
     InertiaEstimate, Sample, TorqueEstimate,
@@ -135,22 +136,14 @@ pub(super) fn commit(place: &Place, before: &BTreeSet<PathBuf>) -> Result<Vec<Ma
 #[allow(unsafe_code)]
 pub(super) fn give_back(prefix: &str) {
     let maps = fs::read_to_string("/proc/self/maps").unwrap_or_default();
-    for line in maps.lines().filter(|line| line.contains(prefix)) {
-        if let Some((start, length)) = mapped(line) {
-            // SAFETY: the range is shared memory of a domain that is given up, whose users expect
-            // any bytes. Where it is something else by now (not a shared, writable mapping of a
-            // file), the kernel refuses.
-            unsafe { libc::madvise(start as *mut _, length, libc::MADV_REMOVE) };
-        }
+    let own = maps.lines().filter_map(Mapping::parse);
+    for mapping in own.filter(|mapping| mapping.rest.contains(prefix)) {
+        let (start, length) = (mapping.start as *mut _, mapping.length());
+        // SAFETY: the range is shared memory of a domain that is given up, whose users expect any
+        // bytes. Where it is something else by now (not a shared, writable mapping of a file), the
+        // kernel refuses.
+        unsafe { libc::madvise(start, length, libc::MADV_REMOVE) };
     }
-}
-
-/// Start and length of a mapping, from a line of /proc/PID/maps. Source: proc_pid_maps(5).
-fn mapped(line: &str) -> Option<(usize, usize)> {
-    let (start, end) = line.split_once(' ')?.0.split_once('-')?;
-    let address = |digits| usize::from_str_radix(digits, 16).ok();
-    let (start, end) = (address(start)?, address(end)?);
-    Some((start, end.saturating_sub(start)))
 }
 
 fn allocate(path: &Path, needed: u64) -> Result<(), DomainError> {

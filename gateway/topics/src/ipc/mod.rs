@@ -47,7 +47,7 @@ pub use error::{DomainError, PortError, SendError, TakeError, open_files_remedy}
 pub use memory::memory_needed;
 pub use presence::{Presence, RobotPresence, Watch};
 pub use reader::{Freshness, Reader};
-pub use renewal::Renewal;
+pub use renewal::{Renewal, Renewing};
 pub use robot::{
     ChannelHandle, Contact, ContactHandle, Measured, Missing, RobotReader, Torque, TorqueHandle,
     Unavailable,

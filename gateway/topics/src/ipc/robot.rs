@@ -601,7 +601,7 @@ impl Attaching {
                     estimator: Watch::default(),
                 };
                 while !attacher.shared.stop.load(Acquire) {
-                    // Whatever it finds in damaged memory, the next turn opens the domain anew.
+                    // iceoryx2 may panic in damaged memory, which must not end the thread.
                     let _ = catch_unwind(AssertUnwindSafe(|| attacher.turn(monotonic())));
                     thread::park_timeout(PERIOD);
                 }
