@@ -140,6 +140,8 @@ impl BusThread {
                 Ok(writer) => writer,
                 Err(error) => return drop(ready.send(Err(error))),
             };
+            // The memory of a domain that is given up is freed when nobody has it any more.
+            drop(domain);
             let refused = realtime
                 .map(|r| realtime::apply(r.cpu, r.priority))
                 .unwrap_or_default();

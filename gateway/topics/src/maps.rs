@@ -1,5 +1,8 @@
 //! The lines of /proc/PID/maps, the mappings of a process. Source: proc_pid_maps(5).
 
+/// How the kernel says that a file has been deleted.
+pub(crate) const DELETED: &str = " (deleted)";
+
 /// A mapping. Reading it allocates nothing: a signal handler does so.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Mapping<'a> {
@@ -32,7 +35,13 @@ impl<'a> Mapping<'a> {
 
     /// Whether its file has been deleted.
     pub(crate) fn is_deleted(&self) -> bool {
-        self.rest.ends_with(" (deleted)")
+        self.rest.ends_with(DELETED)
+    }
+
+    /// Device, inode and file: what tells one file from another.
+    pub(crate) fn file(&self) -> &'a str {
+        let rest = self.rest.strip_suffix(DELETED).unwrap_or(self.rest);
+        rest.splitn(3, ' ').nth(2).unwrap_or_default()
     }
 }
 
@@ -50,6 +59,8 @@ mod tests {
         assert_eq!(read(line), (0x7f00, 0x100, true, false));
         let line = "7f00-8000 rw-s 00000000 00:1a 5 /dev/shm/proprio_0a_x.data (deleted)";
         assert_eq!(read(line), (0x7f00, 0x100, true, true));
+        let file = Mapping::parse(line).unwrap().file();
+        assert_eq!(file, "00:1a 5 /dev/shm/proprio_0a_x.data");
         let line = "7f00-8000 ---p 00000000 00:00 0 ";
         assert_eq!(read(line), (0x7f00, 0x100, false, false));
         let line = "7f00-8000 r-xp 00000000 00:00 0 [vdso]";

@@ -4,7 +4,7 @@ use super::bell::Bell;
 use super::error::{SHM, transport};
 use super::guard::Guard;
 use super::lock::{FEW_STEPS, Lock, STEPS};
-use super::memory::{self, Made};
+use super::memory::{self, Held, Made};
 use super::sweep::{self, Place, SweepCounts};
 use super::{DomainError, PortError};
 use iceoryx2::prelude::{
@@ -178,6 +178,8 @@ struct Inner<S: Service> {
     steps: u32,
     /// The files that this process has made.
     made: Mutex<Vec<Made>>,
+    /// What it holds of a domain that was given up.
+    held: Mutex<Held>,
 }
 
 impl Domain {
@@ -280,6 +282,7 @@ impl<S: Service> Domain<S> {
             guard,
             steps,
             made: Mutex::new(made),
+            held: Mutex::default(),
         };
         Ok(Self {
             inner: Arc::new(inner),
@@ -369,7 +372,9 @@ impl<S: Service> Domain<S> {
     /// deleted, replaced or shortened a file. Looks at each, so not for a data plane.
     #[must_use]
     pub fn is_intact(&self) -> bool {
-        self.is_usable() && self.inner.made().iter().all(Made::is_intact)
+        self.is_usable()
+            && self.inner.made().iter().all(Made::is_intact)
+            && self.inner.emptied().next().is_none()
     }
 
     pub(super) fn guard(&self) -> &Guard {
@@ -378,7 +383,7 @@ impl<S: Service> Domain<S> {
 
     /// Whether ports may still be used: the directory is there, and no memory was found damaged.
     pub(super) fn is_usable(&self) -> bool {
-        self.is_there() && self.inner.guard.is_sound()
+        self.inner.is_usable()
     }
 
     /// What happened to a domain that is not intact, for a person.
@@ -401,8 +406,11 @@ impl<S: Service> Domain<S> {
         if self.is_there() {
             let _ = fs::remove_dir_all(&place.root);
         }
-        // Ports of a damaged domain are not dropped, so their memory is given back here.
-        memory::give_back(&place.prefix);
+        // Whoever opens one of these waits for its content, with the lock.
+        self.inner
+            .emptied()
+            .for_each(|path| drop(fs::remove_file(path)));
+        self.inner.hold();
     }
 
     /// The bell of `service`.
@@ -474,6 +482,26 @@ impl<S: Service> Inner<S> {
         self.made().extend(made);
     }
 
+    /// The segments that another program has emptied.
+    fn emptied(&self) -> impl Iterator<Item = PathBuf> {
+        let segments = self.place.segments().into_iter().flatten();
+        let emptied = segments.filter(|(_, meta)| memory::is_emptied(meta));
+        emptied.map(|(path, _)| path)
+    }
+
+    /// Notes what this process holds of a domain that is given up. If it has opened the domain
+    /// twice, nobody knows what is whose: then that stays until the process ends.
+    fn hold(&self) {
+        if sweep::is_only(&self.place, self.id) {
+            let held = Held::of(&self.place.prefix);
+            *self.held.lock().unwrap_or_else(PoisonError::into_inner) = held;
+        }
+    }
+
+    fn is_usable(&self) -> bool {
+        self.is_there() && self.guard.is_sound()
+    }
+
     fn is_there(&self) -> bool {
         let inode = |meta: Metadata| (meta.dev(), meta.ino());
         let now = fs::metadata(&self.place.root).map(inode);
@@ -485,7 +513,7 @@ impl<S: Service> Inner<S> {
     /// iceoryx2 would remove the files of the same names in the directory that has replaced it. And
     /// it would not find its way in damaged memory.
     fn drop_unless_replaced<P>(&self, resource: P) {
-        if self.is_there() && self.guard.is_sound() {
+        if self.is_usable() {
             drop(resource);
         } else {
             std::mem::forget(resource);
@@ -501,7 +529,12 @@ impl<S: Service> Drop for Inner<S> {
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
             .take();
+        if !self.is_usable() {
+            self.hold();
+        }
         self.drop_unless_replaced(node);
+        let held = std::mem::take(self.held.get_mut().unwrap_or_else(PoisonError::into_inner));
+        held.release();
         sweep::deregister(&self.place, self.id);
         if let Ok(lock) = lock
             && sweep::sweep(&self.place, &self.iceoryx).is_ok_and(|s| s.alive == 0)

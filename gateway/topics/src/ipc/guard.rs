@@ -22,9 +22,9 @@ use std::os::fd::OwnedFd;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Once, OnceLock};
 
-/// What the handler needs and must not ask for: the bytes of a page, this process's mappings, and
-/// who is asked if it is not responsible.
-static PREPARED: OnceLock<(usize, OwnedFd, SigAction)> = OnceLock::new();
+/// What the handler needs and must not ask for: the bytes of a page, and who is asked if it is not
+/// responsible.
+static PREPARED: OnceLock<(usize, SigAction)> = OnceLock::new();
 
 /// The mappings that were damaged so far.
 static DAMAGES: AtomicU32 = AtomicU32::new(0);
@@ -73,18 +73,23 @@ fn install() {
     ONCE.call_once(|| {
         let page = sysconf(SysconfVar::PAGE_SIZE).ok().flatten();
         let page = page.and_then(|page| usize::try_from(page).ok());
-        let flags = OFlag::O_RDONLY | OFlag::O_CLOEXEC;
-        let maps = open("/proc/self/maps", flags, Mode::empty());
-        let (Some(page), Ok(maps)) = (page, maps) else {
+        let (Some(page), Ok(_)) = (page, mappings()) else {
             return;
         };
         let flags = SaFlags::SA_SIGINFO | SaFlags::SA_ONSTACK | SaFlags::SA_NODEFER;
         let action = SigAction::new(SigHandler::SigAction(on_bus_error), flags, SigSet::empty());
         // SAFETY: the handler makes only calls that are async-signal-safe, and takes no lock.
         if let Ok(before) = unsafe { sigaction(Signal::SIGBUS, &action) } {
-            let _ = PREPARED.set((page, maps, before));
+            let _ = PREPARED.set((page, before));
         }
     });
+}
+
+/// The list of this process's mappings. Each fault opens its own: the kernel goes on from the last
+/// mapping that was read from a descriptor, and two threads at one would make each other skip.
+fn mappings() -> nix::Result<OwnedFd> {
+    let flags = OFlag::O_RDONLY | OFlag::O_CLOEXEC;
+    open(c"/proc/self/maps", flags, Mode::empty())
 }
 
 #[allow(unsafe_code)]
@@ -92,11 +97,11 @@ extern "C" fn on_bus_error(_: libc::c_int, info: *mut libc::siginfo_t, _: *mut l
     let errno = Errno::last_raw();
     // SAFETY: the kernel passes a valid pointer to a handler with SA_SIGINFO.
     let (address, code) = unsafe { ((*info).si_addr() as usize, (*info).si_code) };
-    let Some((page, maps, before)) = PREPARED.get() else {
+    let Some((page, before)) = PREPARED.get() else {
         return;
     };
     let is_fault = code > 0;
-    match damaged(maps, address).filter(|_| is_fault) {
+    match damaged(address).filter(|_| is_fault) {
         Some((end, is_deleted)) if replace(address / page * page, end) => {
             // What was deleted belongs to a domain that has been given up.
             if !is_deleted {
@@ -128,10 +133,11 @@ fn replace(start: usize, end: usize) -> bool {
 
 /// The end of the mapping at `address` if it is one of a domain's file, and whether that file has
 /// been deleted. Without allocation.
-fn damaged(maps: &OwnedFd, address: usize) -> Option<(usize, bool)> {
+fn damaged(address: usize) -> Option<(usize, bool)> {
+    let maps = mappings().ok()?;
     let (mut lines, mut chunk, mut place) = (Lines::default(), [0; 1024], 0);
     loop {
-        let length = match pread(maps, &mut chunk, place) {
+        let length = match pread(&maps, &mut chunk, place) {
             Ok(0) | Err(_) => return None,
             Ok(length) => length,
         };

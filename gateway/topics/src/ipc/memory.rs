@@ -8,7 +8,7 @@
 use super::error::SHM;
 use super::sweep::Place;
 use super::{DomainError, Topic};
-use crate::maps::Mapping;
+use crate::maps::{DELETED, Mapping};
 use crate::{
     ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
     InertiaEstimate, Sample, TorqueEstimate,
@@ -16,12 +16,19 @@ use crate::{
 use nix::fcntl::posix_fallocate;
 use nix::libc;
 use nix::sys::statvfs::statvfs;
+use std::borrow::ToOwned;
 use std::collections::BTreeSet;
-use std::fs::{self, OpenOptions};
+use std::format;
+use std::fs::{self, Metadata, OpenOptions};
 use std::io;
+use std::os::fd::{FromRawFd, OwnedFd};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
+use std::string::String;
 use std::vec::Vec;
+
+/// The mappings of this process.
+const MAPS: &str = "/proc/self/maps";
 
 /// What a port or a process needs beside payloads: the lists of a service's ports, the connections
 /// to those that exist, directories \[bytes\].
@@ -65,6 +72,12 @@ pub(super) fn require(needed: u64) -> Result<(), DomainError> {
         true => Ok(()),
         false => Err(DomainError::NoRoom { needed, free }),
     }
+}
+
+/// Whether a segment is empty although it was finished: another program has emptied it. iceoryx2
+/// would wait for its content without end.
+pub(super) fn is_emptied(meta: &Metadata) -> bool {
+    meta.len() == 0 && meta.mode() & 0o400 != 0
 }
 
 /// A file of the domain as it was when this process made it.
@@ -131,19 +144,61 @@ pub(super) fn commit(place: &Place, before: &BTreeSet<PathBuf>) -> Result<Vec<Ma
         .collect())
 }
 
-/// Gives back the memory of all segments with this prefix that this process has mapped, of those
-/// that are deleted too: for everybody they are empty afterwards.
-#[allow(unsafe_code)]
-pub(super) fn give_back(prefix: &str) {
-    let maps = fs::read_to_string("/proc/self/maps").unwrap_or_default();
-    let own = maps.lines().filter_map(Mapping::parse);
-    for mapping in own.filter(|mapping| mapping.rest.contains(prefix)) {
-        let (start, length) = (mapping.start as *mut _, mapping.length());
-        // SAFETY: the range is shared memory of a domain that is given up, whose users expect any
-        // bytes. Where it is something else by now (not a shared, writable mapping of a file), the
-        // kernel refuses.
-        unsafe { libc::madvise(start, length, libc::MADV_REMOVE) };
+/// What this process has mapped and opened of a domain that it gives up. iceoryx2's objects that
+/// hold it are never dropped: they would remove files of the domain that replaces it.
+#[derive(Debug, Default)]
+pub(super) struct Held {
+    /// Lines of the kernel's list.
+    mappings: Vec<String>,
+    descriptors: Vec<(i32, PathBuf)>,
+}
+
+impl Held {
+    /// Everything in files whose names have this prefix.
+    pub(super) fn of(prefix: &str) -> Self {
+        let maps = fs::read_to_string(MAPS).unwrap_or_default();
+        let mappings = maps.lines().filter(|line| line.contains(prefix));
+        let descriptors = entries(Path::new("/proc/self/fd")).filter_map(|entry| {
+            let path = fs::read_link(&entry).ok()?;
+            let number = entry.file_name()?.to_str()?.parse().ok()?;
+            path.to_str()?.contains(prefix).then_some((number, path))
+        });
+        Self {
+            mappings: mappings.map(ToOwned::to_owned).collect(),
+            descriptors: descriptors.collect(),
+        }
     }
+
+    /// Unmaps and closes what is still there. Nobody may use it any more.
+    #[allow(unsafe_code)]
+    pub(super) fn release(self) {
+        let maps = fs::read_to_string(MAPS).unwrap_or_default();
+        let held = self.mappings.iter();
+        let held: Vec<_> = held.filter_map(|line| Mapping::parse(line)).collect();
+        for now in maps.lines().filter_map(Mapping::parse) {
+            // The end may have been replaced since: `guard`.
+            let is_held = held.iter().any(|before| {
+                before.start <= now.start && now.end <= before.end && before.file() == now.file()
+            });
+            if is_held {
+                // SAFETY: the mapping belongs to objects that are not used and not dropped.
+                unsafe { libc::munmap(now.start as *mut _, now.length()) };
+            }
+        }
+        for (number, path) in self.descriptors {
+            let now = fs::read_link(format!("/proc/self/fd/{number}"));
+            if now.is_ok_and(|now| file_of(&now) == file_of(&path)) {
+                // SAFETY: as above.
+                drop(unsafe { OwnedFd::from_raw_fd(number) });
+            }
+        }
+    }
+}
+
+/// A link of the kernel to an open file, without what says that it has been deleted.
+fn file_of(link: &Path) -> &str {
+    let link = link.to_str().unwrap_or_default();
+    link.strip_suffix(DELETED).unwrap_or(link)
 }
 
 fn allocate(path: &Path, needed: u64) -> Result<(), DomainError> {

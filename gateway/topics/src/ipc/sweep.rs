@@ -72,6 +72,14 @@ pub(super) fn deregister(place: &Place, node: u128) {
         .retain(|(p, n)| (p, *n) != (&place.prefix, node));
 }
 
+/// Whether `node` is the only one of this process in the domain.
+pub(super) fn is_only(place: &Place, node: u128) -> bool {
+    OWN.lock()
+        .unwrap_or_else(PoisonError::into_inner)
+        .iter()
+        .all(|(p, n)| *p != place.prefix || *n == node)
+}
+
 fn is_own(place: &Place, node: u128) -> bool {
     OWN.lock()
         .unwrap_or_else(PoisonError::into_inner)

@@ -68,7 +68,7 @@ impl<T: Topic> Writer<T> {
         let name = service_name(robot, T::SUFFIX)?;
         let quality = T::QUALITY;
         let failures = Failures::default();
-        let (publisher, service, bell) = domain.locked(memory::needed::<T>(), |node| {
+        let (publisher, service, readers, bell) = domain.locked(memory::needed::<T>(), |node| {
             let service = node
                 .service_builder(&name)
                 .publish_subscribe::<T>()
@@ -115,9 +115,9 @@ impl<T: Topic> Writer<T> {
                         problem: transport(e),
                     },
                 })?;
-            Ok((publisher, service, bell))
+            let readers = service.dynamic_config().number_of_subscribers();
+            Ok((publisher, service, readers, bell))
         })?;
-        let readers = service.dynamic_config().number_of_subscribers();
         Ok(Self {
             ports: Some((publisher, service)),
             domain: domain.clone(),
