@@ -44,7 +44,7 @@
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Link, Supervised};
-use crate::pairing::{Limit, Paired, Pairing};
+use crate::pairing::{Limit, Order, Paired, Pairing};
 use crate::recognise::{Evidence, Finding, Key, Traffic};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Format, Frame, Frames, Id, Mode, Output,
@@ -202,7 +202,7 @@ impl Aft {
         bringup.start_with(COMMAND, &[number, command::PERIOD, high, low, 0, 0, 0, 0]);
         let start = [number, command::TRANSMIT, CONTINUOUSLY, 0, 0, 0, 0, 0];
         bringup.start_with(COMMAND, &start);
-        let pairing = Pairing::new(Limit::of_period(period), true);
+        let pairing = Pairing::new(Limit::of_period(period), Order::Usual);
         let claims = ids.map(Claim::exclusive);
         let this = Self { ids, pairing };
         Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
@@ -241,12 +241,12 @@ impl Family for Aft {
             link.bringup.lost();
             out.fault(Counter::Unpaired, unpaired, frame.id);
         }
-        let Paired::With(acquired, stamp, first) = paired else {
+        let Paired::With(acquired, stamp, [first, second]) = paired else {
             return;
         };
         let mut quality = Quality::GOOD;
         let force = axes(first, NEWTON, 0, &mut quality);
-        let torque = axes(half, NEWTON_METRE, 3, &mut quality);
+        let torque = axes(second, NEWTON_METRE, 3, &mut quality);
         if quality.contains(Quality::SATURATED) {
             out.fault(Counter::Saturated, 1, frame.id);
         }

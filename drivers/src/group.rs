@@ -4,7 +4,7 @@
 //! dropped if a frame has come once too often, which may be a late one of the reading before.
 
 use crate::Frame;
-use crate::pairing::{Limit, Paired, Pairing};
+use crate::pairing::{Limit, Order, Paired, Pairing};
 use arrayvec::ArrayVec;
 use proprio_topics::{Nanos, StampKind};
 
@@ -36,7 +36,7 @@ pub(crate) struct Group<T> {
 impl<T: Copy> Group<T> {
     /// Readings of `frames` frames, each of which follows the one before within `limit`.
     pub(crate) fn new(frames: usize, limit: Limit) -> Self {
-        let links = (1..frames).map(|_| Pairing::new(limit, true));
+        let links = (1..frames).map(|_| Pairing::new(limit, Order::Strict));
         Self {
             links: links.take(LINKS).collect(),
             joined: true,
@@ -67,7 +67,7 @@ impl<T: Copy> Group<T> {
         };
         let before = position.checked_sub(1);
         if let Some(link) = before.and_then(|link| self.links.get_mut(link)) {
-            let Paired::With(_, _, first) = link.push(true, frame, part, &mut 0) else {
+            let Paired::With(_, _, [first, _]) = link.push(true, frame, part, &mut 0) else {
                 *dropped += u32::from(!self.joined && !self.counted);
                 self.counted = true;
                 return None;

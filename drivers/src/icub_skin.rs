@@ -44,7 +44,7 @@ use crate::bringup::{Bringup, NoInquiry};
 use crate::bytes;
 use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
-use crate::pairing::{Limit, Paired, Pairing};
+use crate::pairing::{Limit, Order, Paired, Pairing};
 use crate::recognise::{Finding, Key, Traffic};
 use crate::{
     Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Id, Mode, Output,
@@ -237,7 +237,7 @@ impl Patch {
             address,
             no_load: options.no_load,
             triangles: options.triangles,
-            pairing: core::array::from_fn(|_| Pairing::new(limit, true)),
+            pairing: core::array::from_fn(|_| Pairing::new(limit, Order::Usual)),
             gap: 0,
             seen: 0,
         };
@@ -293,13 +293,13 @@ impl Family for Patch {
             self.gap |= bit & self.seen;
             out.fault(Counter::Unpaired, unpaired, frame.id);
         }
-        let Paired::With(acquired, stamp, other) = paired else {
+        let Paired::With(acquired, stamp, [first, second]) = paired else {
             return;
         };
         if link.bringup.reading(frame.t) {
             self.gap = self.seen;
         }
-        let (skin, mut quality) = self.skin(triangle, other, half);
+        let (skin, mut quality) = self.skin(triangle, first, second);
         if quality.contains(Quality::DEVICE_FAULT) {
             out.fault(Counter::DeviceFault, 1, frame.id);
         }

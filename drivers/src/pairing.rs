@@ -11,6 +11,11 @@
 //! its first as quickly as usual on this bus, until one does or a surplus second half shows that
 //! one was late.
 //!
+//! An adapter under load may exchange two frames in a row. A second half without a first one waits
+//! for it, unless it may be a late one: nothing is missing, and there is no doubt. It waits for
+//! P/2 - L, at most 1 ms ([`ADAPTER`]): the next reading's first half comes P - L - J after it (P,
+//! L and J: below).
+//!
 //! The stream may be joined between two halves: the first half that is heard, if its other half was
 //! sent before, is dropped and not counted.
 //!
@@ -32,12 +37,14 @@
 //! sixth come later, and the bus counts as calm less than once in a year; with one of up to 0.6 ms,
 //! which loses nothing by the shorter limit, it does.
 //!
-//! Two cases cannot be distinguished from a good pair. (1) A second half that arrives between a
+//! Three cases cannot be distinguished from a good pair. (1) A second half that arrives between a
 //! first half and its own second half and is late by more than two periods, or had lost its first
 //! half, or is not the only late one in a row. (2) With a period below 2 ms, on a bus that is not
 //! calm (or not yet, in the first 192 readings): a second half and the next first half are lost,
 //! and the next second half comes within L + 1 ms. At 1 kHz with a jitter of 1 ms and one frame in
-//! 1000 lost, that is about one reading in a million.
+//! 1000 lost, that is about one reading in a million. Losses among pairs that are exchanged many
+//! times in a row end the calm, too. (3) A second half has lost its first one, and is late by more
+//! than P/2, to just before the next first half.
 
 use crate::Frame;
 use proprio_topics::{Nanos, StampKind};
@@ -56,8 +63,8 @@ pub(crate) fn within(earlier: (Nanos, StampKind), later: (Nanos, StampKind), mos
 pub(crate) enum Paired<T> {
     /// The half waits for its other half.
     Waiting,
-    /// The half completes this one, whose frame has this stamp.
-    With(Nanos, StampKind, T),
+    /// The half completes a reading: the stamp of what came first, the first half and the second.
+    With(Nanos, StampKind, [T; 2]),
     /// The half cannot be used.
     Alone,
 }
@@ -83,6 +90,8 @@ pub(crate) struct Limit {
     calm: Nanos,
     /// Otherwise.
     jittering: Nanos,
+    /// From a second half to its first half, if they were exchanged.
+    exchanged: Nanos,
 }
 
 impl Limit {
@@ -93,6 +102,7 @@ impl Limit {
             soon: ADJACENT + Nanos(period.0 / 4),
             calm: ADJACENT + half,
             jittering: ADJACENT + half.max(ADAPTER),
+            exchanged: (half - ADJACENT).clamp(Nanos::ZERO, ADAPTER),
         }
     }
 
@@ -102,19 +112,32 @@ impl Limit {
             soon: time,
             calm: time,
             jittering: time,
+            exchanged: if time.0 < ADAPTER.0 { time } else { ADAPTER },
         }
     }
+}
+
+/// In which order the halves of a reading come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Order {
+    /// Either half may come first, and waits for the other.
+    Any,
+    /// The first half comes first, unless an adapter exchanges them.
+    Usual,
+    /// The first half comes first; an exchanged pair is dropped.
+    Strict,
 }
 
 /// Combines the two halves of a reading (rules in the module documentation).
 #[derive(Debug)]
 pub(crate) struct Pairing<T> {
     limit: Limit,
-    /// Whether the first half always comes first. If not, either half waits for the other.
-    ordered: bool,
+    order: Order,
     /// Nothing but the waiting half was heard: its other half may have been sent before.
     joined: bool,
     pending: Option<(bool, Nanos, StampKind, T)>,
+    /// A second half that may have been exchanged with its first half.
+    ahead: Option<(Nanos, StampKind, T)>,
     /// A second half is missing and may still arrive.
     owed: bool,
     /// A second half may still arrive, unless it was in the dropped pair.
@@ -129,12 +152,13 @@ pub(crate) struct Pairing<T> {
 const USUAL_SLACK: Nanos = Nanos::from_micros(125);
 
 impl<T: Copy> Pairing<T> {
-    pub(crate) const fn new(limit: Limit, ordered: bool) -> Self {
+    pub(crate) const fn new(limit: Limit, order: Order) -> Self {
         Self {
             limit,
-            ordered,
+            order,
             joined: true,
             pending: None,
+            ahead: None,
             owed: false,
             doubt: false,
             usual: None,
@@ -150,17 +174,31 @@ impl<T: Copy> Pairing<T> {
         half: T,
         unpaired: &mut u32,
     ) -> Paired<T> {
+        let is_ordered = self.order != Order::Any;
         let waiting = (second, frame.t, frame.stamp, half);
+        let has_stamp = frame.stamp != StampKind::None;
+        if let Some((t, stamp, other)) = self.ahead.take() {
+            let now = (frame.t, frame.stamp);
+            if !second && has_stamp && within((t, stamp), now, self.limit.exchanged) {
+                self.calm = self.calm.saturating_add(1);
+                return Paired::With(t, stamp, [half, other]);
+            }
+            *unpaired += 1;
+        }
         let Some((was_second, t, stamp, other)) = self.pending.take() else {
-            if second && self.ordered {
-                // Either its first half was lost, or it is the missing second half.
-                self.owed = false;
-                self.doubt = false;
-                *unpaired += u32::from(!core::mem::take(&mut self.joined));
+            if second && is_ordered {
+                // Its first half was lost, or comes next; or it is the missing second half.
+                let is_late = core::mem::take(&mut self.owed) | core::mem::take(&mut self.doubt);
+                let joined = core::mem::take(&mut self.joined);
+                if self.order == Order::Usual && !joined && !is_late && has_stamp {
+                    self.ahead = Some((frame.t, frame.stamp, half));
+                    return Paired::Waiting;
+                }
+                *unpaired += u32::from(!joined);
                 return Paired::Alone;
             }
             // A first half is followed by its second.
-            self.joined &= !self.ordered;
+            self.joined &= !is_ordered;
             self.pending = Some(waiting);
             return Paired::Waiting;
         };
@@ -195,12 +233,13 @@ impl<T: Copy> Pairing<T> {
             self.doubt = false;
             let (passed, usual) = ((frame.t - t).0, self.usual.unwrap_or(frame.t - t).0);
             self.usual = Some(Nanos(usual + (passed - usual) / 8));
-            return Paired::With(t, stamp, other);
+            let halves = if second { [other, half] } else { [half, other] };
+            return Paired::With(t, stamp, halves);
         }
         self.doubt |= self.owed;
         self.owed = false;
         *unpaired += u32::from(!joined);
-        if self.ordered || in_time {
+        if is_ordered || in_time {
             *unpaired += 1;
             return Paired::Alone;
         }
@@ -212,6 +251,7 @@ impl<T: Copy> Pairing<T> {
     pub(crate) fn reset(&mut self) {
         self.joined = true;
         self.pending = None;
+        self.ahead = None;
         self.owed = false;
         self.doubt = false;
     }

@@ -30,6 +30,7 @@ mod taxels;
 pub use taxels::{Taxel, TaxelMap};
 
 use crate::history::History;
+use proprio_dynamics::PlaceStd;
 use proprio_dynamics::spatial::Vec3;
 use proprio_identification::statistics::exceeded;
 use proprio_topics::{Nanos, Quality, Reason, Skin};
@@ -81,6 +82,13 @@ pub fn threshold(noise: f64, taxels: usize, false_alarms_per_hour: f64) -> f64 {
     noise * exceeded((false_alarms_per_hour / per_hour).sqrt().clamp(1e-300, 0.5))
 }
 
+/// Standard deviation of the direction of a force on a touched skin \[rad\]: friction, which is a
+/// fifth of the pressure for a sliding finger, turns it from the normal.
+const NORMAL_STD: f64 = 0.2;
+/// The same where the normals of the touched taxels cancel out, so that the configured direction is
+/// a guess: about that of any direction.
+const NO_NORMAL_STD: f64 = 1.0;
+
 /// What patches show at an instant: sums over their pressed taxels.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct Touch {
@@ -91,7 +99,7 @@ pub(crate) struct Touch {
     /// Sum of pressure times outward normal.
     normal: Vec3,
     /// The largest standard deviation of position of the touched patches \[m\].
-    pub(crate) position_std: f64,
+    position_std: f64,
     /// A patch was touched when it was last heard, and is silent now: its number.
     pub(crate) lost: Option<usize>,
 }
@@ -103,12 +111,16 @@ impl Touch {
     }
 
     /// The position of the touch, and the direction of a force into the skin; the latter `None` if
-    /// the normals cancel each other, as on two opposite sides.
-    pub(crate) fn place(&self) -> (Vec3, Option<Vec3>) {
+    /// the normals cancel each other, as on two opposite sides. With their standard deviations.
+    pub(crate) fn place(&self) -> (Vec3, Option<Vec3>, PlaceStd) {
         let normal = self.normal / self.pressure;
         // A mean of unit vectors: shorter than half, they are more than 120 degrees apart.
         let direction = (normal.norm() > 0.5).then_some(-normal);
-        (self.moment / self.pressure, direction)
+        let std = PlaceStd {
+            position: self.position_std,
+            direction: direction.map_or(NO_NORMAL_STD, |_| NORMAL_STD),
+        };
+        (self.moment / self.pressure, direction, std)
     }
 }
 
@@ -348,16 +360,14 @@ mod tests {
             &[(10, 17.0), (13, 57.0), (2, -1.0)],
         );
         let now = touch(&patch, MS(1600));
-        let (position, direction) = now.place();
+        let (position, direction, std) = now.place();
         let expected = (20.0 * 0.10 + 60.0 * 0.13) / 80.0;
         assert!(
             (position - Vec3::new(expected, 0.0, 0.03)).norm() < 1e-3,
             "{position}"
         );
-        assert_eq!(
-            (direction, now.position_std, now.lost),
-            (Some(-Vec3::z()), 0.003, None)
-        );
+        assert_eq!((direction, now.lost), (Some(-Vec3::z()), None));
+        assert_eq!((std.position, std.direction), (0.003, NORMAL_STD));
         // What was before is still known.
         assert!(!touch(&patch, MS(1500)).is_there());
         assert!(touch(&patch, MS(1520)).is_there());
@@ -505,7 +515,8 @@ mod tests {
         });
         run(&mut patch, 0, 1500, 0.0, &[]);
         run(&mut patch, 1500, 1600, 0.0, &[(5, 50.0), (20, 50.0)]);
-        assert_eq!(touch(&patch, MS(1600)).place().1, None);
+        let (_, direction, std) = touch(&patch, MS(1600)).place();
+        assert_eq!((direction, std.direction), (None, NO_NORMAL_STD));
     }
 
     /// The stated rate of false alarms is the one that comes: normal noise on all taxels of a
@@ -586,7 +597,7 @@ mod tests {
                 patch.push(MS(5000 + 100 * t), &Skin { triangle: 0, taxels }, Quality::GOOD);
                 let now = touch(&patch, MS(5000 + 100 * t));
                 if now.is_there() {
-                    let (position, direction) = now.place();
+                    let (position, direction, _) = now.place();
                     // Within the patch.
                     prop_assert!(position.x >= -1e-9 && position.x <= 0.24, "{}", position);
                     prop_assert!(direction.is_none_or(|d| d.iter().all(|x| x.is_finite())));

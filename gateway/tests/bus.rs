@@ -10,7 +10,7 @@ use proprio_gateway::link::{Link, LinkCounters, ListenOnly, Received, SendError}
 use proprio_gateway::plan::{BusPlan, Plan};
 use proprio_gateway::publish::Memory;
 use proprio_gateway::status::BusStatus;
-use proprio_topics::{BusError, Counter, LinkState, Nanos, Quality, StampKind};
+use proprio_topics::{BusError, Counter, DeviceState, LinkState, Nanos, Quality, StampKind};
 use std::collections::VecDeque;
 use std::fmt::Write as _;
 use std::path::Path;
@@ -324,6 +324,30 @@ fn what_waits_is_dropped_when_the_link_is_lost() {
         rig.script().state = LinkState::Up;
         rig.turns(START);
         assert_eq!(rig.sent(), wanted);
+    }
+}
+
+/// No device streams over a lost link, whatever it did before.
+#[test]
+fn nobody_streams_over_a_lost_link() {
+    let mut rig = Rig::new(2);
+    let states = |rig: &Rig| -> Vec<DeviceState> {
+        let devices = rig.status.devices();
+        devices.filter_map(|device| device.state.get()).collect()
+    };
+    rig.turns(START);
+    rig.readings(2);
+    assert_eq!(states(&rig), [DeviceState::Streaming; 2]);
+    for lost in [LinkState::Down, LinkState::Gone, LinkState::BusOff] {
+        rig.script().state = lost;
+        rig.script().receives.push_back(Received::StateChanged);
+        rig.turns(2);
+        assert!(!states(&rig).contains(&DeviceState::Streaming), "{lost:?}");
+        rig.script().state = LinkState::Up;
+        rig.script().receives.push_back(Received::StateChanged);
+        rig.turns(START);
+        rig.readings(2);
+        assert_eq!(states(&rig), [DeviceState::Streaming; 2], "after {lost:?}");
     }
 }
 

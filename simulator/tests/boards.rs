@@ -397,6 +397,53 @@ fn a_silent_board_is_silent_and_others_are_not() {
     assert!(session.of("l_elbow").count() > 600);
 }
 
+/// What a silent board is told, it does not hear: one that is started meanwhile stays off.
+#[test]
+fn a_silent_board_does_not_listen() {
+    let robot = robot();
+    let started = |fault: &[&str]| {
+        let mut simulator = Simulator::new(&robot, &settings(fault), T0).unwrap();
+        let mut decoder = Decoder::new(
+            0,
+            &robot.plan.buses[0],
+            None,
+            Arc::new(BusStatus::new(0, &robot.plan.buses[0])),
+        )
+        .unwrap();
+        let (mut commands, mut frames) = (0, 0);
+        for ms in 0..1000 {
+            let now = T0 + Nanos::from_millis(ms);
+            while simulator.poll(now).is_some_and(|(bus, _)| bus == 0) {
+                frames += 1;
+            }
+            if ms == 500 {
+                let mut all = Vec::new();
+                // Each is given when the one before has been sent.
+                while {
+                    let before = all.len();
+                    decoder.poll_transmit(now, |device, t| all.push((device, t.frame)));
+                    for (device, frame) in &all[before..] {
+                        decoder.on_sent(*device, frame, Ok(now));
+                    }
+                    all.len() > before
+                } {}
+                for (_, frame) in &all {
+                    simulator.on_frame(0, frame, now);
+                }
+                commands = all.len();
+            }
+        }
+        assert!(commands > 0);
+        frames
+    };
+    assert!(started(&[]) > 0);
+    let silent = [
+        "silent:l_arm_ft_sensor@0.4..0.6",
+        "silent:chest_imu@0.4..0.6",
+    ];
+    assert_eq!(started(&silent), 0);
+}
+
 #[test]
 fn a_rebooted_board_comes_back_because_it_is_started_again() {
     let imu = session(&["reboot:chest_imu@1"], 4.0);

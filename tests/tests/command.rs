@@ -1424,6 +1424,16 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
     let place = Place::new();
     place.write("empty", "");
     place.write("header.csv", "t,joint/l_elbow/position\n");
+    // All columns, and no reading of the channel by which estimates are made.
+    let table = oracle("icub_left_arm_mujoco.csv");
+    let names = table.lines().next().unwrap();
+    let cells = names.split(',').map(|name| match name {
+        "t" => "1.0",
+        name if name.starts_with("wrench/") => "",
+        _ => "0.1",
+    });
+    let row = cells.collect::<Vec<_>>().join(",");
+    place.write("rest.csv", &format!("{names}\n{row}\n"));
     place.write("text", "Once upon a time\nthere was a robot.\n");
     fs::write(
         place.path("noise"),
@@ -1483,6 +1493,7 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
         assess("-").fails(1, &["--assess reads the table twice", "--samples"]);
         assess("header.csv").fails(2, &["header.csv", "no column for"]);
         estimate("header.csv").fails(2, &["header.csv", "no column for"]);
+        estimate("rest.csv").fails(1, &["rest.csv: the trigger channel", "no estimate"]);
         let encode = |log: &str| {
             place.run(&[
                 "encode",

@@ -2,14 +2,18 @@
 #![allow(missing_docs)]
 
 use nix::sys::signal::{Signal, kill};
-use nix::unistd::Pid;
-use proprio_tests::watch::{open, valid_since};
-use proprio_tests::{Arm, PATIENCE, Rig, until};
+use nix::sys::stat::Mode;
+use nix::unistd::{Pid, mkfifo};
+use proprio_tests::watch::{Newest, open, valid_since};
+use proprio_tests::{Arm, PATIENCE, Rig, now, until};
 use proprio_topics::csv::{Reader, Row, Value, What};
-use proprio_topics::{Kind, Nanos, TorqueEstimate};
+use proprio_topics::{GatewayHealth, Kind, Nanos, TorqueEstimate};
 use serde_json::Value as Json;
-use std::io::Read as _;
+use std::fs::{self, File};
+use std::io::{Read as _, Write as _};
+use std::os::unix::net::UnixDatagram;
 use std::process::Stdio;
+use std::time::Duration;
 
 #[test]
 fn a_running_system_says_what_it_does() {
@@ -149,15 +153,15 @@ fn a_running_system_says_what_it_does() {
     let table = rig.path("samples.csv");
     let table_text = table.to_string_lossy().into_owned();
     // It does not overwrite unless it is asked to.
-    std::fs::write(&table, "mine").expect("a file");
+    fs::write(&table, "mine").expect("a file");
     let (code, _, err) = out(&["record", "--out", &table_text, "--seconds", "3"]);
     assert!(
         code == Some(1) && err.contains("overwrite it with --force"),
         "{err}"
     );
-    assert_eq!(std::fs::read_to_string(&table).expect("a file"), "mine");
+    assert_eq!(fs::read_to_string(&table).expect("a file"), "mine");
     let mut recording = rig.start(&["record", "--out", &table_text, "--force", "--seconds", "3"]);
-    let begun = || std::fs::metadata(&table).is_ok_and(|m| m.len() > 64 << 10);
+    let begun = || fs::metadata(&table).is_ok_and(|m| m.len() > 64 << 10);
     assert!(
         until(PATIENCE, || begun().then_some(())).is_some(),
         "no rows"
@@ -173,7 +177,7 @@ fn a_running_system_says_what_it_does() {
         log.contains("the gateway was restarted: a gap of "),
         "{log}"
     );
-    let mut reader = Reader::new(std::fs::File::open(&table).expect("a table")).expect("a table");
+    let mut reader = Reader::new(File::open(&table).expect("a table")).expect("a table");
     let series = reader.series().to_vec();
     assert!(
         series
@@ -347,4 +351,84 @@ fn what_fell_silent_was_last_seen_and_withholds_torques() {
         .for_each(proprio_tests::Process::end);
     drop((torques, domain));
     rig.assert_nothing_left();
+}
+
+/// A service manager restarts a gateway whose watchdog is not fed. The stuck bus is one whose log
+/// comes through a pipe, from which nothing comes for a while.
+#[test]
+fn the_watchdog_is_not_fed_while_one_bus_is_stuck() {
+    let rig = Rig::new();
+    let (address, log) = (rig.path("notify"), rig.path("log"));
+    let manager = UnixDatagram::bind(&address).expect("a socket");
+    manager
+        .set_read_timeout(Some(Duration::from_millis(500)))
+        .expect("a socket");
+    mkfifo(&log, Mode::from_bits_truncate(0o600)).expect("a pipe");
+    let mut pipe = File::options()
+        .read(true)
+        .write(true)
+        .open(&log)
+        .expect("a pipe");
+    let board = |address: u32| {
+        format!(
+            "[[bus.device]]\ndriver = \"icub_strain\"\nname = \"ft{address}\"\n\
+             address = {address}\nfull_scale_n = [1804.0, 1804.0, 1804.0]\n\
+             full_scale_nm = [31.0, 31.0, 31.0]\n"
+        )
+    };
+    let config = format!(
+        "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"a\"\n\
+         source = {{ kind = \"virtual\", name = \"a\" }}\n{}\
+         [[bus]]\nname = \"b\"\nsource = {{ kind = \"replay\", log = \"log\" }}\n{}",
+        board(1),
+        board(2)
+    );
+    fs::write(rig.path("gateway.toml"), config).expect("a file");
+    let mut command = rig.command(&["gateway", "--config"]);
+    command
+        .arg(rig.path("gateway.toml"))
+        .env("NOTIFY_SOCKET", &address)
+        .env("WATCHDOG_USEC", "3000000");
+    let mut gateway = rig.spawn(command, "gateway");
+
+    // A second of frames from now on, more than the reader takes at once: 64 KiB.
+    let begun = now();
+    let second = || {
+        let start = 1.5 + (now() - begun).seconds();
+        let lines: String = (0..4000)
+            .map(|k| {
+                format!(
+                    "({:.5}) b 32A#008000800080\n",
+                    start + 0.00025 * f64::from(k)
+                )
+            })
+            .collect();
+        lines.into_bytes()
+    };
+    let is_fed = || {
+        let mut bytes = [0; 256];
+        let received = manager.recv(&mut bytes);
+        received.is_ok_and(|length| bytes[..length].starts_with(b"WATCHDOG=1"))
+    };
+    let mut health = None;
+    for _ in 0..2 {
+        pipe.write_all(&second()).expect("it is read");
+        assert!(
+            until(PATIENCE, || is_fed().then_some(())).is_some(),
+            "{}",
+            gateway.log()
+        );
+        assert!(
+            until(PATIENCE, || (!is_fed()).then_some(())).is_some(),
+            "{}",
+            gateway.log()
+        );
+        // It lives, and says so to whoever reads.
+        gateway.assert_runs();
+        health
+            .get_or_insert_with(|| Newest::<GatewayHealth>::open(&rig.open(), "r"))
+            .fresh();
+    }
+    drop((health, pipe));
+    gateway.end();
 }

@@ -10,7 +10,7 @@ use crate::bytes;
 use crate::configure::{Configure, Setting};
 use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
-use crate::pairing::{self, Limit, Paired, Pairing};
+use crate::pairing::{self, Limit, Order, Paired, Pairing};
 use crate::{Claim, Decoded, Device, Frame, NotSent, Output, Spec, SpecError};
 use alloc::boxed::Box;
 use arrayvec::ArrayVec;
@@ -111,7 +111,13 @@ impl ImuDevice {
             may_jump: Nanos::MIN,
             not_calibrated: false,
             // A BNO055 board sends the accelerometer first; the order of an mtb is not documented.
-            legacy: Pairing::new(Limit::of_period(period), plan.legacy == Legacy::Bno055),
+            legacy: Pairing::new(
+                Limit::of_period(period),
+                match plan.legacy {
+                    Legacy::Bno055 => Order::Usual,
+                    _ => Order::Any,
+                },
+            ),
             together: Nanos(period.0 / 2),
             gap: false,
             seen: false,
@@ -329,10 +335,11 @@ impl ImuDevice {
                 out.fault(Counter::Unpaired, unpaired, frame.id);
                 self.gap = true;
             }
-            let Paired::With(t, kind, first) = paired else {
+            let Paired::With(t, kind, [acceleration, rate]) = paired else {
                 return;
             };
-            set(!is_gyroscope, first);
+            set(false, acceleration);
+            set(true, rate);
             (acquired, stamp) = (t, kind);
         }
         self.give(imu, acquired, stamp, 0, Quality::GOOD, frame, link, out);

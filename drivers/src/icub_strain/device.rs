@@ -8,7 +8,7 @@ use crate::bringup::{Ask, Attempts, Bringup, Inquiry};
 use crate::bytes;
 use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
-use crate::pairing::{Limit, Paired, Pairing};
+use crate::pairing::{Limit, Order, Paired, Pairing};
 use crate::{
     Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
     Frame, Mode, NotSent, Output, Spec, SpecError,
@@ -181,7 +181,7 @@ struct Pair {
 impl Pair {
     const fn new(limit: Limit) -> Self {
         Self {
-            pairing: Pairing::new(limit, true),
+            pairing: Pairing::new(limit, Order::Usual),
             gap: false,
         }
     }
@@ -208,15 +208,15 @@ impl Pair {
             out.fault(Counter::Unpaired, unpaired, frame.id);
             self.gap = true;
         }
-        let Paired::With(acquired, stamp, first) = paired else {
+        let Paired::With(acquired, stamp, [first, second]) = paired else {
             return None;
         };
-        let quality = half.mark(first.mark(Quality::GOOD, 0), 3);
+        let quality = second.mark(first.mark(Quality::GOOD, 0), 3);
         Some(Whole {
             acquired,
             stamp,
             first,
-            second: half,
+            second,
             quality,
         })
     }

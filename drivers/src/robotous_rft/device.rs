@@ -5,7 +5,7 @@ use super::options::Options;
 use super::protocol::{DEFAULT_RATE, Ids, OVERLOAD_FX, SET, command, period, send};
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry, Timing};
 use crate::family::{Family, Link, Supervised};
-use crate::pairing::{Limit, Paired, Pairing};
+use crate::pairing::{Limit, Order, Paired, Pairing};
 use crate::wrench::{self, NewZero, TareCommand};
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Id,
@@ -119,7 +119,7 @@ impl Rft {
         let this = Self {
             ids,
             divisors: options.model.divisors(),
-            pairing: Pairing::new(Limit::of_period(period(options.rate_hz)), true),
+            pairing: Pairing::new(Limit::of_period(period(options.rate_hz)), Order::Usual),
             tare: TareCommand::default(),
             zero: NewZero::default(),
         };
@@ -198,12 +198,12 @@ impl Family for Rft {
             link.bringup.lost();
             out.fault(Counter::Unpaired, unpaired, frame.id);
         }
-        let Paired::With(acquired, stamp, first) = paired else {
+        let Paired::With(acquired, stamp, halves) = paired else {
             return;
         };
-        match first {
+        match halves[0] {
             [command::START, ..] => {
-                self.give([first, half], (acquired, stamp), frame, link, out);
+                self.give(halves, (acquired, stamp), frame, link, out);
             }
             [command::GET_RATE, code, ..] if link.bringup.mode() == Mode::Supervise => {
                 link.questions.answer(code, frame, out);

@@ -386,6 +386,46 @@ proptest! {
         }
     }
 
+    /// An adapter that exchanges neighbours costs no reading; with losses as well, none is wrong.
+    #[test]
+    fn exchanged_halves_are_put_together(
+        (period, lost) in losses(),
+        exchanged in proptest::collection::vec(proptest::bool::weighted(0.4), 700),
+        with_losses: bool,
+    ) {
+        // At 1 kHz losses among exchanges can look like jitter.
+        let with_losses = with_losses && period == PERIOD_US;
+        let mut frames = Vec::new();
+        let mut expected = Vec::new();
+        // Whoever joins hears one reading first: before, a torque may be without its force.
+        for (number, half_lost) in (0_u16..).zip(lost.chunks(2)) {
+            let halves = halves(number);
+            let t = i64::from(number) * period;
+            let lost = |half: usize| {
+                with_losses && number > 0 && half_lost.get(half).copied().unwrap_or(false)
+            };
+            // Both are in one transfer of the adapter.
+            let order = match number > 0 && exchanged[usize::from(number)] {
+                true => [1, 0],
+                false => [0, 1],
+            };
+            let there: Vec<usize> = order.into_iter().filter(|half| !lost(*half)).collect();
+            let times = (0..).map(|k| t + USUAL_US + 20 * k);
+            frames.extend(there.iter().zip(times).map(|(half, t)| at(halves[*half], t)));
+            if there.len() == 2 { expected.push(number); }
+        }
+        let (numbers, _, unpaired) = numbers_at(period, &frames);
+        prop_assert!(numbers.iter().all(|number| expected.contains(number)));
+        if !with_losses {
+            prop_assert_eq!((numbers, unpaired), (expected, 0));
+        } else {
+            let paired = 2 * u32::try_from(numbers.len()).unwrap();
+            let all = u32::try_from(frames.len()).unwrap();
+            let seen = paired + unpaired;
+            prop_assert!((all - 1..=all).contains(&seen), "{} of {}", seen, all);
+        }
+    }
+
     /// Losses alone cost at most one more reading than the number of losses.
     #[test]
     fn a_loss_costs_at_most_the_reading_after_it(

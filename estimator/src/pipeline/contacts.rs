@@ -19,13 +19,6 @@ use proprio_topics::{ContactState, NO_CAUSE, Nanos, Quality, Skin};
 /// moving contact a thousand times a second. Identification looks back by up to half a second.
 const DECLARATIONS: usize = 1024;
 
-/// Standard deviation of the direction of a force on a touched skin \[rad\]: friction, which is a
-/// fifth of the pressure for a sliding finger, turns it from the normal.
-const NORMAL_STD: f64 = 0.2;
-/// The same where the normals of the touched taxels cancel out, so that the configured direction is
-/// a guess: about that of any direction.
-const NO_NORMAL_STD: f64 = 1.0;
-
 /// Where a contact is.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Place {
@@ -185,11 +178,7 @@ impl Contacts {
                     configured.at(position, direction, std)
                 }
                 None if touch.is_there() => {
-                    let (position, direction) = touch.place();
-                    let std = PlaceStd {
-                        position: touch.position_std,
-                        direction: direction.map_or(NO_NORMAL_STD, |_| NORMAL_STD),
-                    };
+                    let (position, direction, std) = touch.place();
                     configured.at(position, direction, std)
                 }
                 None => configured,

@@ -250,6 +250,14 @@ impl Pipeline {
                 cause,
                 reserved: 0,
             };
+            // What is published keeps the bound, however it came about.
+            debug_assert!(
+                place.valid == 0
+                    || (self.setup.max_deviation.get(dof))
+                        .is_none_or(|most| place.standard_deviation <= *most),
+                "joint {dof} is valid, with a deviation of {} Nm",
+                place.standard_deviation
+            );
         }
         let places = self
             .estimate

@@ -17,6 +17,7 @@ pub use crate::config::Pace;
 use crate::log::{LogFormat, Reader, Report, Stamps};
 use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos, StampKind};
+use std::fmt::Debug;
 use std::fs::File;
 use std::io::{self, BufRead, BufReader};
 use std::path::Path;
@@ -82,8 +83,8 @@ pub(crate) fn several(interfaces: &[String]) -> Option<String> {
 
 /// A log that is being replayed.
 #[derive(Debug)]
-pub struct Replay {
-    log: Reader<BufReader<File>>,
+pub struct Replay<R = BufReader<File>> {
+    log: Reader<R>,
     pace: Pace,
     matching: Option<Matching>,
     claims: Vec<Claim>,
@@ -134,10 +135,33 @@ impl Replay {
             cause,
         };
         let file = File::open(path).map_err(fail)?;
+        let log = Reader::with_stamps(BufReader::with_capacity(BUFFER, file), stamps);
+        Self::of(log, pace, interface, claims).map_err(fail)
+    }
+}
+
+impl<R: BufRead> Replay<R> {
+    /// A log of which nothing is read yet.
+    fn of(
+        mut log: Reader<R>,
+        pace: Pace,
+        interface: Option<Matching>,
+        claims: &[Claim],
+    ) -> io::Result<Self> {
+        let matching = match interface {
+            Some(interface) => interface.in_log(&mut log)?,
+            None => None,
+        };
+        // The first frame of the whole log is the origin, so that the buses of one log stay in
+        // step.
+        let matches = |interface: &str| matching.as_ref().is_none_or(|m| m.takes(interface));
+        let first = log
+            .next_record()?
+            .map(|r| (r.stamp, matches(r.interface), r.frame));
         let mut replay = Self {
-            log: Reader::with_stamps(BufReader::with_capacity(BUFFER, file), stamps),
+            log,
             pace,
-            matching: None,
+            matching,
             claims: claims.to_vec(),
             clock: Monotonic,
             pending: None,
@@ -149,28 +173,17 @@ impl Replay {
             unmatched: 0,
             counters: LinkCounters::default(),
         };
-        if let Some(interface) = interface {
-            replay.matching = interface.in_log(&mut replay.log).map_err(fail)?;
-        }
-        // The first frame of the whole log is the origin, so that the buses of one log stay in
-        // step.
-        let matches = |interface: &str| replay.matching.as_ref().is_none_or(|m| m.takes(interface));
-        let first = replay
-            .log
-            .next_record()
-            .map_err(fail)?
-            .map(|r| (r.stamp, matches(r.interface), r.frame));
+        let fail = |why: String| Err(io::Error::new(io::ErrorKind::InvalidData, why));
         match first {
             // The log is empty.
             None if replay.log.report().bad == 0 => replay.ended = true,
-            None => {
-                let why = format!("it holds no frame: {}", replay.log.why_empty());
-                return Err(fail(io::Error::new(io::ErrorKind::InvalidData, why)));
-            }
+            None => return fail(format!("it holds no frame: {}", replay.log.why_empty())),
             Some((None, ..)) if pace == Pace::Recorded => {
-                let cause = "it has no time stamps, which pace = \"recorded\" needs; record with \
-                     `candump -l`, or use pace = \"fast\"";
-                return Err(fail(io::Error::new(io::ErrorKind::InvalidData, cause)));
+                return fail(
+                    "it has no time stamps, which pace = \"recorded\" needs; record with \
+                     `candump -l`, or use pace = \"fast\""
+                        .to_owned(),
+                );
             }
             Some((stamp, matches, frame)) => {
                 replay.origin = stamp.unwrap_or_default();
@@ -246,7 +259,7 @@ impl Replay {
     }
 }
 
-impl Link for Replay {
+impl<R: BufRead + Debug + Send> Link for Replay<R> {
     fn note(&self) -> Option<String> {
         let report = self.log.report();
         let mut notes = Vec::new();
@@ -327,5 +340,45 @@ impl Link for Replay {
 
     fn counters(&self) -> LinkCounters {
         self.counters
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// As a file on a disk that fails.
+    #[derive(Debug)]
+    struct Failing;
+
+    impl io::Read for Failing {
+        fn read(&mut self, _: &mut [u8]) -> io::Result<usize> {
+            Err(io::ErrorKind::ConnectionReset.into())
+        }
+    }
+
+    #[test]
+    fn a_log_that_can_not_be_read_to_its_end_is_not_complete() {
+        let text = b"(1.0) can0 123#11\n(1.1) can0 123#22\n".as_slice();
+        let log = Reader::with_stamps(
+            BufReader::new(io::Read::chain(text, Failing)),
+            Stamps::Detect,
+        );
+        let mut replay = Replay::of(log, Pace::Fast, None, &[]).unwrap();
+        let mut received = Vec::new();
+        let end = loop {
+            match replay.recv(Nanos::ZERO) {
+                Received::Frame(frame) => received.extend_from_slice(frame.data()),
+                other => break other,
+            }
+        };
+        assert_eq!((received, end), (vec![0x11, 0x22], Received::Ended));
+        assert_eq!(replay.failure(), Some(io::ErrorKind::ConnectionReset));
+        assert_eq!(replay.counters().losses, 1);
+        let note = replay.note().unwrap();
+        assert!(
+            note.starts_with("the log could not be read to its end: connection reset"),
+            "{note}"
+        );
     }
 }

@@ -44,6 +44,13 @@ fn a_connection_that_failed_is_made_later() {
     let mut second = create();
     let refused = without_files(|| reader.try_take());
     assert_eq!(refused.unwrap_err(), TakeError::Connection);
+    // What waits in the port when it is opened again wakes whoever waits, although nothing is sent
+    // any more.
+    second.send(&health, monotonic()).unwrap();
+    soon(|| {
+        let taken = reader.try_take().ok()?;
+        (taken.is_none() && reader.wait(Nanos::ZERO)).then_some(())
+    });
     let sequence = soon(|| {
         second.send(&health, monotonic()).unwrap();
         reader.try_take().ok().flatten()

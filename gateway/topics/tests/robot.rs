@@ -328,6 +328,51 @@ fn handles_survive_restarts_in_any_order() {
     }
 }
 
+/// After a restart the joints may have other numbers: until the new names are there, nothing that
+/// was sent since has a name.
+#[test]
+fn what_a_new_start_sends_has_no_name_of_the_old_one() {
+    let (_base, config) = place();
+    let domain = Domain::open(&config).unwrap();
+    let mut robot = RobotReader::new(&config, "icub", MAX_AGE).unwrap();
+    let (elbow, hand) = (robot.torque_handle("elbow"), robot.contact_handle("hand"));
+    let mut estimator = Estimator::start(&domain, 1, ["elbow", "wrist"]);
+    let mut send_until = |estimator: &mut Estimator, epoch: u64| {
+        until("estimates of this start", || {
+            let t = monotonic();
+            estimator.send(t, [1.5, 1.0]);
+            robot.update(t);
+            let epochs = [
+                robot.torques().map(|e| e.header.epoch),
+                robot.contacts().map(|e| e.header.epoch),
+            ];
+            epochs == [Some(epoch); 2] && robot.torque(elbow) != Err(Unavailable::NeverSeen)
+        });
+        (
+            robot.torque(elbow).map(|e| e.torque),
+            robot.contact(hand).map(|_| ()),
+        )
+    };
+    until("the names", || {
+        send_until(&mut estimator, 1) == (Ok(1.5), Ok(()))
+    });
+    let Estimator {
+        torques,
+        contacts,
+        descriptions,
+        health,
+    } = estimator;
+    drop((torques, contacts));
+    let mut estimator = Estimator {
+        torques: Writer::create(&domain, "icub", 2).unwrap(),
+        contacts: Writer::create(&domain, "icub", 2).unwrap(),
+        descriptions,
+        health,
+    };
+    let unnamed = Unavailable::NotDescribed;
+    assert_eq!(send_until(&mut estimator, 2), (Err(unnamed), Err(unnamed)));
+}
+
 /// What was sent under a number before is not the value of the channel that has it now.
 #[test]
 fn a_channel_with_a_new_number_has_no_value_of_another() {
