@@ -327,8 +327,9 @@ impl ImuDevice {
                 imu.proper_acceleration = counts.map(|count| f64::from(count) * acceleration_lsb);
             }
         };
-        set(is_gyroscope, counts);
-        if self.plan.want != quantity.bit() {
+        if self.plan.want == quantity.bit() {
+            set(is_gyroscope, counts);
+        } else {
             let mut unpaired = 0;
             let paired = self.legacy.push(is_gyroscope, frame, counts, &mut unpaired);
             if unpaired > 0 {

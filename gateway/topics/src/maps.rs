@@ -1,7 +1,20 @@
 //! The lines of /proc/PID/maps, the mappings of a process. Source: proc_pid_maps(5).
 
+use std::string::String;
+use std::{fs, io};
+
 /// How the kernel says that a file has been deleted.
-pub(crate) const DELETED: &str = " (deleted)";
+const DELETED: &str = " (deleted)";
+
+/// The lines of this process.
+pub(crate) fn own() -> io::Result<String> {
+    fs::read_to_string("/proc/self/maps")
+}
+
+/// The kernel's name of a file, without what says that it has been deleted.
+pub(crate) fn file_name(name: &str) -> &str {
+    name.strip_suffix(DELETED).unwrap_or(name)
+}
 
 /// A mapping. Reading it allocates nothing: a signal handler does so.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,7 +53,7 @@ impl<'a> Mapping<'a> {
 
     /// Device, inode and file: what tells one file from another.
     pub(crate) fn file(&self) -> &'a str {
-        let rest = self.rest.strip_suffix(DELETED).unwrap_or(self.rest);
+        let rest = file_name(self.rest);
         rest.splitn(3, ' ').nth(2).unwrap_or_default()
     }
 }

@@ -1,12 +1,11 @@
 //! Scheduling of real-time threads in gateway, estimator and control loops: processor affinity,
 //! SCHED_FIFO, locked memory.
 
-use crate::maps::Mapping;
+use crate::maps::{self, Mapping};
 use nix::libc;
 use nix::sched::{CpuSet, sched_setaffinity};
 use nix::unistd::Pid;
 use std::format;
-use std::fs;
 use std::io;
 use std::string::{String, ToString};
 use std::vec::Vec;
@@ -28,8 +27,7 @@ pub const SMALL_STACK: usize = 512 << 10;
 /// each thread: hundreds of megabytes, of which a few are used.
 #[allow(unsafe_code)]
 fn lock_memory() -> io::Result<()> {
-    let maps = || fs::read_to_string("/proc/self/maps");
-    for line in maps()?.lines() {
+    for line in maps::own()?.lines() {
         let Some(mapping) = Mapping::parse(line).filter(Mapping::is_readable) else {
             continue;
         };
@@ -38,7 +36,7 @@ fn lock_memory() -> io::Result<()> {
         // that was unmapped meanwhile is an error.
         if unsafe { libc::mlock2(start, length, libc::MLOCK_ONFAULT) } != 0 {
             let error = io::Error::last_os_error();
-            let is_there = maps()?.lines().any(|other| other == line);
+            let is_there = maps::own()?.lines().any(|other| other == line);
             if is_there {
                 return Err(error);
             }

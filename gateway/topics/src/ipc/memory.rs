@@ -8,7 +8,7 @@
 use super::error::SHM;
 use super::sweep::Place;
 use super::{DomainError, Topic};
-use crate::maps::{DELETED, Mapping};
+use crate::maps::{self, Mapping};
 use crate::{
     ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
     InertiaEstimate, Sample, TorqueEstimate,
@@ -26,9 +26,6 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::string::String;
 use std::vec::Vec;
-
-/// The mappings of this process.
-const MAPS: &str = "/proc/self/maps";
 
 /// What a port or a process needs beside payloads: the lists of a service's ports, the connections
 /// to those that exist, directories \[bytes\].
@@ -150,18 +147,19 @@ pub(super) fn commit(place: &Place, before: &BTreeSet<PathBuf>) -> Result<Vec<Ma
 pub(super) struct Held {
     /// Lines of the kernel's list.
     mappings: Vec<String>,
-    descriptors: Vec<(i32, PathBuf)>,
+    /// Numbers, and the kernel's names of the files.
+    descriptors: Vec<(i32, String)>,
 }
 
 impl Held {
     /// Everything in files whose names have this prefix.
     pub(super) fn of(prefix: &str) -> Self {
-        let maps = fs::read_to_string(MAPS).unwrap_or_default();
-        let mappings = maps.lines().filter(|line| line.contains(prefix));
+        let lines = maps::own().unwrap_or_default();
+        let mappings = lines.lines().filter(|line| line.contains(prefix));
         let descriptors = entries(Path::new("/proc/self/fd")).filter_map(|entry| {
-            let path = fs::read_link(&entry).ok()?;
             let number = entry.file_name()?.to_str()?.parse().ok()?;
-            path.to_str()?.contains(prefix).then_some((number, path))
+            let name = fs::read_link(&entry).ok()?.to_str()?.to_owned();
+            name.contains(prefix).then_some((number, name))
         });
         Self {
             mappings: mappings.map(ToOwned::to_owned).collect(),
@@ -172,10 +170,10 @@ impl Held {
     /// Unmaps and closes what is still there. Nobody may use it any more.
     #[allow(unsafe_code)]
     pub(super) fn release(self) {
-        let maps = fs::read_to_string(MAPS).unwrap_or_default();
+        let lines = maps::own().unwrap_or_default();
         let held = self.mappings.iter();
         let held: Vec<_> = held.filter_map(|line| Mapping::parse(line)).collect();
-        for now in maps.lines().filter_map(Mapping::parse) {
+        for now in lines.lines().filter_map(Mapping::parse) {
             // The end may have been replaced since: `guard`.
             let is_held = held.iter().any(|before| {
                 before.start <= now.start && now.end <= before.end && before.file() == now.file()
@@ -185,20 +183,14 @@ impl Held {
                 unsafe { libc::munmap(now.start as *mut _, now.length()) };
             }
         }
-        for (number, path) in self.descriptors {
-            let now = fs::read_link(format!("/proc/self/fd/{number}"));
-            if now.is_ok_and(|now| file_of(&now) == file_of(&path)) {
+        for (number, name) in self.descriptors {
+            let now = fs::read_link(format!("/proc/self/fd/{number}")).unwrap_or_default();
+            if now.to_str().map(maps::file_name) == Some(maps::file_name(&name)) {
                 // SAFETY: as above.
                 drop(unsafe { OwnedFd::from_raw_fd(number) });
             }
         }
     }
-}
-
-/// A link of the kernel to an open file, without what says that it has been deleted.
-fn file_of(link: &Path) -> &str {
-    let link = link.to_str().unwrap_or_default();
-    link.strip_suffix(DELETED).unwrap_or(link)
 }
 
 fn allocate(path: &Path, needed: u64) -> Result<(), DomainError> {
