@@ -12,6 +12,7 @@ use crate::clock::{Clock, Monotonic};
 use crate::config::Source;
 use crate::control;
 use crate::health::{HealthLog, Loads, fill_health};
+use crate::journal::Journal;
 use crate::link::adapter::{self, Adapter};
 use crate::link::interface::{Netlink, Observer};
 use crate::operator::Operator;
@@ -278,16 +279,24 @@ fn control_socket(
     }
 }
 
-/// Sends log lines to standard error; RUST_LOG selects the level, `info` by default.
+/// Sends log lines to systemd's journal, if standard error goes there, else to standard error;
+/// RUST_LOG selects the level, `info` by default.
 pub fn start_logging() {
     use std::io::IsTerminal as _;
+    use tracing_subscriber::prelude::*;
     // neli logs every byte that it sends or receives.
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,neli=warn"));
-    let _ = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_target(false)
-        .with_ansi(std::io::stderr().is_terminal())
-        .with_writer(std::io::stderr)
+    let journal = Journal::open();
+    let text = journal.is_none().then(|| {
+        tracing_subscriber::fmt::layer()
+            .with_target(false)
+            .with_ansi(std::io::stderr().is_terminal())
+            .with_writer(std::io::stderr)
+    });
+    let _ = tracing_subscriber::registry()
+        .with(filter)
+        .with(journal)
+        .with(text)
         .try_init();
 }

@@ -37,6 +37,7 @@ mod eds;
 mod health;
 pub mod inbox;
 pub mod joints;
+mod journal;
 pub mod link;
 pub mod load;
 pub mod log;

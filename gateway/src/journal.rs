@@ -1,0 +1,145 @@
+//! Log lines for systemd's journal, with their fields: `journalctl -u proprio-gateway
+//! DEVICE=chest_imu` finds the lines about a device, `-p warning` the warnings.
+//!
+//! The text of a line has the fields, too. tracing-journald leaves them out of it, so that the
+//! journal's usual output would no longer say which device a line is about.
+//!
+//! Sources: systemd.exec(5), JOURNAL_STREAM; systemd.io/JOURNAL_NATIVE_PROTOCOL.
+
+use nix::sys::stat::fstat;
+use std::fmt::{Debug, Write as _};
+use std::io;
+use std::os::unix::net::UnixDatagram;
+use std::time::Duration;
+use tracing::field::{Field, Visit};
+use tracing::{Event, Level, Subscriber};
+use tracing_subscriber::Layer;
+use tracing_subscriber::layer::Context;
+
+const SOCKET: &str = "/run/systemd/journal/socket";
+
+/// The journal of the machine.
+pub(crate) struct Journal(UnixDatagram);
+
+impl Journal {
+    /// The journal, if that is where systemd sends this process's standard error.
+    pub(crate) fn open() -> Option<Self> {
+        let stream = std::env::var("JOURNAL_STREAM").ok()?;
+        let stat = fstat(io::stderr()).ok()?;
+        if stream != format!("{}:{}", stat.st_dev, stat.st_ino) {
+            return None;
+        }
+        let socket = UnixDatagram::unbound().ok()?;
+        // A journal that hangs must not make the process hang.
+        socket
+            .set_write_timeout(Some(Duration::from_millis(100)))
+            .ok()?;
+        Some(Self(socket))
+    }
+}
+
+impl<S: Subscriber> Layer<S> for Journal {
+    fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
+        let mut line = Line::default();
+        event.record(&mut line);
+        // Addressed each time, because a journal that was restarted has a new socket.
+        if self
+            .0
+            .send_to(&line.entry(*event.metadata().level()), SOCKET)
+            .is_err()
+        {
+            eprintln!("{}", line.text());
+        }
+    }
+}
+
+/// What a line says: its message and its fields.
+#[derive(Default)]
+struct Line {
+    message: String,
+    fields: Vec<(&'static str, String)>,
+}
+
+impl Visit for Line {
+    fn record_debug(&mut self, field: &Field, value: &dyn Debug) {
+        match field.name() {
+            "message" => self.message = format!("{value:?}"),
+            name => self.fields.push((name, format!("{value:?}"))),
+        }
+    }
+
+    fn record_str(&mut self, field: &Field, value: &str) {
+        match field.name() {
+            "message" => value.clone_into(&mut self.message),
+            name => self.fields.push((name, value.to_owned())),
+        }
+    }
+}
+
+impl Line {
+    fn text(&self) -> String {
+        let mut text = self.message.clone();
+        for (name, value) in &self.fields {
+            let _ = write!(text, " {name}={value}");
+        }
+        text
+    }
+
+    /// The datagram of the journal's own protocol.
+    fn entry(&self, level: Level) -> Vec<u8> {
+        // The numbers of syslog(3).
+        let priority = match level {
+            Level::ERROR => "3",
+            Level::WARN => "4",
+            Level::INFO => "6",
+            _ => "7",
+        };
+        let mut entry = Vec::new();
+        let mut put = |name: &str, value: &str| {
+            entry.extend_from_slice(name.as_bytes());
+            if value.contains('\n') {
+                entry.push(b'\n');
+                entry.extend_from_slice(&(value.len() as u64).to_le_bytes());
+            } else {
+                entry.push(b'=');
+            }
+            entry.extend_from_slice(value.as_bytes());
+            entry.push(b'\n');
+        };
+        put("PRIORITY", priority);
+        put("SYSLOG_IDENTIFIER", "proprio");
+        put("MESSAGE", &self.text());
+        for (name, value) in &self.fields {
+            put(&name.to_uppercase(), value);
+        }
+        entry
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_has_its_fields_in_its_text_and_apart() {
+        let line = Line {
+            message: "silent".to_owned(),
+            fields: vec![("device", "imu".to_owned()), ("error", "a\nb".to_owned())],
+        };
+        let expected = [
+            &b"PRIORITY=4\nSYSLOG_IDENTIFIER=proprio\nMESSAGE\n\x1B\0\0\0\0\0\0\0"[..],
+            b"silent device=imu error=a\nb\nDEVICE=imu\nERROR\n\x03\0\0\0\0\0\0\0a\nb\n",
+        ];
+        assert_eq!(line.text().len(), 27);
+        assert_eq!(
+            String::from_utf8_lossy(&line.entry(Level::WARN)),
+            String::from_utf8_lossy(&expected.concat())
+        );
+    }
+
+    #[test]
+    fn only_a_stream_of_the_journal_is_one() {
+        // Tests do not run as a service whose standard error is the journal.
+        assert!(Journal::open().is_none());
+    }
+}
