@@ -128,6 +128,7 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
     let state_file = config.identification.state.clone().map(|file| StateFile {
         file,
         every: Nanos::from_seconds(config.identification.save_every_s),
+        fails: false,
     });
     let channels: Arc<[ChannelStatus]> = std::iter::repeat_with(ChannelStatus::default)
         .take(setup.channels().count())
@@ -664,6 +665,8 @@ fn report_leading(group: Option<&str>, likelier: Option<Hypothesis>, robot: &Rob
 struct StateFile {
     file: PathBuf,
     every: Nanos,
+    /// It could not be written the last time.
+    fails: bool,
 }
 
 impl StateFile {
@@ -695,13 +698,18 @@ impl StateFile {
         }
     }
 
-    fn write(&self, text: &str) {
-        if let Err(error) = files::replace(&self.file, text, 0o600) {
-            tracing::error!(
-                "{}: the state of identification cannot be written: {error}; check the folder and \
-                 its permissions",
-                self.file.display()
-            );
+    /// Writes it; a failure is told once, until it can be written again.
+    fn write(&mut self, text: &str) {
+        let result = files::replace(&self.file, text, 0o600);
+        let file = self.file.display();
+        let failed = std::mem::replace(&mut self.fails, result.is_err());
+        match result {
+            Err(error) if !failed => tracing::error!(
+                "{file}: the state of identification cannot be written: {error}; check the folder \
+                 and its permissions"
+            ),
+            Ok(()) if failed => tracing::info!("{file} can be written again"),
+            _ => {}
         }
     }
 }
@@ -724,7 +732,7 @@ impl IdentificationThread {
     fn start(
         online: &Online,
         robot: &Robot,
-        state_file: Option<StateFile>,
+        mut state_file: Option<StateFile>,
     ) -> anyhow::Result<Self> {
         let components = online.solution().components.iter();
         let groups: Vec<String> = components
@@ -761,7 +769,7 @@ impl IdentificationThread {
                 // Send before writing to the disk, which may be slow: the solution must be in use
                 // in time. A receiver that is gone needs none.
                 let _ = results.send(job);
-                if let (Some(state_file), Some(text)) = (&state_file, text) {
+                if let (Some(state_file), Some(text)) = (&mut state_file, text) {
                     if monotonic() - written >= state_file.every {
                         state_file.write(&text);
                         (unwritten, written) = (None, monotonic());
@@ -770,7 +778,7 @@ impl IdentificationThread {
                     }
                 }
             }
-            if let (Some(state_file), Some(text)) = (&state_file, unwritten) {
+            if let (Some(state_file), Some(text)) = (&mut state_file, unwritten) {
                 state_file.write(&text);
             }
         };
