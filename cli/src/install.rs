@@ -1,5 +1,6 @@
 //! `proprio install`: puts this program, its systemd units and a robot's configuration where they
-//! belong, and starts the services. `--dry-run` prints the steps instead.
+//! belong, and starts the services. `--dry-run` prints the steps instead. What a Debian package has
+//! installed stays the package's: then only the configuration is copied.
 
 use crate::folder::{each_file, read};
 use anyhow::{Context as _, bail};
@@ -11,8 +12,10 @@ use std::fs;
 use std::path::{Component, Path, PathBuf};
 use std::process::Command;
 
-/// systemd finds programs without a path here and in /usr/bin, where packages install them.
+/// systemd finds programs without a path here and in /usr/bin.
 const PROGRAM: &str = "usr/local/bin/proprio";
+/// Where the Debian package has put the program; the units and the user are there too.
+const PACKAGED: &str = "usr/bin/proprio";
 const CONFIG: &str = "etc/proprio";
 const USER: (&str, &str) = (
     "etc/sysusers.d/proprio.conf",
@@ -128,15 +131,18 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let mut steps = Vec::new();
     let own = std::env::current_exe().context("cannot find this program's own file")?;
     let program = args.root.join(PROGRAM);
-    if own != program {
+    let is_packaged = own == args.root.join(PACKAGED);
+    if !is_packaged && own != program {
         let bytes = fs::read(&own).with_context(|| format!("cannot read {}", own.display()))?;
         steps.push(write(program, bytes, 0o755));
     }
-    steps.push(write(args.root.join(USER.0), USER.1.into(), 0o644));
+    if !is_packaged {
+        steps.push(write(args.root.join(USER.0), USER.1.into(), 0o644));
+    }
     if let Some(folder) = &args.config {
         steps.extend(configuration(folder, &etc, args.force)?);
     }
-    for service in &services {
+    for service in services.iter().filter(|_| !is_packaged) {
         let to = args.root.join("etc/systemd/system").join(service.unit);
         steps.push(write(to, service.text.into(), 0o644));
     }
@@ -146,7 +152,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     };
     let units = || services.iter().map(|service| service.unit.to_owned());
     let words = |text: &'static str| text.split(' ').map(str::to_owned);
-    steps.push(Step::Run(in_image("systemd-sysusers").collect()));
+    if !is_packaged {
+        steps.push(Step::Run(in_image("systemd-sysusers").collect()));
+    }
     let enable = in_image("systemctl").chain(words("enable"));
     steps.push(Step::Run(enable.chain(units()).collect()));
     if !is_image {

@@ -136,6 +136,43 @@ fn an_installed_system_is_one_that_systemd_starts() {
     );
 }
 
+/// Where a package has put the program, units and user are the package's: copies in /etc and
+/// /usr/local would hide its upgrades.
+#[test]
+fn what_a_package_has_installed_is_not_copied() {
+    if systemd("systemctl").is_none() {
+        println!("skipped: systemd is not installed");
+        return;
+    }
+    let image = tempfile::tempdir().expect("a folder");
+    let root = image.path();
+    let program = root.join("usr/bin/proprio");
+    let units = root.join("usr/lib/systemd/system");
+    for folder in [&root.join("etc"), &root.join("usr/bin"), &units] {
+        fs::create_dir_all(folder).expect("a folder");
+    }
+    fs::copy(PROGRAM, &program).expect("a copy");
+    let given = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/systemd");
+    for unit in ["proprio-gateway.service", "proprio-estimator.service"] {
+        fs::copy(given.join(unit), units.join(unit)).expect("a copy");
+    }
+    let mut command = Command::new(&program);
+    command.args(["install", "--root"]).arg(root);
+    good(
+        &command
+            .arg("--config")
+            .arg(robot())
+            .output()
+            .expect("it starts"),
+    );
+    assert!(root.join("etc/proprio/gateway.toml").is_file());
+    assert!(!root.join("usr/local").exists() && !root.join("etc/sysusers.d").exists());
+    let made = root.join("etc/systemd/system");
+    let wanted = made.join("multi-user.target.wants");
+    assert!(wanted.join("proprio-gateway.service").is_symlink());
+    assert_eq!(fs::read_dir(made).expect("a folder").count(), 1);
+}
+
 #[test]
 fn systemd_finds_nothing_wrong_in_the_units() {
     let Some(mut verify) = systemd("systemd-analyze") else {

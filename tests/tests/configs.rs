@@ -234,6 +234,7 @@ fn problems(unit: &Unit, daemon: &str) -> Vec<String> {
     for key in [
         "NoNewPrivileges",
         "PrivateDevices",
+        "PrivateMounts",
         "PrivateTmp",
         "ProtectHome",
         "ProtectClock",
@@ -249,7 +250,6 @@ fn problems(unit: &Unit, daemon: &str) -> Vec<String> {
     }
     // A private one would be a separate domain.
     expect("PrivateIPC", &str::is_empty);
-    expect("SystemCallFilter", &|v| v == "@system-service");
     let (rights, families) = match daemon {
         "gateway" => ("CAP_NET_ADMIN", "AF_CAN AF_NETLINK AF_UNIX"),
         _ => ("", "AF_UNIX"),
