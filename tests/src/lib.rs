@@ -9,6 +9,7 @@
 //!   published; reads the truth.
 //! - [`browse`]: checks a report in a headless browser.
 //! - [`truth`]: is a valid torque true, whatever goes wrong?
+//! - [`fuzz`]: readers of what others write, as functions of bytes.
 //! - [`can`]: candump, canplayer, cangen, cansend, ip.
 //!
 //! Every process started here is ended by its process id when its handle is dropped, whether the
@@ -17,6 +18,7 @@
 mod arm;
 mod browser;
 pub mod can;
+pub mod fuzz;
 mod process;
 pub mod truth;
 pub mod watch;
