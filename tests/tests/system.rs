@@ -48,6 +48,7 @@ fn a_running_system_says_what_it_does() {
     let (code, text, err) = out(&["status", "--json"]);
     assert_eq!(code, Some(0), "{err}");
     let status: Json = serde_json::from_str(&text).expect("JSON");
+    assert_eq!(violations(&status, &schema(), "status"), [""; 0], "{text}");
     let robot = &status["robots"][0];
     assert_eq!(robot["robot"], "icub_left_arm");
     for process in ["gateway", "estimator"] {
@@ -295,6 +296,11 @@ fn what_fell_silent_was_last_seen_and_withholds_torques() {
         (channel(&status)?["age_s"].as_f64()? > 1.5).then_some(status)
     });
     let status = status.expect("it falls silent");
+    assert_eq!(
+        violations(&status, &schema(), "status"),
+        [""; 0],
+        "{status}"
+    );
     let elbow = channel(&status).expect("a channel");
     assert_eq!(
         (&elbow["quality"], &elbow["rate_hz"]),
@@ -431,4 +437,75 @@ fn the_watchdog_is_not_fed_while_one_bus_is_stuck() {
     }
     drop((health, pipe));
     gateway.end();
+}
+
+fn schema() -> Json {
+    let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/status.schema.json");
+    serde_json::from_str(&fs::read_to_string(file).expect("the schema")).expect("JSON")
+}
+
+/// Where a value differs from a JSON schema. Only of what our schema uses: a whole validator would
+/// bring twenty crates.
+fn violations(value: &Json, schema: &Json, place: &str) -> Vec<String> {
+    let is_a = |word: &Json| match word.as_str() {
+        Some("object") => value.is_object(),
+        Some("array") => value.is_array(),
+        Some("string") => value.is_string(),
+        Some("number") => value.is_number(),
+        Some("integer") => value.is_u64() || value.is_i64(),
+        Some("boolean") => value.is_boolean(),
+        Some("null") => value.is_null(),
+        _ => panic!("{place}: no type {word}"),
+    };
+    let types = &schema["type"];
+    let fits = types
+        .as_array()
+        .map_or_else(|| is_a(types), |all| all.iter().any(is_a));
+    if !fits {
+        return vec![format!("{place}: {value} is no {types}")];
+    }
+    let mut found = Vec::new();
+    for item in value.as_array().into_iter().flatten() {
+        found.extend(violations(item, &schema["items"], &format!("{place}[]")));
+    }
+    let Some(members) = value.as_object() else {
+        return found;
+    };
+    let required = schema["required"].as_array().into_iter().flatten();
+    let missing = required
+        .filter_map(Json::as_str)
+        .filter(|key| !members.contains_key(*key));
+    found.extend(missing.map(|key| format!("{place}: no {key}")));
+    for (key, member) in members {
+        match schema["properties"]
+            .get(key)
+            .unwrap_or(&schema["additionalProperties"])
+        {
+            own @ Json::Object(_) => {
+                found.extend(violations(member, own, &format!("{place}.{key}")));
+            }
+            _ => found.push(format!("{place}: {key} is not in the schema")),
+        }
+    }
+    found
+}
+
+#[test]
+fn a_status_that_differs_from_its_schema_is_noticed() {
+    let right = serde_json::json!({ "domain": "d", "domains": [], "robots": [] });
+    assert_eq!(violations(&right, &schema(), "status"), [""; 0]);
+    for (key, value, expected) in [
+        ("domain", Json::Null, "status.domain: null is no"),
+        ("new", Json::Null, "status: new is not in the schema"),
+        (
+            "robots",
+            serde_json::json!([{}]),
+            "status.robots[]: no robot",
+        ),
+    ] {
+        let mut wrong = right.clone();
+        wrong[key] = value;
+        let found = violations(&wrong, &schema(), "status");
+        assert!(found[0].starts_with(expected), "{found:?}");
+    }
 }
