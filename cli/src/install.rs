@@ -14,8 +14,8 @@ use std::process::Command;
 
 /// systemd finds programs without a path here and in /usr/bin.
 const PROGRAM: &str = "usr/local/bin/proprio";
-/// Where the Debian package has put the program; the units and the user are there too.
-const PACKAGED: &str = "usr/bin/proprio";
+/// Where the Debian package puts the units. Copies of ours would hide these for ever.
+const PACKAGED: &str = "usr/lib/systemd/system";
 const CONFIG: &str = "etc/proprio";
 const USER: (&str, &str) = (
     "etc/sysusers.d/proprio.conf",
@@ -131,8 +131,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let mut steps = Vec::new();
     let own = std::env::current_exe().context("cannot find this program's own file")?;
     let program = args.root.join(PROGRAM);
-    let is_packaged = own == args.root.join(PACKAGED);
-    if !is_packaged && own != program {
+    let is_packaged = args
+        .root
+        .join(PACKAGED)
+        .join("proprio-gateway.service")
+        .exists();
+    if is_packaged {
+        refuse_copies(&args.root)?;
+    } else if own != program {
         let bytes = fs::read(&own).with_context(|| format!("cannot read {}", own.display()))?;
         steps.push(write(program, bytes, 0o755));
     }
@@ -168,6 +174,27 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         if !args.dry_run {
             step.run()?;
         }
+    }
+    Ok(())
+}
+
+/// Of an installation without a package, systemd would start the program and the units, and not
+/// what the package upgrades.
+fn refuse_copies(root: &Path) -> anyhow::Result<()> {
+    let etc = |service: Service| Path::new("etc/systemd/system").join(service.unit);
+    let copies: Vec<String> = [PathBuf::from(PROGRAM)]
+        .into_iter()
+        .chain(SERVICES.map(etc))
+        .map(|copy| root.join(copy))
+        .filter(|copy| copy.is_file())
+        .map(|copy| copy.display().to_string())
+        .collect();
+    if !copies.is_empty() {
+        bail!(
+            "{} would be used instead of the package's: remove them (`sudo rm {}`)",
+            copies.join(", "),
+            copies.join(" ")
+        );
     }
     Ok(())
 }

@@ -119,7 +119,12 @@ fn main() -> ExitCode {
 
 /// Prints an error chain; exit code 2 if its root is a wrong configuration, else 1.
 fn fail(error: &anyhow::Error) -> ExitCode {
-    eprintln!("error: {error:#}");
+    // The journal takes a line of standard error for information.
+    if proprio_gateway::daemon::logs_to_journal() {
+        tracing::error!("{error:#}");
+    } else {
+        eprintln!("error: {error:#}");
+    }
     let configuration = proprio_simulator::is_configuration(error)
         || proprio_gateway::daemon::is_configuration(error)
         || proprio_estimator::daemon::is_configuration(error);

@@ -146,25 +146,23 @@ fn what_a_package_has_installed_is_not_copied() {
     }
     let image = tempfile::tempdir().expect("a folder");
     let root = image.path();
-    let program = root.join("usr/bin/proprio");
     let units = root.join("usr/lib/systemd/system");
-    for folder in [&root.join("etc"), &root.join("usr/bin"), &units] {
+    for folder in [&root.join("etc"), &units] {
         fs::create_dir_all(folder).expect("a folder");
     }
-    fs::copy(PROGRAM, &program).expect("a copy");
     let given = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/systemd");
     for unit in ["proprio-gateway.service", "proprio-estimator.service"] {
         fs::copy(given.join(unit), units.join(unit)).expect("a copy");
     }
-    let mut command = Command::new(&program);
-    command.args(["install", "--root"]).arg(root);
-    good(
-        &command
-            .arg("--config")
-            .arg(robot())
-            .output()
-            .expect("it starts"),
-    );
+    let copy = root.join("usr/local/bin/proprio");
+    fs::create_dir_all(root.join("usr/local/bin")).expect("a folder");
+    fs::write(&copy, "an older program").expect("a file");
+    let refused = install(&[], root, Some(&robot()));
+    fails(&refused, 1, "instead of the package's");
+    assert!(!root.join("etc/proprio").exists());
+    fs::remove_dir_all(root.join("usr/local")).expect("a folder");
+
+    good(&install(&[], root, Some(&robot())));
     assert!(root.join("etc/proprio/gateway.toml").is_file());
     assert!(!root.join("usr/local").exists() && !root.join("etc/sysusers.d").exists());
     let made = root.join("etc/systemd/system");

@@ -279,6 +279,11 @@ fn control_socket(
     }
 }
 
+/// Whether [`start_logging`] sends log lines to systemd's journal.
+pub fn logs_to_journal() -> bool {
+    Journal::open().is_some()
+}
+
 /// Sends log lines to systemd's journal, if standard error goes there, else to standard error;
 /// RUST_LOG selects the level, `info` by default.
 pub fn start_logging() {

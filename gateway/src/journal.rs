@@ -8,9 +8,10 @@
 
 use nix::sys::stat::fstat;
 use std::fmt::{Debug, Write as _};
-use std::io;
+use std::io::{self, Write as _};
 use std::os::unix::net::UnixDatagram;
-use std::time::Duration;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
 use tracing::field::{Field, Visit};
 use tracing::{Event, Level, Subscriber};
 use tracing_subscriber::Layer;
@@ -18,8 +19,13 @@ use tracing_subscriber::layer::Context;
 
 const SOCKET: &str = "/run/systemd/journal/socket";
 
-/// The journal of the machine.
-pub(crate) struct Journal(UnixDatagram);
+/// The journal of the machine. Whoever logs never waits for it: lines that it does not take are
+/// counted, and the next line says how many.
+pub(crate) struct Journal {
+    socket: UnixDatagram,
+    place: PathBuf,
+    lost: AtomicU64,
+}
 
 impl Journal {
     /// The journal, if that is where systemd sends this process's standard error.
@@ -29,12 +35,33 @@ impl Journal {
         if stream != format!("{}:{}", stat.st_dev, stat.st_ino) {
             return None;
         }
-        let socket = UnixDatagram::unbound().ok()?;
-        // A journal that hangs must not make the process hang.
-        socket
-            .set_write_timeout(Some(Duration::from_millis(100)))
-            .ok()?;
-        Some(Self(socket))
+        Self::at(SOCKET.into()).ok()
+    }
+
+    fn at(place: PathBuf) -> io::Result<Self> {
+        let socket = UnixDatagram::unbound()?;
+        socket.set_nonblocking(true)?;
+        Ok(Self {
+            socket,
+            place,
+            lost: AtomicU64::new(0),
+        })
+    }
+
+    fn put(&self, mut line: Line, level: Level) {
+        let lost = self.lost.swap(0, Ordering::Relaxed);
+        if lost > 0 {
+            line.fields.push(("lost_lines", lost.to_string()));
+        }
+        // Addressed each time, because a journal that was restarted has a new socket.
+        match self.socket.send_to(&line.entry(level), &self.place) {
+            Ok(_) => {}
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                self.lost.fetch_add(lost + 1, Ordering::Relaxed);
+            }
+            // There is no journal, or the line is too long for a datagram.
+            Err(_) => drop(writeln!(io::stderr(), "{}", line.text())),
+        }
     }
 }
 
@@ -42,14 +69,7 @@ impl<S: Subscriber> Layer<S> for Journal {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
         let mut line = Line::default();
         event.record(&mut line);
-        // Addressed each time, because a journal that was restarted has a new socket.
-        if self
-            .0
-            .send_to(&line.entry(*event.metadata().level()), SOCKET)
-            .is_err()
-        {
-            eprintln!("{}", line.text());
-        }
+        self.put(line, *event.metadata().level());
     }
 }
 
@@ -135,6 +155,35 @@ mod tests {
             String::from_utf8_lossy(&line.entry(Level::WARN)),
             String::from_utf8_lossy(&expected.concat())
         );
+    }
+
+    #[test]
+    fn nobody_waits_for_a_journal_that_hangs_and_lost_lines_are_counted() {
+        let folder = tempfile::tempdir().unwrap();
+        let place = folder.path().join("socket");
+        let reader = UnixDatagram::bind(&place).unwrap();
+        reader.set_nonblocking(true).unwrap();
+        let journal = Journal::at(place).unwrap();
+        let log = || {
+            let line = Line {
+                message: "x".repeat(1000),
+                fields: vec![],
+            };
+            journal.put(line, Level::INFO);
+        };
+        let read = || {
+            let mut buffer = [0; 4096];
+            let length = reader.recv(&mut buffer).ok()?;
+            Some(String::from_utf8_lossy(&buffer[..length]).into_owned())
+        };
+        // More than any queue of the kernel holds.
+        (0..10_000).for_each(|_| log());
+        let taken = std::iter::from_fn(read).count();
+        log();
+        let told = format!("LOST_LINES={}\n", 10_000 - taken);
+        assert!(taken > 0 && read().unwrap().ends_with(&told));
+        log();
+        assert!(!read().unwrap().contains("LOST"));
     }
 
     #[test]

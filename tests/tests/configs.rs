@@ -257,6 +257,15 @@ fn problems(unit: &Unit, daemon: &str) -> Vec<String> {
     expect("AmbientCapabilities", &|v| v == rights);
     expect("CapabilityBoundingSet", &|v| v == rights);
     expect("RestrictAddressFamilies", &|v| v == families);
+    // @resources and @memlock are for real time.
+    let filters: Vec<&str> = unit["Service"]
+        .iter()
+        .filter(|(key, _)| key == "SystemCallFilter")
+        .map(|(_, value)| value.as_str())
+        .collect();
+    if filters != ["@system-service", "~@privileged"] {
+        problems.push(format!("SystemCallFilter={filters:?}"));
+    }
     if !unit
         .get("Service")
         .is_some_and(|s| s.iter().any(|(k, _)| k == "CapabilityBoundingSet"))

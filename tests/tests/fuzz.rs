@@ -5,7 +5,8 @@
 
 use fastrand::Rng;
 use proprio_tests::fuzz::{TARGETS, Target};
-use std::time::{Duration, Instant};
+use proprio_tests::now;
+use proprio_topics::Nanos;
 
 /// One change of some bytes.
 fn mutate(bytes: &mut Vec<u8>, other: &[u8], random: &mut Rng) {
@@ -63,13 +64,13 @@ fn try_mutations(name: &str) {
         for _ in 0..1 + random.u8(..6) {
             mutate(&mut bytes, &seeds[random.usize(..seeds.len())], &mut random);
         }
-        let start = Instant::now();
+        let start = now();
         let panicked = std::panic::catch_unwind(|| (target.run)(&bytes)).is_err();
-        let took = start.elapsed();
-        if panicked || took > Duration::from_secs(5) {
+        let took = now() - start;
+        if panicked || took > Nanos::from_millis(5000) {
             let file = std::env::temp_dir().join(format!("proprio-fuzz-{name}"));
             std::fs::write(&file, &bytes).expect("a file");
-            panic!("{name}: {took:?}; the input is {}", file.display());
+            panic!("{name}: {took} s; the input is {}", file.display());
         }
     }
 }

@@ -185,6 +185,13 @@ impl Machine {
     }
 }
 
+/// A configuration with some change.
+fn changed(text: &str, change: impl FnOnce(&mut toml::Table)) -> String {
+    let mut table: toml::Table = text.parse().expect("TOML");
+    change(&mut table);
+    table.to_string()
+}
+
 /// The path of the model in an estimator.toml.
 fn arm_model(text: &str) -> String {
     let table: toml::Table = text.parse().expect("TOML");
@@ -219,9 +226,9 @@ fn a_package_waits_for_a_configuration_and_a_purge_leaves_nothing() {
         assert_eq!(property(unit, "ConditionResult"), "no", "{unit}");
         assert_eq!(property(unit, "ActiveState"), "inactive", "{unit}");
     }
-    // The example is one.
+    // The examples are some.
     for daemon in ["gateway", "estimator"] {
-        let config = format!("/etc/proprio/example/{daemon}.toml");
+        let config = format!("/usr/share/doc/proprio/examples/icub_left_arm/{daemon}.toml");
         sh(&format!("{PROGRAM} {daemon} --config {config} --check"));
     }
     assert!(
@@ -233,10 +240,9 @@ fn a_package_waits_for_a_configuration_and_a_purge_leaves_nothing() {
 
     let machine = Machine::running().expect("a package");
     for unit in UNITS {
-        assert_eq!(
-            property(unit, "FragmentPath"),
-            format!("/lib/systemd/system/{unit}")
-        );
+        // /lib may be a link to /usr/lib.
+        let file = fs::canonicalize(property(unit, "FragmentPath")).expect("a unit");
+        assert_eq!(file, Path::new("/usr/lib/systemd/system").join(unit));
         assert_eq!(property(unit, "NRestarts"), "0", "{unit}");
         let id = process(unit);
         let owner = fs::metadata(format!("/proc/{id}")).expect("it runs").uid();
@@ -262,6 +268,33 @@ fn a_package_waits_for_a_configuration_and_a_purge_leaves_nothing() {
         assert!(level.is_some_and(|level| level <= most), "{unit}: {report}");
     }
 
+    // The sandbox leaves real time.
+    let real_time = || {
+        "cpu = 0\npriority = 10"
+            .parse::<toml::Table>()
+            .expect("TOML")
+    };
+    machine.configure("gateway.toml", |text| {
+        changed(&text, |table| {
+            for bus in table["bus"].as_array_mut().expect("buses") {
+                let bus = bus.as_table_mut().expect("a table");
+                bus.insert("realtime".into(), real_time().into());
+            }
+        })
+    });
+    machine.configure("estimator.toml", |text| {
+        changed(&text, |table| {
+            drop(table.insert("realtime".into(), real_time().into()));
+        })
+    });
+    sh(&format!("systemctl restart {}", UNITS.join(" ")));
+    machine.expect_torques("in real time");
+    for unit in UNITS {
+        assert!(!log(unit).contains("not granted"), "{}", log(unit));
+        let threads = sh(&format!("ps -L -o cls= -p {}", process(unit)));
+        assert!(threads.contains("FF"), "{unit}: {threads}");
+    }
+
     drop(machine);
     sh(&format!(
         "systemctl stop {LOOP}; rm /etc/systemd/system/{LOOP}"
@@ -269,6 +302,8 @@ fn a_package_waits_for_a_configuration_and_a_purge_leaves_nothing() {
     sh(&format!("rm -f {READ} /usr/local/bin/control-loop"));
     let files = sh("dpkg -L proprio");
     assert!(files.contains(PROGRAM), "{files}");
+    // As of a process that was killed.
+    sh("install -o proprio -m 600 /dev/null /dev/shm/proprio_left");
     sh("dpkg -P proprio");
     assert_eq!(leftovers(&files), "", "after a purge");
     let (state, _) = attempt(&format!("systemctl is-active {}", UNITS[0]));
@@ -283,9 +318,6 @@ fn an_upgrade_keeps_the_configuration_and_restarts_the_services() {
     let package = Machine::package().expect("a package");
     let line = "# measured on this robot\n";
     machine.configure("gateway.toml", |text| line.to_owned() + &text);
-    let example = "/etc/proprio/example/gateway.toml";
-    let changed = line.to_owned() + &fs::read_to_string(example).expect("the example");
-    fs::write(example, changed).expect("it is written");
     let before = UNITS.map(process);
     sh(&format!(
         "cd /tmp && rm -rf next && dpkg-deb -R {package} next && \
@@ -293,14 +325,8 @@ fn an_upgrade_keeps_the_configuration_and_restarts_the_services() {
          dpkg-deb -Znone -b next next.deb && rm -r next && dpkg -i next.deb"
     ));
     assert_eq!(sh("dpkg-query -W -f '${Version}' proprio"), "999");
-    for file in ["/etc/proprio/gateway.toml", example] {
-        assert!(
-            fs::read_to_string(file)
-                .expect("it stays")
-                .starts_with(line),
-            "{file}"
-        );
-    }
+    let kept = fs::read_to_string("/etc/proprio/gateway.toml").expect("it stays");
+    assert!(kept.starts_with(line), "{kept}");
     for (unit, before) in UNITS.into_iter().zip(before) {
         let after = process(unit);
         assert!(after != 0 && after != before, "{unit} was not restarted");
@@ -372,13 +398,20 @@ fn a_wrong_configuration_is_told_once_and_a_reload_refuses_it() {
 
     for (unit, file) in UNITS.into_iter().zip(["gateway.toml", "estimator.toml"]) {
         machine.configure(file, |text| "bogus = 1\n".to_owned() + &text);
+        let errors = || sh(&format!("journalctl --no-pager -o cat -p err -u {unit}"));
+        let told = errors().matches("bogus = 1").count();
         let (_, restarted) = attempt(&format!("systemctl restart {unit}"));
         assert!(!restarted, "{unit} starts with a wrong file");
         std::thread::sleep(std::time::Duration::from_secs(2));
         assert_eq!(property(unit, "ActiveState"), "failed");
         assert_eq!(property(unit, "ExecMainStatus"), "2");
         assert_eq!(property(unit, "NRestarts"), "0", "{unit}: a loop");
-        assert!(log(unit).contains("bogus"), "{}", log(unit));
+        assert_eq!(
+            errors().matches("bogus = 1").count(),
+            told + 1,
+            "{}",
+            log(unit)
+        );
         machine.configure(file, |text| text);
         sh(&format!("systemctl start {unit}"));
         machine.expect_torques(&format!("after {file} was mended"));
@@ -403,20 +436,17 @@ fn a_full_disk_costs_the_state_of_identification_and_nothing_else() {
     sh("mount -t tmpfs -o size=1m,uid=proprio,gid=proprio,mode=755 tmpfs /var/lib/proprio");
     let _ = attempt("cat /dev/zero >/var/lib/proprio/full");
     let told = log(estimator).len();
-    machine.configure("estimator.toml", |text| {
-        let mut table: toml::Table = text.parse().expect("TOML");
+    let learn = |table: &mut toml::Table| {
         for contact in table["contact"].as_array_mut().expect("contacts") {
             let contact = contact.as_table_mut().expect("a table");
             contact.insert("presence".into(), "possible".into());
         }
         let identification =
             "enabled = true\nsave_every_s = 1.0\nstate = \"/var/lib/proprio/state\"";
-        table.insert(
-            "identification".into(),
-            identification.parse::<toml::Table>().expect("TOML").into(),
-        );
-        table.to_string()
-    });
+        let identification: toml::Table = identification.parse().expect("TOML");
+        table.insert("identification".into(), identification.into());
+    };
+    machine.configure("estimator.toml", |text| changed(&text, learn));
     sh(&format!("systemctl restart {estimator}"));
     let id = process(estimator);
     let counted = |what| {
