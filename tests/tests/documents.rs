@@ -1,5 +1,6 @@
-//! README.md, SECURITY.md and docs/: their configuration blocks are legal, and their commands exist. (Their
-//! programs are doc tests of the crate that consumers depend on.)
+//! README.md, SECURITY.md and docs/: their configuration blocks are legal, their commands and the
+//! tests that they name exist. (Their programs are doc tests of the crate that consumers depend
+//! on.)
 
 use proprio_estimator::config::Config;
 use proprio_gateway::plan::Plan;
