@@ -144,7 +144,7 @@ const CLOCKS: [(&str, &str); 2] = [
 
 /// The files that may call these clocks: the outermost loops of programs, and tests that wait for
 /// processes.
-const OUTERMOST: [(&str, &str); 12] = [
+const OUTERMOST: [(&str, &str); 13] = [
     ("gateway/topics/src/ipc/clock.rs", "is it"),
     ("gateway/src/clock.rs", "the gateway's clock"),
     ("gateway/topics/src/ipc/bell.rs", "tests of waiting"),
@@ -164,6 +164,10 @@ const OUTERMOST: [(&str, &str); 12] = [
     ("gateway/topics/benches/", "measure"),
     ("gateway/benches/", "measure"),
     ("estimator/src/daemon.rs", "the daemon's loop"),
+    (
+        "estimator/src/daemon/identification.rs",
+        "when its state was written",
+    ),
     ("cli/src/", "programs"),
     ("tests/", "tests of processes"),
 ];
@@ -920,4 +924,32 @@ fn nothing_is_left_for_later() {
         ),
     ));
     assert_eq!(unfinished(&sources).len(), 3);
+}
+
+/// Tests that SECURITY.md names as `file::test`, and that do not exist.
+fn missing_tests(sources: &[Source]) -> Vec<&str> {
+    let document = sources.iter().find(|source| source.path == "SECURITY.md");
+    let words = document.map_or("", |source| &source.text).split('`');
+    let is_missing = |word: &&str| {
+        word.split_once(".rs::").is_some_and(|(file, test)| {
+            let file = format!("{file}.rs");
+            let mut files = sources
+                .iter()
+                .filter(|source| Path::new(&source.path).ends_with(&file));
+            !files.any(|source| source.text.contains(&format!("fn {test}(")))
+        })
+    };
+    words.filter(is_missing).collect()
+}
+
+#[test]
+fn tests_that_a_document_names_exist() {
+    let mut sources = sources();
+    assert_eq!(missing_tests(&sources), [""; 0]);
+    let document = (sources.iter_mut()).find(|source| source.path == "SECURITY.md");
+    let text = &mut document.expect("it is there").text;
+    assert!(text.matches(".rs::").count() > 10);
+    text.push_str("`truth.rs::all_is_well` `none.rs::a_valid_torque_is_true`");
+    let missing = ["truth.rs::all_is_well", "none.rs::a_valid_torque_is_true"];
+    assert_eq!(missing_tests(&sources), missing);
 }
