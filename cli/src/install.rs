@@ -14,7 +14,9 @@ use std::process::Command;
 
 /// systemd finds programs without a path here and in /usr/bin.
 const PROGRAM: &str = "usr/local/bin/proprio";
-/// Where the Debian package puts the units. Copies of ours would hide these for ever.
+/// Units here hide those of the Debian package.
+const UNITS: &str = "etc/systemd/system";
+/// Where the Debian package puts its units.
 const PACKAGED: &str = "usr/lib/systemd/system";
 const CONFIG: &str = "etc/proprio";
 const USER: (&str, &str) = (
@@ -129,37 +131,33 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     check(from)?;
 
     let mut steps = Vec::new();
-    let own = std::env::current_exe().context("cannot find this program's own file")?;
-    let program = args.root.join(PROGRAM);
-    let is_packaged = args
-        .root
-        .join(PACKAGED)
-        .join("proprio-gateway.service")
-        .exists();
-    if is_packaged {
-        refuse_copies(&args.root)?;
-    } else if own != program {
-        let bytes = fs::read(&own).with_context(|| format!("cannot read {}", own.display()))?;
-        steps.push(write(program, bytes, 0o755));
-    }
-    if !is_packaged {
-        steps.push(write(args.root.join(USER.0), USER.1.into(), 0o644));
-    }
-    if let Some(folder) = &args.config {
-        steps.extend(configuration(folder, &etc, args.force)?);
-    }
-    for service in services.iter().filter(|_| !is_packaged) {
-        let to = args.root.join("etc/systemd/system").join(service.unit);
-        steps.push(write(to, service.text.into(), 0o644));
-    }
+    let is_packaged = SERVICES
+        .iter()
+        .any(|service| args.root.join(PACKAGED).join(service.unit).exists());
     let in_image = |name: &str| {
         let root = is_image.then(|| format!("--root={}", args.root.display()));
         [name.to_owned()].into_iter().chain(root)
     };
     let units = || services.iter().map(|service| service.unit.to_owned());
     let words = |text: &'static str| text.split(' ').map(str::to_owned);
-    if !is_packaged {
+    if is_packaged {
+        refuse_copies(&args.root)?;
+    } else {
+        let own = std::env::current_exe().context("cannot find this program's own file")?;
+        let program = args.root.join(PROGRAM);
+        if own != program {
+            let bytes = fs::read(&own).with_context(|| format!("cannot read {}", own.display()))?;
+            steps.push(write(program, bytes, 0o755));
+        }
+        steps.push(write(args.root.join(USER.0), USER.1.into(), 0o644));
+        for service in &services {
+            let to = args.root.join(UNITS).join(service.unit);
+            steps.push(write(to, service.text.into(), 0o644));
+        }
         steps.push(Step::Run(in_image("systemd-sysusers").collect()));
+    }
+    if let Some(folder) = &args.config {
+        steps.extend(configuration(folder, &etc, args.force)?);
     }
     let enable = in_image("systemctl").chain(words("enable"));
     steps.push(Step::Run(enable.chain(units()).collect()));
@@ -181,7 +179,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 /// Of an installation without a package, systemd would start the program and the units, and not
 /// what the package upgrades.
 fn refuse_copies(root: &Path) -> anyhow::Result<()> {
-    let etc = |service: Service| Path::new("etc/systemd/system").join(service.unit);
+    let etc = |service: Service| Path::new(UNITS).join(service.unit);
     let copies: Vec<String> = [PathBuf::from(PROGRAM)]
         .into_iter()
         .chain(SERVICES.map(etc))

@@ -88,7 +88,7 @@ struct Daemon {
 
 fn main() -> ExitCode {
     let args = Args::parse();
-    proprio_gateway::daemon::start_logging();
+    let is_journal = proprio_gateway::daemon::start_logging();
     let mut domain = DomainConfig::from_env();
     if let Some(name) = args.domain {
         domain.name = name;
@@ -113,14 +113,14 @@ fn main() -> ExitCode {
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => fail(&error),
+        Err(error) => fail(&error, is_journal),
     }
 }
 
 /// Prints an error chain; exit code 2 if its root is a wrong configuration, else 1.
-fn fail(error: &anyhow::Error) -> ExitCode {
-    // The journal takes a line of standard error for information.
-    if proprio_gateway::daemon::logs_to_journal() {
+fn fail(error: &anyhow::Error, is_journal: bool) -> ExitCode {
+    if is_journal {
+        // It takes a line of standard error for information.
         tracing::error!("{error:#}");
     } else {
         eprintln!("error: {error:#}");

@@ -12,7 +12,7 @@ fn target() -> &'static Target {
         let name = std::env::var("PROPRIO_FUZZ_TARGET").expect("PROPRIO_FUZZ_TARGET");
         let target = Target::named(&name).expect("the name of a reader");
         if let Ok(folder) = std::env::var("PROPRIO_FUZZ_SEEDS") {
-            for (number, seed) in target.seeds().iter().enumerate() {
+            for (number, seed) in (target.seeds)().iter().enumerate() {
                 std::fs::write(format!("{folder}/seed-{number}"), seed).expect("a seed");
             }
         }

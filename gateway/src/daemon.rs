@@ -279,21 +279,17 @@ fn control_socket(
     }
 }
 
-/// Whether [`start_logging`] sends log lines to systemd's journal.
-pub fn logs_to_journal() -> bool {
-    Journal::open().is_some()
-}
-
 /// Sends log lines to systemd's journal, if standard error goes there, else to standard error;
-/// RUST_LOG selects the level, `info` by default.
-pub fn start_logging() {
+/// RUST_LOG selects the level, `info` by default. Returns whether they go to the journal.
+pub fn start_logging() -> bool {
     use std::io::IsTerminal as _;
     use tracing_subscriber::prelude::*;
     // neli logs every byte that it sends or receives.
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,neli=warn"));
     let journal = Journal::open();
-    let text = journal.is_none().then(|| {
+    let is_journal = journal.is_some();
+    let text = (!is_journal).then(|| {
         tracing_subscriber::fmt::layer()
             .with_target(false)
             .with_ansi(std::io::stderr().is_terminal())
@@ -304,4 +300,5 @@ pub fn start_logging() {
         .with(journal)
         .with(text)
         .try_init();
+    is_journal
 }

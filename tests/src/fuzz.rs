@@ -20,8 +20,8 @@ use std::path::Path;
 pub struct Target {
     /// What it reads.
     pub name: &'static str,
-    /// Files that it reads without an error, below the workspace.
-    seeds: &'static [&'static str],
+    /// Legal input, from which mutations reach more than random bytes do.
+    pub seeds: fn() -> Vec<Vec<u8>>,
     /// Reads; whether it found nothing wrong.
     pub run: fn(&[u8]) -> bool,
 }
@@ -30,43 +30,49 @@ pub struct Target {
 pub const TARGETS: &[Target] = &[
     Target {
         name: "log",
-        seeds: &[
-            "gateway/tests/log/bus.log",
-            "gateway/tests/log/bus.asc",
-            "gateway/tests/log/bus.trc",
-            "gateway/tests/log/bus.csv",
-            "gateway/tests/log/bus.blf",
-            "gateway/tests/log/stored.blf",
-            "gateway/tests/log/straddling.blf",
-        ],
+        seeds: || {
+            files(&[
+                "gateway/tests/log/bus.log",
+                "gateway/tests/log/bus.asc",
+                "gateway/tests/log/bus.trc",
+                "gateway/tests/log/bus.csv",
+                "gateway/tests/log/bus.blf",
+                "gateway/tests/log/stored.blf",
+                "gateway/tests/log/straddling.blf",
+            ])
+        },
         run: read_log,
     },
     Target {
         name: "table",
-        seeds: &["tests/oracle/icub_left_arm_mujoco.csv"],
+        seeds: || files(&["tests/oracle/icub_left_arm_mujoco.csv"]),
         run: read_table,
     },
     Target {
         name: "gateway",
-        seeds: &[
-            "config/icub_left_arm/gateway.toml",
-            "config/six_axis_arm/gateway.toml",
-            "config/moteus_leg/gateway.toml",
-        ],
+        seeds: || {
+            files(&[
+                "config/icub_left_arm/gateway.toml",
+                "config/six_axis_arm/gateway.toml",
+                "config/moteus_leg/gateway.toml",
+            ])
+        },
         run: |bytes| Plan::parse(&text(bytes), Path::new("/nowhere")).is_ok(),
     },
     Target {
         name: "estimator",
-        seeds: &[
-            "config/icub_left_arm/estimator.toml",
-            "config/six_axis_arm/estimator.toml",
-            "config/moteus_leg/estimator.toml",
-        ],
+        seeds: || {
+            files(&[
+                "config/icub_left_arm/estimator.toml",
+                "config/six_axis_arm/estimator.toml",
+                "config/moteus_leg/estimator.toml",
+            ])
+        },
         run: |bytes| Config::parse(&text(bytes)).is_ok(),
     },
     Target {
         name: "dbc",
-        seeds: &["gateway/tests/dbc/everything.dbc"],
+        seeds: || files(&["gateway/tests/dbc/everything.dbc"]),
         run: |bytes| {
             let skin = "name = \"s\"\ndriver = \"dbc\"\n[[bus.device.reading]]\nkind = \"skin\"\n\
                         fields = { p0 = \"Intel.High\" }\nunits = { p0 = \"raw\" }";
@@ -75,11 +81,13 @@ pub const TARGETS: &[Target] = &[
     },
     Target {
         name: "eds",
-        seeds: &[
-            "gateway/tests/eds/drive.eds",
-            "gateway/tests/eds/drive.dcf",
-            "gateway/tests/eds/encoder.eds",
-        ],
+        seeds: || {
+            files(&[
+                "gateway/tests/eds/drive.eds",
+                "gateway/tests/eds/drive.dcf",
+                "gateway/tests/eds/encoder.eds",
+            ])
+        },
         run: |bytes| {
             let drive = "name = \"d\"\ndriver = \"canopen_drive\"\naddress = 5\n\
                          [[bus.device.joint]]\nname = \"j\"";
@@ -88,26 +96,31 @@ pub const TARGETS: &[Target] = &[
     },
     Target {
         name: "urdf",
-        seeds: &[
-            "config/icub_left_arm/model.urdf",
-            "config/six_axis_arm/model.urdf",
-            "config/moteus_leg/model.urdf",
-        ],
+        seeds: || {
+            files(&[
+                "config/icub_left_arm/model.urdf",
+                "config/six_axis_arm/model.urdf",
+                "config/moteus_leg/model.urdf",
+            ])
+        },
         run: |bytes| Model::from_urdf(&text(bytes), &[]).is_ok(),
     },
     Target {
         name: "taxels",
-        seeds: &[],
+        seeds: || vec![b"# x y z nx ny nz\n0.01 0 0 0 0 1\n0 0.01 0 0 1 0\n".into()],
         run: |bytes| TaxelMap::parse(&text(bytes)).is_ok(),
     },
     Target {
         name: "parameters",
-        seeds: &[],
+        seeds: || {
+            let parameters = Parameters::new(&arm(|_| {}).robot, Provenance::default());
+            vec![parameters.to_string().into()]
+        },
         run: read_parameters,
     },
     Target {
         name: "state",
-        seeds: &[],
+        seeds: || vec![state().into()],
         run: read_state,
     },
 ];
@@ -118,32 +131,13 @@ impl Target {
     pub fn named(name: &str) -> Option<&'static Self> {
         TARGETS.iter().find(|target| target.name == name)
     }
+}
 
-    /// Legal input, from which mutations reach more than random bytes do.
-    ///
-    /// # Panics
-    /// If a file is missing.
-    #[must_use]
-    pub fn seeds(&self) -> Vec<Vec<u8>> {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-        let read = |name: &&str| fs::read(root.join(name)).expect(name);
-        let mut seeds: Vec<Vec<u8>> = self.seeds.iter().map(read).collect();
-        match self.name {
-            "taxels" => seeds.push(b"# x y z nx ny nz\n0.01 0 0 0 0 1\n0 0.01 0 0 1 0\n".into()),
-            "parameters" => {
-                let robot = arm(|_| {}).robot;
-                let parameters = Parameters::new(&robot, Provenance::default());
-                seeds.push(parameters.to_string().into());
-            }
-            "state" => {
-                let text = state();
-                // Its sum is made anew, see below.
-                seeds.push(text.rsplit_once("sum ").expect("a sum").0.into());
-            }
-            _ => {}
-        }
-        seeds
-    }
+/// The content of files of this repository.
+fn files(names: &[&str]) -> Vec<Vec<u8>> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let read = |name: &&str| fs::read(root.join(name)).expect(name);
+    names.iter().map(read).collect()
 }
 
 fn text(bytes: &[u8]) -> String {
@@ -210,7 +204,7 @@ fn read_parameters(bytes: &[u8]) -> bool {
     true
 }
 
-/// Whether the checksum fits is not left to chance.
+/// Reads a state without its checksum: whether that fits is not left to chance.
 fn read_state(bytes: &[u8]) -> bool {
     thread_local! {
         static PIPELINE: RefCell<Pipeline> = RefCell::new(learning());
@@ -243,7 +237,7 @@ fn learning() -> Pipeline {
     }))
 }
 
-/// A state of the arm at rest.
+/// A state of the arm at rest, without its checksum.
 fn state() -> String {
     let mut pipeline = learning();
     let channels: Vec<Kind> = pipeline.setup().channels().map(|(kind, _)| kind).collect();
@@ -268,7 +262,8 @@ fn state() -> String {
         }
         while pipeline.poll().is_some() {
             if let Some(job) = pipeline.take_job() {
-                return job.state();
+                let state = job.state();
+                return state.rsplit_once("sum ").expect("a checksum").0.to_owned();
             }
         }
     }

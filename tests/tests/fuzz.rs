@@ -49,7 +49,7 @@ fn try_mutations(name: &str) {
     let count = std::env::var("PROPRIO_FUZZ").ok();
     let count = count.map_or(500, |count| count.parse().expect("a number"));
     let mut random = Rng::with_seed(1);
-    let seeds = target.seeds();
+    let seeds = (target.seeds)();
     for (number, seed) in seeds.iter().enumerate() {
         assert!((target.run)(seed), "{name}: seed {number} is not legal");
     }
