@@ -39,9 +39,9 @@ pub(crate) trait Inquiry {
     fn sent(&mut self, outcome: Result<Nanos, NotSent>) {
         let _ = outcome;
     }
-    /// Time of the next poll.
+    /// Time of the next poll; `None`: only a frame can make it advance. Without a question: now.
     fn wake(&self) -> Option<Nanos> {
-        None
+        Some(Nanos::MIN)
     }
     /// Why the board cannot be used.
     fn refusal(&self) -> Option<Refusal> {

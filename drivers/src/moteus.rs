@@ -33,6 +33,9 @@
 //! - A joint reading comes with each reply; the actuator's if its mode or fault is new, and it and
 //!   the temperature once a second.
 //!
+//! A reply without an open query is an old one: it is dropped and counted as unexpected, but for a
+//! driver that only listens.
+//!
 //! The driver never commands: it reads registers, and sends nothing at the end.
 //!
 //! Sources: `docs/protocol/can.md` and `registers.md` (moteus db1a7623). Certain: the tests compare
@@ -54,8 +57,8 @@ use crate::family::{Family, Link, Supervised, next_in_step};
 use crate::held::OnChange;
 use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
 use crate::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Format, Frame, Frames, Id, Output,
-    OutputInfo, Spec, SpecError,
+    Board, Claim, Decoded, Device, Driver, EncodeError, Format, Frame, Frames, Id, Mode, NotSent,
+    Output, OutputInfo, Spec, SpecError,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -392,6 +395,8 @@ struct Controller {
     reply: Id,
     period: Nanos,
     next: Nanos,
+    /// Whether a query has no reply yet.
+    asked: bool,
     /// The last mode and fault.
     mode: u32,
     fault: u32,
@@ -413,6 +418,7 @@ impl Controller {
             reply,
             period,
             next: Nanos::MIN,
+            asked: false,
             mode: 0,
             fault: 0,
             actuator: OnChange::NOTHING,
@@ -448,6 +454,10 @@ impl Family for Controller {
         let Some(told) = Told::parse(data) else {
             return out.fault(Counter::Value, 1, frame.id);
         };
+        // A reply to nobody is an old one, which a queue of an adapter has held back.
+        if link.bringup.mode() == Mode::Supervise && !core::mem::take(&mut self.asked) {
+            return out.fault(Counter::Unexpected, 1, frame.id);
+        }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // casts saturate
         let code = |value: f64| value.max(0.0) as u32;
         if let Some(fault) = told.fault {
@@ -504,7 +514,16 @@ impl Family for Controller {
             return None;
         }
         self.next = next_in_step(self.next, self.period, now);
+        self.asked = true;
         Some(self.query)
+    }
+
+    fn on_sent(&mut self, _frame: &Frame, outcome: Result<Nanos, NotSent>) {
+        self.asked &= outcome.is_ok();
+    }
+
+    fn interrupt(&mut self) {
+        self.asked = false;
     }
 
     fn request_at(&self) -> Option<Nanos> {

@@ -130,7 +130,8 @@ impl Board for RftBoard {
         let axes = values.into_iter().zip(self.divisors);
         for (axis, (count, (value, divisor))) in (0..).zip(counts.iter_mut().zip(axes)) {
             *count = bytes::quantise_i16(value, 1.0 / divisor);
-            if quality.saturation(axis) != Saturation::None {
+            let is_at_end = [i16::MIN, i16::MAX].contains(count);
+            if is_at_end || quality.saturation(axis) != Saturation::None {
                 overload |= 1 << (OVERLOAD_FX - axis);
             }
         }

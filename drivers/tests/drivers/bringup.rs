@@ -210,6 +210,51 @@ fn a_start_command_that_was_not_sent_is_repeated() {
     }
 }
 
+/// An interface that takes nothing for longer than the maximum silence, also where nothing is asked
+/// before a start.
+#[test]
+fn a_board_is_asked_again_when_the_interface_takes_frames_again() {
+    let joint = (
+        0,
+        Reading::Joint(JointState {
+            position: 0.5,
+            velocity: 0.0,
+            torque: 0.0,
+            current: 0.0,
+            ..JointState::ABSENT
+        }),
+    );
+    for (driver, keys, outputs, reading) in [
+        ("moteus", "", &[0][..], joint),
+        ("odrive", "request_period_ms = 5", &[0], joint),
+        (
+            "damiao",
+            "model = \"DM4310\"\nrequest_period_ms = 5",
+            &[0],
+            joint,
+        ),
+        ("myactuator", "request_period_ms = 5", &[0], joint),
+        (
+            "robstride",
+            "model = \"RS03\"\nrequest_period_ms = 5",
+            &[0],
+            joint,
+        ),
+        ("ati_netcanoem", "", &[], wrench()),
+        ("icub_strain", "", &[], wrench()),
+        ("icub_imu", "", &[], imu()),
+    ] {
+        let mut rig = Rig::new(driver, keys, outputs, reading);
+        rig.run(1000);
+        assert_eq!(rig.device.state(), State::Streaming, "{driver}");
+        rig.interface = Box::new(|_| Some(NotSent::Deadline));
+        rig.run(5000);
+        rig.interface = Box::new(|_| None);
+        rig.run(5000);
+        assert_eq!(rig.device.state(), State::Streaming, "{driver}");
+    }
+}
+
 /// The outcome is late: until it is known nothing else is sent. After a restart the device does not
 /// wait for it.
 #[test]

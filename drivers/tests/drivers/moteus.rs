@@ -2,7 +2,9 @@
 //! is asked.
 
 use crate::rig::{FD, Rig, board, count, decode, encode, listener, options, spec, supervisor};
-use proprio_drivers::{Board, Decoded, Device, Frame, Frames, Id, Mode, Output, SpecError, State};
+use proprio_drivers::{
+    Board, Decoded, Device, Frame, Frames, Id, Mode, NotSent, Output, SpecError, State,
+};
 use proprio_topics::{
     Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind, Temperature,
 };
@@ -339,6 +341,34 @@ fn queries_leave_in_step() {
         assert_eq!(poll(&mut *device, due - Nanos(1)), None);
         assert_eq!(poll(&mut *device, due), query);
     }
+}
+
+/// A reply that a queue has held back, or that comes twice, is none of what is asked now. A
+/// listener does not know what was asked.
+#[test]
+fn a_reply_to_no_query_is_dropped() {
+    let mut device = supervisor("moteus", "period_ms = 4", &[0]);
+    let reply = reply("21010A");
+    let count = |device: &mut dyn Device| {
+        let (readings, faults) = decode(device, &[reply]);
+        (readings.len(), faults)
+    };
+    let mut out = Decoded::new();
+    let mut ask = |device: &mut dyn Device, ms: i64, outcome: Result<(), NotSent>| {
+        let t = Nanos::from_millis(ms);
+        let sent = device.poll_transmit(t, &mut out).expect("a query").frame;
+        device.on_sent(&sent, outcome.map(|()| t));
+    };
+    ask(&mut *device, 1000, Ok(()));
+    assert_eq!(count(&mut *device).0, 1);
+    let (readings, faults) = count(&mut *device);
+    assert_eq!((readings, faults[0].counter), (0, Counter::Unexpected));
+    ask(&mut *device, 1004, Ok(()));
+    assert_eq!(count(&mut *device).0, 1);
+    ask(&mut *device, 1008, Err(NotSent::Deadline));
+    assert_eq!(count(&mut *device).0, 0, "it was not asked");
+    let mut other = listener("moteus", "", &[0]);
+    assert_eq!([(); 2].map(|()| count(&mut *other).0), [1; 2]);
 }
 
 /// Another controller may be there: what the last one told is forgotten.
