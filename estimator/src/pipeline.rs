@@ -141,6 +141,10 @@ pub struct Pipeline {
     encoder_offset_std: Vec<f64>,
     /// Per F/T sensor, the corrected reading less the offset.
     readings: Vec<Wrench>,
+    /// See [`validity::ValidityCheck`].
+    unwatched: Vec<(ContactSet, Reason, u32)>,
+    /// Per F/T sensor, since when its zero is another one than that of the offset in use.
+    new_zeros: Vec<Option<Nanos>>,
     /// Per F/T sensor, whether its calibration needs a temperature that is missing or too old.
     missing_temperature: Vec<bool>,
     /// The channels that each output depends on.
@@ -246,6 +250,8 @@ impl Pipeline {
             acceleration: vec![0.0; dofs],
             encoder_offset_std: encoder_offset_std(&setup.state.model),
             readings: vec![Wrench::zero(); setup.robot.structure.sensors().len()],
+            unwatched: Vec::with_capacity(setup.robot.structure.subtrees().len()),
+            new_zeros: vec![None; setup.robot.structure.sensors().len()],
             missing_temperature: vec![false; setup.robot.structure.sensors().len()],
             dependences: Dependences {
                 active: None,
@@ -315,6 +321,9 @@ impl Pipeline {
         if let Some(place) = self.setup.state.offsets.get_mut(sensor) {
             *place = offset;
             self.residuals.restart_means();
+            if let Some(zero) = self.new_zeros.get_mut(sensor) {
+                *zero = None;
+            }
         }
     }
 
@@ -387,6 +396,9 @@ impl Pipeline {
             let touched = self.residuals.touched(&self.setup.robot.structure);
             if identification.apply(&mut self.setup, &mut self.propagation, &touched) {
                 self.residuals.restart_means();
+                for (sensor, since) in self.new_zeros.iter_mut().enumerate() {
+                    since.take_if(|_| identification.knows_zero(sensor));
+                }
             }
         }
         self.identification = Some(identification);
@@ -490,6 +502,10 @@ impl Pipeline {
                         stale(&sample, self.setup.robot.max_silence)
                             .or(Reason::of_quality(sample.quality, Quality::DEVICE_FAULT))
                             .or(starting)
+                            .or(match self.new_zeros.get(number) {
+                                Some(Some(since)) if t > *since => Reason::Uncertain,
+                                _ => Reason::None,
+                            })
                     }
                 },
                 (ChannelBuffer::Imu(history, window, predictor), ChannelRole::Base) => {

@@ -5,6 +5,7 @@
 use proprio_estimator::config::{Config, Presence, Timing};
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
+use proprio_identification::robot::Channel;
 use proprio_topics::{
     Code, ContactState, Imu, JointState, Kind, Nanos, Quality, Reading, Reason, Wrench,
 };
@@ -214,6 +215,77 @@ fn a_frozen_sensor_gives_no_valid_torque() {
 
 /// A joint moves with jitter, stops, and stays at one count: it is not frozen. An F/T sensor whose
 /// noise ends like that is.
+/// A contact that is possible is absent because the F/T sensor would show it. While that can not
+/// see, the torques that rest on its absence are withheld, unless a program declares it.
+#[test]
+fn a_contact_that_nothing_would_show_is_not_assumed_absent() {
+    let setup = setup(|config| {
+        let hand = config.contact.last_mut().unwrap();
+        hand.presence = Presence::Possible;
+    });
+    let channel = |kind| setup.robot.channels.iter().position(|c| c.kind == kind);
+    let (ft, hand) = (channel(Kind::Wrench).unwrap(), setup.robot.contact("hand"));
+    for declared in [false, true] {
+        let mut pipeline = Pipeline::new(setup.clone());
+        if declared {
+            let absent = ContactState::configured(false);
+            pipeline.declare(hand.unwrap(), Nanos::ZERO, &absent);
+        }
+        let mut last = None;
+        for instant in 0..60 {
+            for number in 0..setup.robot.channels.len() {
+                let own = match number == ft {
+                    true => Quality::DEVICE_FAULT,
+                    false => Quality::GOOD,
+                };
+                let t = Nanos(PERIOD * instant);
+                pipeline.push(number, t, &reading(&setup, number), own);
+            }
+            while let Some(estimate) = pipeline.poll() {
+                last = Some(estimate.clone());
+            }
+        }
+        // The wrist is behind the sensor: its torque follows from the hand's links alone.
+        let last = last.unwrap();
+        let wrist = last.torques.joints().last().unwrap();
+        let cause = u32::try_from(ft).unwrap();
+        match declared {
+            true => assert_eq!(wrist.valid, 1, "{wrist:?}"),
+            false => assert_eq!(
+                (wrist.reason.get(), wrist.cause),
+                (Some(Reason::DeviceFault), cause)
+            ),
+        }
+    }
+}
+
+/// The offset in use is that of the zero before: until another one is given, nothing that depends
+/// on the sensor is valid. The first reading of all is of the zero that the configuration is of.
+#[test]
+fn a_new_zero_makes_the_offset_unknown() {
+    let setup = setup(|_| {});
+    let wrench = |c: &Channel| c.kind == Kind::Wrench;
+    let ft = setup.robot.channels.iter().position(wrench).unwrap();
+    let shoulder = |estimate: &Estimate| estimate.torques.joints()[0];
+    for zero_at in [0, 60] {
+        let found = estimates(&setup, 120, |instant, channel, _| {
+            match (instant, channel) == (zero_at, ft) {
+                true => Quality::ZERO_CHANGED,
+                false => Quality::GOOD,
+            }
+        });
+        let (before, after) = (shoulder(&found[50]), shoulder(found.last().unwrap()));
+        assert_eq!(before.valid, 1, "{before:?}");
+        match zero_at {
+            0 => assert_eq!(after.valid, 1, "{after:?}"),
+            _ => assert_eq!(
+                (after.reason.get(), after.cause),
+                (Some(Reason::Uncertain), u32::try_from(ft).unwrap())
+            ),
+        }
+    }
+}
+
 #[test]
 fn a_joint_that_stands_is_not_frozen() {
     let setup = setup(|_| {});

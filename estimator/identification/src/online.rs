@@ -394,6 +394,7 @@ impl Online {
             component.observe(observation, &self.stacked, known, slot);
         }
         if t.saturating_sub(TICK) >= self.last_tick
+            && !self.components.iter().any(|component| component.waits)
             && let Some(tick) = self.ticks.get_mut(self.tick_count)
         {
             self.last_tick = t;
@@ -409,6 +410,23 @@ impl Online {
             tick.moving = bank::bits(moving.map(|(number, _)| number));
         }
         Ok(())
+    }
+
+    /// F/T sensor number `sensor` has a new zero from the next observation on, as its device says:
+    /// its offset is learnt anew, and all else is kept. Does not allocate.
+    pub fn forget_offset(&mut self, sensor: usize) {
+        for component in &mut self.components {
+            if let Some(place) = component.sensors.iter().position(|own| *own == sensor) {
+                component.forget_offset(place);
+            }
+        }
+    }
+
+    /// Whether the solution in use has the present zero of F/T sensor number `sensor`. True for a
+    /// sensor that is not identified.
+    pub fn knows_zero(&self, sensor: usize) -> bool {
+        let mut own = (self.components.iter()).filter(|c| c.sensors.contains(&sensor));
+        own.all(|component| !component.is_outdated)
     }
 
     /// Returns a job to run once a second; None while the last one has not come back or waits for
@@ -432,6 +450,8 @@ impl Online {
             std::mem::swap(&mut part.rejected_rows, &mut component.rejected_rows);
             component.learnt.clear();
             component.rejected_rows.clear();
+            component.waits = false;
+            part.has_new_zero = component.is_outdated;
             part.is_disturbed = component.is_disturbed;
             part.is_moving = part.learnt.is_moving() || part.rejected_rows.is_moving();
             part.cosines.copy_from_slice(&component.cosines);
@@ -471,7 +491,9 @@ impl Online {
         for (part, component) in job.parts.iter_mut().zip(&mut self.components) {
             component.variances.copy_from_slice(&part.variances);
             component.drift_rates.copy_from_slice(&part.drift_rates);
-            component.may_judge = part.failure.is_none();
+            component.is_outdated &=
+                component.waits || !part.has_new_zero || part.failure.is_some();
+            component.may_judge = part.failure.is_none() && !component.is_outdated;
             component.counts.failed += u64::from(part.failure.is_some());
             // A disturbance that has ended meanwhile was no change.
             part.is_replaced &= component.is_disturbed;

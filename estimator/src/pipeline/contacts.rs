@@ -218,6 +218,17 @@ impl Contacts {
         &self.lost
     }
 
+    /// The contacts that a program declares, or a skin feels: their absence is known.
+    pub(super) fn watched(&self, t: Nanos) -> ContactSet {
+        let mut watched = ContactSet::EMPTY;
+        let declared = (0..self.declarations.len()).filter(|c| self.declared(*c, t).is_some());
+        let felt = self.patches.iter().map(Patch::contact);
+        declared
+            .chain(felt)
+            .for_each(|contact| watched.insert(contact));
+        watched
+    }
+
     fn declared(&self, contact: usize, t: Nanos) -> Option<Declared> {
         self.declarations.get(contact)?.at(t)
     }

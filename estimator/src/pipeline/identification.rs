@@ -50,6 +50,8 @@ pub(super) struct OnlineIdentification {
     moved: DofSet,
     /// Per F/T sensor, why its reading is not valid.
     sensors: Vec<Reason>,
+    /// Per F/T sensor, when it got a new zero, if the observations have not come there.
+    new_zeros: Vec<Option<Nanos>>,
     differentiator: Box<Centred>,
     /// The workspace of a job; none while a job runs.
     workspace: Option<Box<Workspace>>,
@@ -232,6 +234,7 @@ impl OnlineIdentification {
             joints: vec![Reason::None; dofs],
             moved: DofSet::default(),
             sensors: vec![Reason::None; setup.robot.structure.sensors().len()],
+            new_zeros: vec![None; setup.robot.structure.sensors().len()],
             differentiator: Box::default(),
             workspace: Some(Box::new(Workspace {
                 setup: setup.clone(),
@@ -249,6 +252,18 @@ impl OnlineIdentification {
         if let Some(workspace) = &mut self.workspace {
             std::mem::swap(propagation, &mut workspace.propagation);
         }
+    }
+
+    /// F/T sensor number `sensor` has a new zero from `t` on.
+    pub(super) fn begin_zero(&mut self, sensor: usize, t: Nanos) {
+        if let Some(zero) = self.new_zeros.get_mut(sensor) {
+            *zero = Some(t);
+        }
+    }
+
+    /// Whether the offset in use of F/T sensor number `sensor` is that of its present zero.
+    pub(super) fn knows_zero(&self, sensor: usize) -> bool {
+        self.new_zeros.get(sensor).is_none_or(Option::is_none) && self.online.knows_zero(sensor)
     }
 
     /// The identification instant that an estimate at `t` triggers, if it does.
@@ -356,6 +371,17 @@ impl OnlineIdentification {
                     *reading =
                         calibration.map_or(mean, |calibration| calibration.apply(&mean, celsius));
                     *fault = reason;
+                    // A mean of readings before and after is of neither zero.
+                    if let Some(zero) = self.new_zeros.get_mut(number)
+                        && let Some(from) = *zero
+                    {
+                        if t > from + self.period {
+                            *zero = None;
+                            self.online.forget_offset(number);
+                        } else if t + self.period >= from {
+                            *fault = (*fault).or(Reason::Uncertain);
+                        }
+                    }
                 }
                 (ChannelBuffer::Imu(history, window, _), ChannelRole::Base) => {
                     let gathered = self.differentiator.gather(

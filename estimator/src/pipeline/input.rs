@@ -4,6 +4,7 @@ use super::Pipeline;
 use super::buffers::ChannelBuffer;
 use crate::config::Timing;
 use crate::skin::Taken;
+use proprio_identification::robot::ChannelRole;
 use proprio_topics::{ContactState, Nanos, Quality, Reading, Reason};
 
 impl Pipeline {
@@ -17,6 +18,7 @@ impl Pipeline {
         };
         // Estimates that do not wait go by the order of arrival: no sample is late.
         let waits = self.setup.timing == Timing::Aligned;
+        let role = self.setup.robot.channels.get(channel).map(|c| c.role);
         let newest = buffer.newest().unwrap_or(Nanos::MIN);
         let all_finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
         let finite_or_absent = |values: &[f64]| values.iter().all(|v| !v.is_infinite());
@@ -97,6 +99,17 @@ impl Pipeline {
                         predictor.push(t, &value, fault == Reason::None, is_continued);
                     }
                     history.push(t, value, quality);
+                    // The first reading is of the zero that the configuration is of.
+                    if !is_continued
+                        && newest > Nanos::MIN
+                        && let Some(ChannelRole::Sensor(number)) = role
+                        && let Some(since) = self.new_zeros.get_mut(number)
+                    {
+                        since.get_or_insert(newest);
+                        if let Some(identification) = &mut self.identification {
+                            identification.begin_zero(number, t);
+                        }
+                    }
                 }
                 is_valid
             }

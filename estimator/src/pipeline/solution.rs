@@ -104,6 +104,7 @@ impl Pipeline {
     /// Tests the residual of each sub-tree, when the contacts in `declared` are known to be
     /// present.
     fn test_residuals(&mut self, t: Nanos, declared: &ContactSet, is_solved: bool) {
+        self.unwatched.clear();
         if !is_solved {
             return self.residuals.reset();
         }
@@ -114,7 +115,20 @@ impl Pipeline {
             base_fault: self.base_fault,
             lost: &[],
             detected: ContactSet::EMPTY,
+            unwatched: &[],
         };
+        let structure = &self.setup.robot.structure;
+        let watched = self.contacts.watched(t);
+        for (own, dependence) in (structure.subtrees().iter()).zip(&self.dependences.subtrees) {
+            let unwatched = own.contacts.difference(&watched);
+            if own.sensors.is_empty() || unwatched.is_empty() {
+                continue;
+            }
+            let (reason, cause) = validity.reason_and_cause(dependence);
+            if reason != Reason::None {
+                self.unwatched.push((unwatched, reason, cause));
+            }
+        }
         let solved = residuals::Solved {
             t,
             structure: &self.setup.robot.structure,
@@ -145,6 +159,7 @@ impl Pipeline {
             base_fault: self.base_fault,
             lost: self.contacts.lost(),
             detected,
+            unwatched: &self.unwatched,
         };
         let results = self
             .solver

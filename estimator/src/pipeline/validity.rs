@@ -49,6 +49,9 @@ pub(crate) struct ValidityCheck<'a> {
     pub(crate) lost: &'a [u32],
     /// The contacts that F/T readings show: they are known to be present.
     pub(crate) detected: ContactSet,
+    /// Contacts that nobody declares and no skin feels, where F/T readings can not show them: why
+    /// not, and the channel.
+    pub(crate) unwatched: &'a [(ContactSet, Reason, u32)],
 }
 
 impl ValidityCheck<'_> {
@@ -81,6 +84,14 @@ impl ValidityCheck<'_> {
             let lost = lost.filter_map(|contact| self.lost.get(contact).copied());
             if let Some(skin) = lost.filter(|skin| *skin != NO_CAUSE).min() {
                 found = (Reason::Stale, skin);
+            }
+        }
+        if found.0 == Reason::None {
+            let absent = &dependence.absent;
+            let mut unwatched = self.unwatched.iter();
+            let blind = unwatched.find(|(own, ..)| !absent.intersection(own).is_empty());
+            if let Some((_, reason, cause)) = blind {
+                found = (*reason, *cause);
             }
         }
         found

@@ -346,8 +346,9 @@ impl Bank {
 
     /// Sets the doubts about the torques of a solution, which is in use. Torques that can not be
     /// compared keep theirs. `disturbed` are the components whose rows are rejected, a bit each:
-    /// what was learnt does not explain their readings.
-    pub(crate) fn doubt(&mut self, solution: &mut Solution, disturbed: u64) {
+    /// what was learnt does not explain their readings. Of those that begin `anew` nothing is
+    /// known.
+    pub(crate) fn doubt(&mut self, solution: &mut Solution, disturbed: u64, anew: u64) {
         let Self {
             place,
             units,
@@ -374,7 +375,7 @@ impl Bank {
             // The first postures of a motion do not show yet what is wrong, nor how far apart the
             // torques will be.
             let learnt = solution.components[unit.component].motion;
-            let is_begun = learnt > 0.0 && learnt < BEGUN;
+            let is_begun = learnt > 0.0 && learnt < BEGUN || anew & bit(unit.component) != 0;
             let is_shown = unit.fits[0].ticks() >= SHOWN && disturbed & bit(unit.component) == 0;
             if is_doubtful || is_begun || !is_settled {
                 let beyond = place.dofs(&measured_with(unit, units), None);

@@ -107,6 +107,10 @@ pub(crate) struct Component {
     pub(crate) cosines: Vec<f64>,
     /// Whether the solution in use may judge rows.
     pub(crate) may_judge: bool,
+    /// A sensor has a new zero: nothing is observed before the next job, which begins without it.
+    pub(crate) waits: bool,
+    /// Whether the solution in use is from before that job.
+    pub(crate) is_outdated: bool,
     pub(crate) paused: Paused,
     pub(crate) last_change: Option<Change>,
     pub(crate) counts: Counts,
@@ -268,6 +272,8 @@ impl Component {
             directions: vec![Vec3::zeros(); sensors.len()],
             cosines: vec![1.0; sensors.len()],
             may_judge: false,
+            waits: false,
+            is_outdated: false,
             paused: Paused::No,
             last_change: None,
             counts: Counts::default(),
@@ -313,6 +319,24 @@ impl Component {
         }
     }
 
+    /// Forgets the offset of the sensor at this place, and keeps what is known of all else.
+    pub(crate) fn forget_offset(&mut self, place: usize) {
+        self.join();
+        let columns: [usize; 6] = std::array::from_fn(|axis| 6 * place + axis);
+        // The columns exist.
+        let _ = self.information.marginalise(&columns);
+        self.gathered.clear();
+        self.pending.clear();
+        (self.waits, self.is_outdated, self.may_judge) = (true, true, false);
+        (self.is_disturbed, self.is_persistent) = (false, false);
+        self.paused = Paused::No;
+        // A contact may be there since: that is to be seen by another motion.
+        (self.motion, self.rows) = (0.0, 0);
+        self.last_change = Some(Change::Offset);
+        self.counts.changes += 1;
+        self.counts.offset_changes += 1;
+    }
+
     pub(crate) fn observe(
         &mut self,
         seen: &Observation<'_>,
@@ -321,6 +345,10 @@ impl Component {
         slot: i64,
     ) {
         let t = seen.t;
+        if self.waits {
+            (self.block_from, self.last_drift) = (t, t);
+            return;
+        }
         if self.block_from == Nanos::MIN {
             (self.block_from, self.last_drift) = (t, t);
         }

@@ -55,6 +55,8 @@ pub(crate) struct Part {
     pub(crate) learnt: Rows,
     pub(crate) rejected_rows: Rows,
     pub(crate) is_disturbed: bool,
+    /// Whether a sensor's offset was forgotten since the solution in use.
+    pub(crate) has_new_zero: bool,
     /// Whether something moved in this second.
     pub(crate) is_moving: bool,
     /// [`Component::cosines`].
@@ -139,6 +141,7 @@ impl Part {
             learnt: component.learnt.clone_room(),
             rejected_rows: component.rejected_rows.clone_room(),
             is_disturbed: false,
+            has_new_zero: false,
             is_moving: false,
             cosines: component.cosines.clone(),
             variances: component.variances.clone(),
@@ -409,7 +412,7 @@ impl Part {
         self.before = Some((sensitivities, bodies.to_vec()));
         for (channel, own) in self.channels.iter_mut().enumerate() {
             // An offset jump is no drift.
-            if self.change.is_some() {
+            if self.change.is_some() || self.has_new_zero {
                 own.interrupt();
             }
             let seen = || {
@@ -666,11 +669,18 @@ impl Job {
         for (number, part) in self.parts.iter().enumerate() {
             if let Some((change, _)) = part.change {
                 self.bank.forget(number, change);
+            } else if part.has_new_zero {
+                // A contact may be there since: that again is to be refuted.
+                self.bank.forget(number, Change::Anew);
             }
         }
-        let disturbed = (self.parts.iter().enumerate()).filter(|(_, part)| part.is_disturbed);
-        let disturbed = bank::bits(disturbed.map(|(number, _)| number));
-        self.bank.doubt(&mut self.solution, disturbed);
+        let those = |is: fn(&Part) -> bool| {
+            let those = (self.parts.iter().enumerate()).filter(|(_, part)| is(part));
+            bank::bits(those.map(|(number, _)| number))
+        };
+        let disturbed = those(|part| part.is_disturbed);
+        let anew = those(|part| part.has_new_zero);
+        self.bank.doubt(&mut self.solution, disturbed, anew);
     }
 
     /// The result.
