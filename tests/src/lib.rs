@@ -18,8 +18,10 @@
 mod arm;
 mod browser;
 pub mod can;
+pub mod chain;
 pub mod fuzz;
 mod process;
+pub mod promise;
 pub mod truth;
 pub mod watch;
 

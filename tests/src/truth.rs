@@ -6,103 +6,31 @@
 //!                                            -> readings -> trouble -> Pipeline -> judged
 //! ```
 //!
-//! **The promise.** A valid torque is within four stated deviations of the truth, or within 1 % of
-//! the joint's range (at least .02 Nm). A run breaks it if more than one of a thousand torques do.
-//! **Use.** In a run without trouble 95 % of the torques are valid from ten seconds after the first
-//! motion on.
+//! What is promised, and what use is, [`crate::promise`] tells.
 //!
 //! One seed is one run. The short set of `tests/truth.rs` runs with the other tests; the long one
 //! is `cargo run --release -p proprio-tests --bin truth`.
 
-mod random;
-mod robot;
+pub(crate) mod random;
+pub(crate) mod robot;
 mod trouble;
 mod world;
 
+pub use crate::promise::Outcome;
 pub use trouble::{Defect, TROUBLES, Trouble, When};
 
+use crate::promise::Judge;
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
 use proprio_identification::robot::ChannelRole;
-use proprio_topics::{Imu, JointState, Kind, NO_CAUSE, Nanos, Quality, Reading, Wrench};
+use proprio_topics::{Imu, JointState, Kind, Nanos, Quality, Reading, Wrench};
 use random::Random;
 use robot::Robot;
-use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 use std::fmt::Write as _;
 use toml::Table;
 use trouble::Series;
 use world::{DURATION, World};
-
-/// Deviations within which a valid torque is.
-const DEVIATIONS: f64 = 4.0;
-/// The part of a joint's range that need not be covered, and its least \[Nm\].
-const SMALL: (f64, f64) = (0.01, 0.02);
-/// The share of a run's torques that may break the promise: four deviations are exceeded once in
-/// 16,000 times by chance, but errors last for a while.
-const FEW: f64 = 1e-3;
-
-/// A valid torque that is not true.
-#[derive(Debug, Clone)]
-pub struct Worst {
-    /// The joint.
-    pub joint: String,
-    /// When \[s\].
-    pub t: f64,
-    /// Its error \[Nm\].
-    pub error: f64,
-    /// Its error in stated deviations.
-    pub deviations: f64,
-    /// Its error as a part of the joint's range.
-    pub share: f64,
-}
-
-/// What a run showed.
-#[derive(Debug, Clone)]
-pub struct Outcome {
-    /// The robot, in words.
-    pub robot: String,
-    /// Torques: all; valid; valid and not true.
-    pub torques: [usize; 3],
-    /// Torques from ten seconds after the first motion on: all; valid.
-    pub late: [usize; 2],
-    /// The largest error of a valid torque that is not true.
-    pub worst: Option<Worst>,
-    /// The median deviation of late valid torques, as a part of the joint's range.
-    pub deviation: f64,
-    /// Why torques were withheld, and how often.
-    pub withheld: BTreeMap<String, usize>,
-    /// The channel that has the trouble.
-    pub channel: Option<String>,
-}
-
-impl Outcome {
-    /// Whether the promise is broken.
-    #[must_use]
-    pub fn is_broken(&self) -> bool {
-        let [all, _, bad] = self.torques;
-        bad as f64 > FEW * all as f64
-    }
-
-    /// The share of withheld torques that name the channel that has the trouble; NaN if there is
-    /// none, or if no torque is withheld.
-    #[must_use]
-    pub fn named(&self) -> f64 {
-        let Some(channel) = &self.channel else {
-            return f64::NAN;
-        };
-        let own = self.withheld.iter();
-        let own = own.filter(|(why, _)| why.split_once(':').is_some_and(|(_, c)| c == channel));
-        let all: usize = self.withheld.values().sum();
-        own.map(|(_, count)| count).sum::<usize>() as f64 / all as f64
-    }
-
-    /// The share of late torques that are valid.
-    #[must_use]
-    pub fn use_of(&self) -> f64 {
-        self.late[1] as f64 / self.late[0].max(1) as f64
-    }
-}
 
 /// The readings of a run.
 pub struct Run {
@@ -217,15 +145,14 @@ impl Run {
             .map(|(_, name)| name.into())
             .collect();
         let joints: Vec<String> = self.setup.robot.joint_names().map(Into::into).collect();
-        let mut judge = Judge::new(joints, names, &mut self.world);
+        let (begin, world) = (self.world.rest + 10.0, &mut self.world);
+        let mut truth = |t: f64| world.at(t).torque;
+        let mut judge = Judge::new(joints, names, &mut truth, DURATION, begin);
         let mut pipeline = Pipeline::new(self.setup);
         let mut drain = |pipeline: &mut Pipeline| {
             while let Some(estimate) = pipeline.poll() {
-                judge.on_estimate(
-                    estimate.t.seconds(),
-                    estimate.torques.joints(),
-                    &mut self.world,
-                );
+                let torques = estimate.torques.joints();
+                judge.on_estimate(estimate.t.seconds(), torques, &mut truth);
                 if let Some(mut job) = pipeline.take_job() {
                     job.run();
                     pipeline.give_back(job);
@@ -244,106 +171,6 @@ impl Run {
         pipeline.finish();
         drain(&mut pipeline);
         judge.outcome(self.robot.name, self.channel)
-    }
-}
-
-/// Compares torques with the truth.
-struct Judge {
-    joints: Vec<String>,
-    channels: Vec<String>,
-    small: Vec<f64>,
-    ranges: Vec<f64>,
-    begin: f64,
-    deviations: Vec<f64>,
-    outcome: Outcome,
-}
-
-impl Judge {
-    fn new(joints: Vec<String>, channels: Vec<String>, world: &mut World) -> Self {
-        let mut least = vec![f64::INFINITY; joints.len()];
-        let mut most = vec![f64::NEG_INFINITY; joints.len()];
-        for step in 0..200 {
-            let truth = world.at(DURATION / 200.0 * f64::from(step)).torque;
-            for (torque, (least, most)) in truth.iter().zip(least.iter_mut().zip(&mut most)) {
-                (*least, *most) = (least.min(*torque), most.max(*torque));
-            }
-        }
-        let ranges: Vec<f64> = (least.iter().zip(&most))
-            .map(|(a, b)| b - a + 0.1 * a.abs().max(b.abs()))
-            .collect();
-        let small = ranges.iter().map(|range| SMALL.1.max(SMALL.0 * range));
-        Self {
-            small: small.collect(),
-            joints,
-            channels,
-            ranges,
-            begin: world.rest + 10.0,
-            deviations: Vec::new(),
-            outcome: Outcome {
-                robot: String::new(),
-                torques: [0; 3],
-                late: [0; 2],
-                worst: None,
-                deviation: f64::NAN,
-                withheld: BTreeMap::new(),
-                channel: None,
-            },
-        }
-    }
-
-    fn on_estimate(&mut self, t: f64, torques: &[proprio_topics::JointTorque], world: &mut World) {
-        let truth = world.at(t).torque;
-        for (joint, (torque, truth)) in torques.iter().zip(truth).enumerate() {
-            let is_late = t > self.begin;
-            self.outcome.torques[0] += 1;
-            self.outcome.late[0] += usize::from(is_late);
-            if torque.valid != 1 {
-                let word = torque.reason.get().map_or("?", |reason| reason.word());
-                let cause = match torque.cause {
-                    NO_CAUSE => String::new(),
-                    cause => format!(":{}", self.channels[cause as usize]),
-                };
-                *(self.outcome.withheld.entry(format!("{word}{cause}"))).or_default() += 1;
-                continue;
-            }
-            self.outcome.torques[1] += 1;
-            if is_late {
-                self.outcome.late[1] += 1;
-                self.deviations
-                    .push(torque.standard_deviation / self.ranges[joint]);
-            }
-            let error = (torque.torque - truth).abs();
-            let deviations = error / torque.standard_deviation;
-            // A value that is not finite is no true one.
-            let is_true = deviations <= DEVIATIONS || error <= self.small[joint];
-            if !is_true {
-                self.outcome.torques[2] += 1;
-                let share = error / self.ranges[joint];
-                if self
-                    .outcome
-                    .worst
-                    .as_ref()
-                    .is_none_or(|worst| share > worst.share)
-                {
-                    self.outcome.worst = Some(Worst {
-                        joint: self.joints[joint].clone(),
-                        t,
-                        error,
-                        deviations,
-                        share,
-                    });
-                }
-            }
-        }
-    }
-
-    fn outcome(mut self, robot: String, channel: Option<String>) -> Outcome {
-        (self.outcome.robot, self.outcome.channel) = (robot, channel);
-        self.deviations.sort_by(f64::total_cmp);
-        if let Some(median) = self.deviations.get(self.deviations.len() / 2) {
-            self.outcome.deviation = *median;
-        }
-        self.outcome
     }
 }
 
@@ -460,68 +287,5 @@ fn reading(kind: Kind, values: &[f64]) -> Reading {
             position: values[0],
             ..JointState::ABSENT
         }),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use proprio_topics::{JointTorque, Reason};
-
-    /// An estimate of each joint that is off by so many of its deviations, which are a part of its
-    /// range.
-    fn judged(deviations: f64, part: f64) -> Outcome {
-        let Run {
-            setup, mut world, ..
-        } = Run::new(2, Trouble::None).expect("a run");
-        let names: Vec<String> = setup.robot.joint_names().map(Into::into).collect();
-        let mut judge = Judge::new(names, vec!["one".into()], &mut world);
-        let t = world.rest + 11.0;
-        let truth = world.at(t).torque;
-        let mut torques: Vec<JointTorque> = (truth.iter().zip(&judge.ranges))
-            .map(|(truth, range)| JointTorque {
-                torque: truth + deviations * part * range,
-                standard_deviation: part * range,
-                valid: 1,
-                reason: Reason::None.into(),
-                ..JointTorque::ABSENT
-            })
-            .collect();
-        judge.on_estimate(t, &torques, &mut world);
-        torques.truncate(1);
-        torques[0] = JointTorque {
-            cause: 0,
-            reason: Reason::Stale.into(),
-            ..JointTorque::ABSENT
-        };
-        judge.on_estimate(t, &torques, &mut world);
-        judge.outcome("a robot".into(), None)
-    }
-
-    #[test]
-    fn what_is_far_off_and_valid_is_not_true() {
-        for (deviations, part, is_true) in [
-            (3.9, 0.1, true),
-            (-3.9, 0.1, true),
-            (4.1, 0.1, false),
-            (-4.1, 0.1, false),
-            // Within the small part of the range.
-            (9.0, 0.0005, true),
-            (100.0, 0.005, false),
-            (f64::NAN, 0.1, false),
-        ] {
-            let outcome = judged(deviations, part);
-            let valid = outcome.torques[1];
-            let bad = if is_true { 0 } else { valid };
-            assert_eq!(
-                outcome.torques,
-                [valid + 1, valid, bad],
-                "{deviations} {part}"
-            );
-            assert_eq!(outcome.late, [valid + 1, valid]);
-            assert_eq!(outcome.is_broken(), !is_true);
-            assert_eq!(outcome.withheld, [("stale:one".to_owned(), 1)].into());
-            assert!((outcome.deviation - part).abs() < 1e-12 || !is_true);
-        }
     }
 }

@@ -2672,15 +2672,30 @@ fn reasons(place: &Place) -> BTreeMap<String, usize> {
     counts
 }
 
+/// Whether the machine let the processes of a demonstration keep up. If not, samples are late or
+/// lost, and torques are withheld as they must be: then nothing can be said of their share.
+fn has_kept_up(summary: &serde_json::Value) -> bool {
+    let buses = summary["simulator"]["buses"].as_array().unwrap();
+    let in_time = buses.iter().all(|bus| bus["skipped"] == 0);
+    let has_kept_up = in_time && summary["latency_us"]["p99"].as_f64().unwrap() < 1000.0;
+    if !has_kept_up {
+        println!("this machine is busy, so shares and reasons are not compared: {summary}");
+    }
+    has_kept_up
+}
+
 #[test]
 fn a_demonstration_ends_well_and_leaves_nothing_behind() {
     let place = Place::new();
     let summary = demo(&place, 12.0, &["--seed", "4"]);
-    assert_eq!(summary["lost"], 0, "{summary}");
+    let has_kept_up = has_kept_up(&summary);
     assert_eq!(summary["seed"], 4);
     browse(&place.path("d/report.html"));
-    // Until motion has confirmed the setup, torques are uncertain and withheld.
-    assert!(summary["valid_share"].as_f64().unwrap() > 0.1, "{summary}");
+    if has_kept_up {
+        assert_eq!(summary["lost"], 0, "{summary}");
+        // Until motion has confirmed the setup, torques are uncertain and withheld.
+        assert!(summary["valid_share"].as_f64().unwrap() > 0.1, "{summary}");
+    }
     // Their figures rest on the valid ones alone.
     for (joint, error) in summary["torque_rms_error_nm"].as_object().unwrap() {
         let count = summary["valid_estimates"][joint].as_u64().unwrap();
@@ -2709,11 +2724,12 @@ fn a_demonstration_ends_well_and_leaves_nothing_behind() {
         7,
         "{summary}"
     );
+    let expected = |reason: &String| {
+        let words = ["starting", "stale", "implausible"];
+        reason == "uncertain" || words.iter().any(|word| reason.starts_with(word))
+    };
     assert!(
-        reasons(&place).keys().all(|r| r == "uncertain"
-            || ["starting", "stale", "implausible"]
-                .iter()
-                .any(|word| r.starts_with(word))),
+        !has_kept_up || reasons(&place).keys().all(expected),
         "{:?}",
         reasons(&place)
     );
@@ -2730,18 +2746,15 @@ fn a_demonstration_of_other_boards_ends_well() {
         let place = Place::new();
         let more = ["--robot", robot, "--seed", "4", "--cad-error", "0"];
         let summary = demo_of(joints, &place, 12.0, &more);
-        assert_eq!(summary["lost"], 0, "{summary}");
-        // From about four seconds of motion on, and while nothing is declared to push.
-        assert!(summary["valid_share"].as_f64().unwrap() > 0.1, "{summary}");
         let log = place.read("d/gateway.log");
         assert!(log.matches("INFO streaming").count() > joints, "{log}");
         assert!(!log.contains("panicked"), "{log}");
-        let buses = summary["simulator"]["buses"].as_array().unwrap();
-        let in_time = buses.iter().all(|bus| bus["skipped"] == 0);
-        if !in_time || summary["latency_us"]["p99"].as_f64().unwrap() > 1000.0 {
-            println!("{robot}: this machine is busy, so torques are not compared");
+        if !has_kept_up(&summary) {
             continue;
         }
+        assert_eq!(summary["lost"], 0, "{summary}");
+        // From about four seconds of motion on, and while nothing is declared to push.
+        assert!(summary["valid_share"].as_f64().unwrap() > 0.1, "{summary}");
         for (joint, error) in summary["torque_rms_error_nm"].as_object().unwrap() {
             // Withheld throughout in so short a run: no figure.
             let Some(error) = error.as_f64() else {

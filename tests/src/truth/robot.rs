@@ -11,17 +11,17 @@ use toml::{Table, Value};
 
 /// A robot and what the estimator is told of it.
 #[derive(Debug, Clone)]
-pub(super) struct Robot {
+pub(crate) struct Robot {
     /// In words.
-    pub(super) name: String,
+    pub(crate) name: String,
     /// estimator.toml, with unknown offsets; `model` names no file.
-    pub(super) config: Table,
+    pub(crate) config: Table,
     /// The URDF.
-    pub(super) urdf: String,
+    pub(crate) urdf: String,
     /// The URDF's model.
-    pub(super) cad: Model,
+    pub(crate) cad: Model,
     /// The links that may be touched.
-    pub(super) tips: Vec<String>,
+    pub(crate) tips: Vec<String>,
 }
 
 /// Where an F/T sensor is in a limb: before this joint; after the last one if there is none.
@@ -29,7 +29,7 @@ const PLACES: [&[f64]; 5] = [&[0.0], &[0.5], &[1.0], &[0.0, 1.0], &[0.5, 0.5]];
 
 impl Robot {
     /// Of three seeds one is that of a shipped arm, the others are trees at random.
-    pub(super) fn new(seed: u64) -> Self {
+    pub(crate) fn new(seed: u64) -> Self {
         match seed % 6 {
             1 => Self::shipped("six_axis_arm"),
             4 => Self::shipped("icub_left_arm"),
@@ -197,13 +197,13 @@ impl Robot {
     }
 
     /// The configuration.
-    pub(super) fn config(&self) -> Config {
+    pub(crate) fn config(&self) -> Config {
         let text = self.config.to_string();
         Config::parse(&text).unwrap_or_else(|e| panic!("{e}\n{text}"))
     }
 
     /// The true bodies: those of the URDF, wrong by about the fraction `size`.
-    pub(super) fn bodies(&self, size: f64, random: &mut Random) -> Model {
+    pub(crate) fn bodies(&self, size: f64, random: &mut Random) -> Model {
         let mut truth = self.cad.clone();
         for (link, body) in self.cad.inertias().iter().enumerate() {
             let Some(centre) = body.centre().filter(|_| body.mass > 1e-6) else {
@@ -224,7 +224,7 @@ impl Robot {
 }
 
 /// The tables of an array of the configuration.
-pub(super) fn tables<'a>(
+pub(crate) fn tables<'a>(
     config: &'a mut Table,
     name: &str,
 ) -> impl Iterator<Item = &'a mut Table> + use<'a> {
@@ -239,7 +239,7 @@ fn tables_mut<'a>(config: &'a mut Table, name: &str) -> &'a mut Vec<Value> {
     array.as_array_mut().expect("an array")
 }
 
-pub(super) fn numbers(v: Vec3) -> Value {
+pub(crate) fn numbers(v: Vec3) -> Value {
     let v: [f64; 3] = v.into();
     v.to_vec().into()
 }

@@ -1,0 +1,584 @@
+//! Frames to torques, under fault, from a seed: the gateway's half of [`crate::truth`].
+//!
+//! ```text
+//! seed -> Rig: a robot at random, its boards of families at random (gateway.toml, estimator.toml)
+//! boards <-> Wire (faults) <-> Bus (devices) -> shared memory -> Pipeline -> judged
+//! ```
+//!
+//! Everything between the wire and the judge is the program itself: the gateway's loop with its
+//! devices, ports in shared memory, the estimator's pipeline with identification. Time is
+//! simulated, so that one seed is one run.
+//!
+//! What must hold under every fault: valid torques are true ([`crate::promise`]); nothing stale is
+//! fresh: a good reading is the truth at its stamp; all frames and samples are accounted for.
+//!
+//! The short set of `tests/chain.rs` runs with the other tests; the long one is `cargo run
+//! --release -p proprio-tests --bin chain`.
+
+mod rig;
+mod wire;
+
+pub use crate::promise::Outcome;
+pub use rig::{FAMILIES, Family};
+pub use wire::Fault;
+
+use crate::promise::Judge;
+use crate::truth::random::Random;
+use proprio_estimator::pipeline::Pipeline;
+use proprio_gateway::bus::Bus;
+use proprio_gateway::clock::Clock;
+use proprio_gateway::decoder::{Decoder, build};
+use proprio_gateway::plan::{ChannelPlan, DevicePlan, Plan};
+use proprio_gateway::publish::Shared;
+use proprio_gateway::status::BusStatus;
+use proprio_simulator::fault::{Fault as BoardFault, Window};
+use proprio_simulator::{Settings, Simulation};
+use proprio_topics::ipc::{Domain, DomainConfig, Reader, Renewal, Writer};
+use proprio_topics::{
+    Counter, DeviceHealth, DeviceState, Kind, NO_CAUSE, Nanos, Quality, Reading, Sample,
+};
+use rig::{REST, Rig};
+use std::path::Path;
+use std::sync::atomic::Ordering::Relaxed;
+use std::sync::{Arc, Mutex};
+use wire::{End, Planned, SimulatedClock, Wire};
+
+/// Duration of a run \[s\].
+pub const DURATION: f64 = 40.0;
+/// When a fault is present \[s\].
+const PRESENT: (f64, f64) = (20.0, 30.0);
+/// When the boards are powered: not at zero, which a stamp would be by mistake.
+const START: Nanos = Nanos::from_millis(5_000);
+/// Samples are passed to the estimator so often: as fast as a thread is woken.
+const SLICE: Nanos = Nanos::from_millis(1);
+/// How long a killed gateway is away \[s\].
+const AWAY: f64 = 0.5;
+
+/// Old frames of a device that is asked for each reading: the most of those that are taken for the
+/// answer, because they come between a request and it. A device that streams gives no sign.
+const TAKEN: f64 = 0.25;
+
+/// How far a good reading may be off the truth at its stamp: resolution and noise of the coarsest
+/// family \[rad\], \[N\], \[Nm\], \[m/s^2\], \[rad/s\].
+const OFF: [f64; 5] = [2.5e-3, 1.2, 0.06, 0.3, 0.05];
+/// How much earlier than its stamp it may have been measured \[s\]: frames wait for each other on
+/// the bus.
+const BEFORE: f64 = 4e-3;
+
+/// What a run showed.
+#[derive(Debug, Clone)]
+pub struct Shown {
+    /// The judge of torques.
+    pub outcome: Outcome,
+    /// Good readings: compared with the truth; off.
+    pub readings: [u64; 2],
+    /// The first reading that is off.
+    pub first: Option<String>,
+    /// Whatever is not accounted for.
+    pub missing: Vec<String>,
+    /// Frames that the gateway got.
+    pub frames: u64,
+    /// Good readings that may be off: old frames that nothing tells from new ones.
+    pub excused: u64,
+    /// Devices that do not stream at the end.
+    pub silent: Vec<String>,
+    /// The share of valid torques: before the fault, while it is present, and in the last five
+    /// seconds.
+    pub valid: [f64; 3],
+    /// Torques that are withheld because of a channel, while the fault is present: all; because of
+    /// one that the fault concerns.
+    pub named: [u64; 2],
+}
+
+impl Shown {
+    /// Whether something that must hold does not.
+    #[must_use]
+    pub fn is_broken(&self) -> bool {
+        self.outcome.is_broken()
+            || self.readings[1] > self.excused
+            || !self.missing.is_empty()
+            || !self.silent.is_empty()
+    }
+}
+
+/// Runs the robot of `seed`, with a `fault` in a device of `family` or on its bus; `None` if the
+/// robot has no such device.
+///
+/// # Panics
+/// If the robot cannot be simulated.
+#[must_use]
+pub fn run(seed: u64, family: Family, fault: Fault) -> Option<Shown> {
+    let folder = tempfile::tempdir().expect("a folder");
+    let random = Random::new(seed, "fault");
+    let settings = |plan: &Plan| {
+        let target = device_of(plan, family.kind, &mut random.clone());
+        let name = |(bus, device): (usize, usize)| plan.buses[bus].devices[device].name.clone();
+        Settings {
+            seed,
+            still: REST,
+            push: seed.is_multiple_of(2),
+            cycle: DURATION,
+            noise: true,
+            faults: target.map_or_else(Vec::new, |target| board_fault(fault, name(target))),
+        }
+    };
+    let rig = Rig::new(seed, family, settings, START, folder.path())?;
+    Some(Chain::new(rig, seed, fault, family, folder.path()).run())
+}
+
+/// A device that measures `kind`: its bus and number.
+fn device_of(plan: &Plan, kind: Kind, random: &mut Random) -> Option<(usize, usize)> {
+    let all: Vec<(usize, usize)> = (plan.channels.iter())
+        .filter(|channel| channel.kind == kind)
+        .map(|channel| (channel.bus, channel.device))
+        .collect();
+    (!all.is_empty()).then(|| all[random.below(all.len())])
+}
+
+/// The fault that the board itself has.
+fn board_fault(fault: Fault, device: String) -> Vec<BoardFault> {
+    let (from, until) = PRESENT;
+    match fault {
+        Fault::Stuck => vec![BoardFault::Freeze {
+            device,
+            window: Window { from, until },
+        }],
+        Fault::Reboot => vec![BoardFault::Reboot { device, at: from }],
+        _ => Vec::new(),
+    }
+}
+
+fn at(t: f64) -> Nanos {
+    START + Nanos::from_seconds(t)
+}
+
+/// The gateway's side of one bus.
+struct Running {
+    bus: Bus<Shared>,
+    status: Arc<BusStatus>,
+    /// What the wire had delivered when it was started.
+    before: u64,
+}
+
+/// All processes of the robot.
+struct Chain {
+    plan: Plan,
+    simulation: Simulation,
+    fault: Fault,
+    family: Family,
+    /// Bus and number of the device that has it.
+    target: (usize, usize),
+    clocks: Vec<SimulatedClock>,
+    wires: Vec<End>,
+    /// None while the gateway is killed.
+    buses: Vec<Running>,
+    /// Samples of gateways that have ended.
+    published: u64,
+    domain: Domain,
+    reader: Reader<Sample>,
+    inbox: Vec<Sample>,
+    /// Per channel of the gateway, the pipeline's.
+    map: Vec<Option<usize>>,
+    pipeline: Pipeline,
+    judge: Judge,
+    name: String,
+    /// Torques before, during and after the fault: all, valid.
+    phases: [[u64; 2]; 3],
+    named: [u64; 2],
+    /// Per channel of the pipeline, whether the fault concerns it.
+    concerned: Vec<bool>,
+    /// Per channel of the gateway, a wrench sensor's zero.
+    zeros: Vec<Option<[f64; 6]>>,
+    readings: [u64; 2],
+    first: Option<String>,
+    missing: Vec<String>,
+}
+
+impl Chain {
+    fn new(rig: Rig, seed: u64, fault: Fault, family: Family, folder: &Path) -> Self {
+        let kind = family.kind;
+        let target = device_of(&rig.plan, kind, &mut Random::new(seed, "fault")).expect("one");
+        let Rig {
+            name,
+            setup,
+            plan,
+            mut simulation,
+            boards,
+        } = rig;
+        let domain = Domain::open(&DomainConfig::new(folder, "chain")).expect("a domain");
+        let clocks: Vec<_> = plan
+            .buses
+            .iter()
+            .map(|_| SimulatedClock::at(START))
+            .collect();
+        let device = &plan.buses[target.0].devices[target.1];
+        let claims = build(device, None).expect("a device").claims().to_vec();
+        let wires = boards
+            .into_buses()
+            .into_iter()
+            .enumerate()
+            .map(|(bus, boards)| {
+                let planned = Planned {
+                    fault,
+                    from: at(PRESENT.0),
+                    until: at(PRESENT.1),
+                    claims: claims.clone(),
+                };
+                let planned = if bus == target.0 {
+                    vec![planned]
+                } else {
+                    Vec::new()
+                };
+                let random = Random::new(seed, &format!("wire {bus}"));
+                let wire = Wire::new(boards, planned, clocks[bus].clone(), random);
+                End(Arc::new(Mutex::new(wire)))
+            });
+        let wires = wires.collect();
+        let joints = setup.robot.joint_names().map(Into::into).collect();
+        let names = setup.channels().map(|(_, name)| name.into()).collect();
+        let mut truth = |t: f64| torques(&mut simulation, t);
+        let judge = Judge::new(joints, names, &mut truth, DURATION, REST + 10.0);
+        let map: Vec<Option<usize>> = plan
+            .channels
+            .iter()
+            .map(|c| setup.channel(c.kind, &c.name))
+            .collect();
+        let is_concerned = |name: &str| {
+            let mut own = plan.channels.iter().filter(|c| c.name == name);
+            own.any(|c| c.bus == target.0 && (!fault.is_of_device() || c.device == target.1))
+        };
+        let concerned = setup
+            .channels()
+            .map(|(_, name)| is_concerned(name))
+            .collect();
+        // The topic is there as long as it has a port.
+        let first = Writer::<Sample>::create(&domain, &plan.robot, 0).expect("a port");
+        let reader = Reader::open(&domain, &plan.robot).expect("a port");
+        drop(first);
+        let mut this = Self {
+            plan,
+            simulation,
+            fault,
+            family,
+            target,
+            clocks,
+            wires,
+            buses: Vec::new(),
+            published: 0,
+            domain,
+            reader,
+            inbox: Vec::new(),
+            pipeline: Pipeline::new(setup),
+            judge,
+            name,
+            phases: [[0; 2]; 3],
+            named: [0; 2],
+            concerned,
+            zeros: vec![None; map.len()],
+            map,
+            readings: [0; 2],
+            first: None,
+            missing: Vec::new(),
+        };
+        this.start(1);
+        this
+    }
+
+    /// Starts the gateway.
+    fn start(&mut self, epoch: u64) {
+        for (number, plan) in (0..).zip(&self.plan.buses) {
+            let status = Arc::new(BusStatus::new(number, plan));
+            let decoder = Decoder::new(number, plan, None, Arc::clone(&status)).expect("devices");
+            let writer = Writer::create(&self.domain, &self.plan.robot, epoch).expect("a port");
+            let sink = Shared::new(writer, &self.plan.robot, Arc::new(Renewal::default()));
+            let end = self.wires[number as usize].clone();
+            self.buses.push(Running {
+                before: end.with(|wire| wire.passed.delivered),
+                bus: Bus::new(Box::new(end), decoder, sink, Arc::clone(&status)),
+                status,
+            });
+        }
+    }
+
+    /// Ends it; all that it has taken must be accounted for.
+    fn kill(&mut self) {
+        for (running, end) in self.buses.drain(..).zip(&self.wires) {
+            let status = running.status;
+            let delivered = end.with(|wire| wire.passed.delivered) - running.before;
+            let frames = status.frames.load(Relaxed);
+            let unclaimed = status.unclaimed.load(Relaxed);
+            let claimed = status
+                .devices()
+                .map(|d| d.counters[Counter::Frames as usize]);
+            let claimed: u64 = claimed.sum();
+            if frames != delivered || claimed + unclaimed < frames {
+                self.missing.push(format!(
+                    "{delivered} frames delivered, {frames} counted, {claimed} for devices, \
+                     {unclaimed} for none"
+                ));
+            }
+            let failures = status.publish_failures.load(Relaxed);
+            if failures > 0 {
+                self.missing
+                    .push(format!("{failures} samples not published"));
+            }
+            self.published += status.published.load(Relaxed);
+        }
+    }
+
+    fn run(mut self) -> Shown {
+        let mut t = START;
+        let (killed, back) = (at(PRESENT.0), at(PRESENT.0 + AWAY));
+        while t < at(DURATION) {
+            t += SLICE;
+            if self.fault == Fault::Restart && t > killed && t <= back {
+                if !self.buses.is_empty() {
+                    self.kill();
+                }
+                self.wires
+                    .iter()
+                    .for_each(|end| end.with(|wire| wire.pass_unheard(t)));
+                if t == back {
+                    self.start(2);
+                }
+                continue;
+            }
+            for ((running, end), clock) in self.buses.iter_mut().zip(&self.wires).zip(&self.clocks)
+            {
+                end.with(|wire| wire.horizon = t);
+                let mut turns = 0;
+                while clock.now() < t {
+                    running.bus.turn(clock);
+                    turns += 1;
+                    assert!(turns < 10_000, "a loop without an end: {}", self.name);
+                }
+            }
+            self.take();
+            if std::env::var_os("DBG").is_some() && (t.0 / 1_000_000) % 1000 == 0 {
+                for (r, end) in self.buses.iter().zip(&self.wires) {
+                    let d = r.status.devices().next().unwrap();
+                    eprintln!(
+                        "{t:?} {:?} {:?} full {} fail {} frames {} {:?}",
+                        d.name,
+                        d.state.get(),
+                        r.status.queue_full.load(Relaxed),
+                        r.status.send_failures.load(Relaxed),
+                        r.status.frames.load(Relaxed),
+                        end.with(|w| w.passed)
+                    );
+                }
+            }
+        }
+        self.finish()
+    }
+
+    /// What the estimator does with the samples that wait.
+    fn take(&mut self) {
+        self.inbox.clear();
+        while let Some(sample) = self.reader.try_take().expect("a port") {
+            self.inbox.push(sample);
+        }
+        self.inbox
+            .sort_unstable_by_key(|s| (s.header.acquired, s.header.bus, s.header.sequence));
+        for at in 0..self.inbox.len() {
+            let sample = self.inbox[at];
+            self.compare(&sample);
+            if let (Some(channel), Some(reading)) =
+                (self.map[sample.channel as usize], sample.reading())
+            {
+                let header = &sample.header;
+                self.pipeline
+                    .push(channel, header.acquired, &reading, header.quality);
+            }
+            self.judge();
+        }
+    }
+
+    fn judge(&mut self) {
+        while let Some(estimate) = self.pipeline.poll() {
+            let t = (estimate.t - START).seconds();
+            let simulation = &mut self.simulation;
+            let joints = estimate.torques.joints();
+            self.judge
+                .on_estimate(t, joints, &mut |t| torques(simulation, t));
+            let (from, until) = PRESENT;
+            let phases = [
+                (REST + 10.0, from),
+                (from + 0.5, until),
+                (DURATION - 5.0, DURATION),
+            ];
+            for (phase, (from, until)) in self.phases.iter_mut().zip(phases) {
+                if from <= t && t < until {
+                    phase[0] += joints.len() as u64;
+                    phase[1] += joints.iter().filter(|joint| joint.valid == 1).count() as u64;
+                }
+            }
+            if from + 0.5 <= t && t < until {
+                for cause in joints
+                    .iter()
+                    .map(|joint| joint.cause)
+                    .filter(|c| *c != NO_CAUSE)
+                {
+                    self.named[0] += 1;
+                    self.named[1] += u64::from(self.concerned[cause as usize]);
+                }
+            }
+            if let Some(mut job) = self.pipeline.take_job() {
+                job.run();
+                self.pipeline.give_back(job);
+            }
+        }
+    }
+
+    /// Compares a good reading with the truth at its stamp.
+    fn compare(&mut self, sample: &Sample) {
+        let noted = Quality::GAP_BEFORE.0 | Quality::DEVICE_COUNTER.0 | Quality::ZERO_CHANGED.0;
+        let channel = &self.plan.channels[sample.channel as usize];
+        let t = (sample.header.acquired - START).seconds();
+        // A fault's last frames arrive later.
+        let is_present = PRESENT.0 <= t && t < PRESENT.1 + 0.3;
+        let is_here = is_present && channel.bus == self.target.0;
+        // Some motors share an identifier: the frames of one may become those of another.
+        let is_bad = is_here && self.fault.is_of_values();
+        let Some(reading) = sample.reading() else {
+            return;
+        };
+        if sample.header.quality.0 & !noted != 0 || is_bad {
+            return;
+        }
+        let lag = BEFORE + if is_here { self.fault.delay() } else { 0.0 };
+        let name = channel.name.clone();
+        let mut least = [f64::INFINITY; 6];
+        let mut most = [f64::NEG_INFINITY; 6];
+        let mut cover = |values: [f64; 6]| {
+            for ((least, most), value) in least.iter_mut().zip(&mut most).zip(values) {
+                (*least, *most) = (least.min(value), most.max(value));
+            }
+        };
+        let (values, off, count) = match reading {
+            Reading::Joint(joint) => {
+                let number = self.simulation.joint(&name).expect("a joint");
+                for k in 0..6 {
+                    let before = lag * f64::from(k) / 4.0 - 0.25 * lag;
+                    let point = self.simulation.motion(number, t - before).expect("a joint");
+                    cover([point.position; 6]);
+                }
+                ([joint.position; 6], [OFF[0]; 6], 1)
+            }
+            Reading::Wrench(wrench) => {
+                let number = self.simulation.wrench(&name).expect("a sensor");
+                for before in [-1e-3, 0.5 * lag, lag] {
+                    cover(self.simulation.at(t - before).wrenches[number]);
+                }
+                let ([fx, fy, fz], [tx, ty, tz]) = (wrench.force, wrench.torque);
+                let (force, torque) = (OFF[1], OFF[2]);
+                let mut values = [fx, fy, fz, tx, ty, tz];
+                // Some sensors take the load at their start for zero, and the gateway knows.
+                let zero = &mut self.zeros[sample.channel as usize];
+                if zero.is_none() || sample.header.quality.contains(Quality::ZERO_CHANGED) {
+                    let middle = |axis: usize| 0.5 * (least[axis] + most[axis]);
+                    *zero = Some(std::array::from_fn(|axis| values[axis] - middle(axis)));
+                }
+                for (value, zero) in values.iter_mut().zip(zero.unwrap_or_default()) {
+                    *value -= zero;
+                }
+                (values, [force, force, force, torque, torque, torque], 6)
+            }
+            Reading::Imu(imu) => {
+                let number = self.simulation.imu(&name).expect("an IMU");
+                for before in [-1e-3, 0.5 * lag, lag] {
+                    let truth = self.simulation.at(t - before).imus[number];
+                    let ([ax, ay, az], [gx, gy, gz]) =
+                        (truth.proper_acceleration, truth.angular_velocity);
+                    cover([ax, ay, az, gx, gy, gz]);
+                }
+                let ([ax, ay, az], [gx, gy, gz]) = (imu.proper_acceleration, imu.angular_velocity);
+                let (along, about) = (OFF[3], OFF[4]);
+                (
+                    [ax, ay, az, gx, gy, gz],
+                    [along, along, along, about, about, about],
+                    6,
+                )
+            }
+            _ => return,
+        };
+        self.readings[0] += 1;
+        for axis in 0..count {
+            let (value, off) = (values[axis], off[axis]);
+            // An absent value is none.
+            if value < least[axis] - off || value > most[axis] + off {
+                self.readings[1] += 1;
+                self.first.get_or_insert_with(|| {
+                    format!(
+                        "{name}, t = {t:.4}: axis {axis} is {value}, and was {} to {}",
+                        least[axis], most[axis]
+                    )
+                });
+                return;
+            }
+        }
+    }
+
+    fn finish(mut self) -> Shown {
+        let is_silent = |(health, plan): &(DeviceHealth, &DevicePlan)| {
+            !plan.routes.is_empty() && health.state.get() != Some(DeviceState::Streaming)
+        };
+        let mut silent = Vec::new();
+        for (running, plan) in self.buses.iter().zip(&self.plan.buses) {
+            let devices = running.status.devices().zip(&plan.devices);
+            silent.extend(devices.filter(is_silent).map(|(_, plan)| plan.name.clone()));
+        }
+        self.kill();
+        let (taken, lost) = (self.reader.taken(), self.reader.lost());
+        if taken + lost != self.published {
+            let published = self.published;
+            self.missing.push(format!(
+                "{published} samples published, {taken} taken, {lost} lost"
+            ));
+        }
+        let (mut frames, mut added) = (0, 0);
+        for end in &self.wires {
+            let (passed, under_way) = end.with(|wire| (wire.passed, wire.under_way()));
+            frames += passed.delivered;
+            added += passed.added;
+            if passed.sent + passed.added != passed.lost + passed.delivered + under_way {
+                self.missing
+                    .push(format!("{passed:?}, {under_way} under way"));
+            }
+        }
+        let excused = match (self.fault, self.family.drops_old) {
+            (Fault::Old, true) => (TAKEN * added as f64) as u64,
+            (Fault::Old, false) => added,
+            _ => 0,
+        };
+        self.pipeline.finish();
+        self.judge();
+        let (bus, device) = self.target;
+        let channels = &self.plan.channels;
+        let is_it = |c: &&ChannelPlan| (c.bus, c.device, c.kind) == (bus, device, self.family.kind);
+        let channel = channels.iter().find(is_it);
+        let channel = channel.map(|channel| channel.name.clone());
+        Shown {
+            outcome: self.judge.outcome(self.name, channel),
+            readings: self.readings,
+            first: self.first,
+            missing: self.missing,
+            excused,
+            frames,
+            silent,
+            named: self.named,
+            valid: self
+                .phases
+                .map(|[all, valid]| valid as f64 / all.max(1) as f64),
+        }
+    }
+}
+
+fn torques(simulation: &mut Simulation, t: f64) -> Vec<f64> {
+    simulation
+        .at(t)
+        .joints
+        .iter()
+        .map(|joint| joint.torque)
+        .collect()
+}

@@ -1,0 +1,86 @@
+//! The short set of [`proprio_tests::chain`]: what holds from the frames to the torques under every
+//! fault.
+#![allow(missing_docs)]
+
+use proprio_tests::chain::{FAMILIES, Family, Fault, Shown, run};
+
+fn family(name: &str) -> Family {
+    let found = FAMILIES.iter().find(|family| family.name == name);
+    *found.unwrap_or_else(|| panic!("{name}"))
+}
+
+fn shown(seed: u64, name: &str, fault: Fault) -> Shown {
+    run(seed, family(name), fault).unwrap_or_else(|| panic!("{name}: no such device"))
+}
+
+/// Every fault of a part of the list, each in another family.
+fn nothing_is_broken(part: usize) {
+    for (number, (name, fault)) in Fault::ALL.iter().enumerate().skip(part).step_by(4) {
+        // A robot on a fixed base has no IMU.
+        let families = FAMILIES.iter().cycle().skip(7 * number);
+        let seed = 1 + number as u64;
+        let one = families.take(FAMILIES.len()).find_map(|family| {
+            let shown = run(seed, *family, *fault)?;
+            Some((family.name, shown))
+        });
+        let (family, shown) = one.expect("some family");
+        assert!(
+            !shown.is_broken(),
+            "{name}, {family}, seed {seed}: {shown:#?}"
+        );
+        assert!(shown.readings[0] > 10_000, "{name}, {family}: {shown:#?}");
+    }
+}
+
+// Four tests, because they run side by side.
+
+#[test]
+fn nothing_is_broken_by_the_first_faults() {
+    nothing_is_broken(0);
+}
+
+#[test]
+fn nothing_is_broken_by_the_second_faults() {
+    nothing_is_broken(1);
+}
+
+#[test]
+fn nothing_is_broken_by_the_third_faults() {
+    nothing_is_broken(2);
+}
+
+#[test]
+fn nothing_is_broken_by_the_fourth_faults() {
+    nothing_is_broken(3);
+}
+
+/// A device that is off withholds what depends on it, is named, and is used again.
+#[test]
+fn a_device_that_is_off_is_named() {
+    for name in ["moteus", "icub_strain"] {
+        let shown = shown(3, name, Fault::Off);
+        let [all, concerned] = shown.named;
+        assert!(all == concerned, "{name}: {shown:#?}");
+        assert!(name != "moteus" || all > 1000, "{name}: {shown:#?}");
+        assert!(shown.valid[0] > 0.8, "{name}: {shown:#?}");
+        assert!(shown.valid[2] > 0.8, "{name}: {shown:#?}");
+    }
+}
+
+/// A sensor that takes the load at its start for zero has another offset after a restart, under a
+/// push that nobody declares as well: its torques are withheld until that is known again.
+#[test]
+fn a_new_zero_is_learnt_anew() {
+    let shown = shown(6, "jr3_can", Fault::Restart);
+    assert!(!shown.is_broken(), "{shown:#?}");
+    assert!(shown.valid[0] > 0.95 && shown.valid[2] > 0.95, "{shown:#?}");
+    assert!(shown.valid[1] < 0.6, "{shown:#?}");
+}
+
+#[test]
+fn one_seed_is_one_run() {
+    let [one, other] = [(); 2].map(|()| shown(3, "moteus", Fault::Loss));
+    assert_eq!(format!("{one:?}"), format!("{other:?}"));
+    let another = shown(4, "moteus", Fault::Loss);
+    assert_ne!(one.frames, another.frames);
+}
