@@ -264,7 +264,7 @@ impl Wire {
                 frame = with_data(&frame, &data);
             }
             Fault::Slow => is_lost = t.seconds() % 0.1 > 0.01,
-            Fault::Delayed => arrival = arrival + Nanos::from_millis(20),
+            Fault::Delayed => arrival += Nanos::from_millis(20),
             Fault::Intermittent => {
                 if t >= self.next_silence {
                     self.silent_until = t + seconds(random, 0.1, 1.0);
@@ -273,7 +273,7 @@ impl Wire {
                 is_lost = t < self.silent_until;
             }
             Fault::Order if random.happens(0.2) => {
-                arrival = arrival + seconds(random, 0.0, 0.4e-3);
+                arrival += seconds(random, 0.0, 0.4e-3);
             }
             Fault::Loss => is_lost = random.happens(0.05),
             Fault::Twice if random.happens(0.05) => again = Some(arrival + FRAME),
