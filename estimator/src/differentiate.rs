@@ -62,8 +62,9 @@
 //! - The square sum of a window's residuals follows from its sums too. It grows with the window,
 //!   and bounds every residual. So residuals are computed only for windows longer than the longest
 //!   for which it is below the square of the tolerance: mostly for none.
-//! - A degree whose windows cannot be long enough is not tried, and unused windows are not
-//!   computed.
+//! - A degree whose windows cannot be long enough is not tried.
+//! - All windows are computed together, one per lane of the processor's vectors: for channels whose
+//!   stamps all differ, as they come from a bus, most of the work is the recurrence.
 //! - The results that depend on stamps alone (sums, recurrence, polynomials at the instant) are
 //!   shared by channels with equal stamps ([`Grid`]).
 //!
@@ -197,11 +198,21 @@ impl<const D: usize> Window<D> {
             .min(SAMPLES);
         // Limited by time, so that a replay which begins later gives the same.
         let stamps = &self.stamps.all()[skipped.min(self.len)..][..known];
-        let count = stamps.partition_point(|stamp| until - *stamp <= self.settings.max_window);
+        let count = self.within(stamps, until);
         std::array::from_fn(|component| {
             let own = &self.roughness_square[component].all()[skipped.min(self.len)..][..count];
             (sum(own) / count.max(1) as f64).sqrt()
         })
+    }
+
+    /// How many of these stamps, newest first, are in the `max_window` up to `until`.
+    fn within(&self, stamps: &[Nanos], until: Nanos) -> usize {
+        let is_within = |stamp: &Nanos| until - *stamp <= self.settings.max_window;
+        // Mostly all are, because the number of samples kept is the limit.
+        match stamps.last().is_some_and(is_within) {
+            true => stamps.len(),
+            false => stamps.partition_point(is_within),
+        }
     }
 
     /// The square of the divided difference of the newest [`DIFFERENCE_SAMPLES`] samples, scaled so
@@ -369,7 +380,7 @@ impl<const D: usize> Window<D> {
             .min(self.settings.capacity)
             .min(self.runs.all()[skipped]);
         let stamps = &self.stamps.all()[skipped..skipped + most];
-        let used = stamps.partition_point(|stamp| newest - *stamp <= self.settings.max_window);
+        let used = self.within(stamps, newest);
         let oldest = stamps[used - 1];
         if t < oldest {
             return Err(Unavailable::Before { by: oldest - t });

@@ -1,6 +1,7 @@
 //! Polynomials orthogonal over the stamps of a window.
 
 use crate::differentiate::estimate::MAX_SAMPLES;
+use pulp::Simd;
 
 /// The number of degrees fitted, from [`FIRST_DEGREE`] up.
 pub(crate) const FITTED: usize = 3;
@@ -38,9 +39,14 @@ pub(crate) const MOMENTS: usize = 2 * TERMS - 1;
 /// is mostly rounding error. With regular stamps it is 0.03 to 1e-5.
 pub(crate) const DEGENERATE: f64 = 1e-12;
 
-/// Numbers of one sample or window that are computed together: a multiple of the vector length of
-/// every processor.
+/// Numbers of one sample that are computed together: a multiple of the vector length of every
+/// processor.
 pub(crate) const LANES: usize = 8;
+
+/// One number of each window. Windows are computed together, so that their numbers fill vectors.
+pub(crate) type PerWindow = [f64; CANDIDATES];
+
+pub(crate) const NONE: PerWindow = [0.0; CANDIDATES];
 
 /// The last samples, newest first. Each is stored twice, so that any of them in a row are one
 /// slice.
@@ -50,27 +56,22 @@ pub(crate) struct Recent<T> {
     newest: usize,
 }
 
-/// Polynomials orthogonal over the newest samples, and their values at an instant; computed on
-/// demand.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Basis {
+/// The polynomials orthogonal over the samples of each window, and their values at an instant.
+#[derive(Debug, Clone)]
+pub(crate) struct Bases {
     /// `<v^k, v^l>` by `k + l`.
-    sums: [f64; 2 * LANES],
+    pub(crate) sums: [PerWindow; MOMENTS],
     /// Coefficients of the recurrence.
-    a: [f64; TERMS],
-    b: [f64; TERMS],
+    a: [PerWindow; TERMS],
+    b: [PerWindow; TERMS],
     /// `1 / <p_k, p_k>`; zero for polynomials that do not exist.
-    pub(crate) per_norm: [f64; LANES],
-    /// The coefficients of `v^j` in all polynomials.
-    by_power: [[f64; LANES]; TERMS],
-    /// The number of polynomials, once they are computed.
-    pub(crate) found: usize,
-    is_computed: bool,
-    /// `p_k` and its derivatives by `v` at the instant, and the square roots of the sums of
-    /// `p_k^(m)^2 / <p_k, p_k>` up to `k`, once they are computed.
-    pub(crate) here: [[f64; 3]; TERMS],
-    pub(crate) deviation: [[f64; 3]; TERMS],
-    is_placed: bool,
+    pub(crate) per_norm: [PerWindow; TERMS],
+    /// By polynomial, its coefficients of `v^j`.
+    pub(crate) by_power: [[PerWindow; TERMS]; TERMS],
+    /// `p_k` and its derivatives by `v` at the instant, and the sums of `p_k^(m)^2 / <p_k, p_k>` up
+    /// to `k`.
+    pub(crate) here: [[PerWindow; 3]; TERMS],
+    pub(crate) variance: [[PerWindow; 3]; TERMS],
 }
 
 impl<T: Copy> Recent<T> {
@@ -96,149 +97,161 @@ impl<T: Copy> Recent<T> {
     }
 }
 
-impl Basis {
+impl Bases {
     pub(crate) const NONE: Self = Self {
-        sums: [0.0; 2 * LANES],
-        a: [0.0; TERMS],
-        b: [0.0; TERMS],
-        per_norm: [0.0; LANES],
-        by_power: [[0.0; LANES]; TERMS],
-        found: 0,
-        is_computed: false,
-        here: [[0.0; 3]; TERMS],
-        deviation: [[0.0; 3]; TERMS],
-        is_placed: false,
+        sums: [NONE; MOMENTS],
+        a: [NONE; TERMS],
+        b: [NONE; TERMS],
+        per_norm: [NONE; TERMS],
+        by_power: [[NONE; TERMS]; TERMS],
+        here: [[NONE; 3]; TERMS],
+        variance: [[NONE; 3]; TERMS],
     };
 
-    /// A basis from the sums of `v^0 ... v^7` and of `v^8 ...`.
-    pub(crate) fn new(low: [f64; LANES], high: [f64; LANES]) -> Self {
-        let mut new = Self::NONE;
-        new.sums[..LANES].copy_from_slice(&low);
-        new.sums[LANES..].copy_from_slice(&high);
-        new
+    /// Whether a window has this many polynomials.
+    pub(crate) fn has(&self, terms: usize, window: usize) -> bool {
+        self.per_norm[terms - 1][window] > 0.0
     }
 
-    /// Computes the polynomials for this many `samples`, if they are not yet, and returns their
-    /// number.
+    /// Computes the polynomials from the sums: Chebyshev's algorithm. Those that a window does not
+    /// have become finite numbers, which its `per_norm` of zero makes ineffective.
     #[inline(always)]
-    pub(crate) fn count(&mut self, samples: usize) -> usize {
-        if !self.is_computed {
-            self.compute(samples);
-        }
-        self.found
-    }
-
-    /// Chebyshev's algorithm.
-    fn compute(&mut self, samples: usize) {
-        self.is_computed = true;
-        // `<p_k, v^l>` for the last `k` and for the one before, from `l = k` on.
-        let (mut moments, mut before) = (self.sums, [0.0; 2 * LANES]);
-        for k in 0..TERMS.min(samples) {
-            if k > 0 {
-                let (a, b) = (self.a[k - 1], self.b[k - 1]);
-                // From those of k - 1 and k - 2, in place of the latter.
-                for l in k..MOMENTS - k {
-                    before[l] = moments[l + 1] - a * moments[l] - b * before[l];
+    pub(crate) fn compute<S: Simd>(&mut self, simd: S) {
+        let zero = simd.splat_f64s(0.0);
+        for i in 0..CANDIDATES / S::F64_LANES {
+            let sums = self.sums.each_ref().map(|own| vector::<S>(own, i));
+            // `<p_k, v^l>` for the last `k` and for the one before, from `l = k` on.
+            let (mut moments, mut before) = (sums, [zero; MOMENTS]);
+            let (mut a, mut b, mut per_norm) = (zero, zero, zero);
+            let mut by_power = [[zero; TERMS]; 3];
+            let mut has = simd.greater_than_f64s(sums[0], zero);
+            for k in 0..TERMS {
+                let [last, second, own] = &mut by_power;
+                if k == 0 {
+                    own[0] = simd.splat_f64s(1.0);
+                } else {
+                    // From those of k - 1 and k - 2, in place of the latter.
+                    for l in k..MOMENTS - k {
+                        let known = simd.sub_f64s(moments[l + 1], simd.mul_f64s(a, moments[l]));
+                        before[l] = simd.sub_f64s(known, simd.mul_f64s(b, before[l]));
+                    }
+                    std::mem::swap(&mut moments, &mut before);
+                    for j in 0..=k {
+                        let shifted = if j > 0 { last[j - 1] } else { zero };
+                        let known = simd.sub_f64s(shifted, simd.mul_f64s(a, last[j]));
+                        own[j] = simd.sub_f64s(known, simd.mul_f64s(b, second[j]));
+                    }
                 }
-                std::mem::swap(&mut moments, &mut before);
-            }
-            let norm = moments[k];
-            if norm <= DEGENERATE * self.sums[2 * k] || !norm.is_finite() {
-                return;
-            }
-            self.per_norm[k] = 1.0 / norm;
-            if k == 0 {
-                self.by_power[0][0] = 1.0;
-                self.a[0] = moments[1] * self.per_norm[0];
-            } else {
-                let (a, b) = (self.a[k - 1], self.b[k - 1]);
-                for j in 0..=k {
-                    let shifted = if j > 0 {
-                        self.by_power[j - 1][k - 1]
-                    } else {
-                        0.0
-                    };
-                    let own = &mut self.by_power[j];
-                    let second = if k > 1 { own[k - 2] } else { 0.0 };
-                    own[k] = shifted - a * own[k - 1] - b * second;
+                let norm = moments[k];
+                let least = simd.mul_f64s(simd.splat_f64s(DEGENERATE), sums[2 * k]);
+                for is_met in [
+                    simd.greater_than_f64s(norm, least),
+                    simd.greater_than_f64s(simd.splat_f64s(f64::INFINITY), norm),
+                    simd.greater_than_f64s(sums[0], simd.splat_f64s(k as f64)),
+                ] {
+                    has = simd.and_m64s(has, is_met);
                 }
-                let earlier = self.per_norm[k - 1];
+                let earlier = per_norm;
+                per_norm = simd.select_f64s(has, simd.div_f64s(simd.splat_f64s(1.0), norm), zero);
                 if k + 1 < TERMS {
-                    self.a[k] = moments[k + 1] * self.per_norm[k] - before[k] * earlier;
+                    let known = simd.mul_f64s(moments[k + 1], per_norm);
+                    a = simd.sub_f64s(known, simd.mul_f64s(before[k], earlier));
+                    b = simd.mul_f64s(norm, earlier);
                 }
-                self.b[k] = norm * earlier;
+                set::<S>(&mut self.a[k], i, a);
+                set::<S>(&mut self.b[k], i, b);
+                set::<S>(&mut self.per_norm[k], i, per_norm);
+                for (to, own) in self.by_power[k].iter_mut().zip(*own) {
+                    set::<S>(to, i, own);
+                }
+                by_power = [*own, *last, [zero; TERMS]];
             }
-            self.found = k + 1;
         }
     }
 
-    /// The instant is another one.
-    pub(crate) fn displace(&mut self) {
-        self.is_placed = false;
-    }
-
-    /// Evaluates the polynomials at the instant `at`, unless that was done.
+    /// Evaluates the polynomials at the instant `at`.
     #[inline(always)]
-    pub(crate) fn place(&mut self, at: f64) {
-        if !self.is_placed {
-            self.evaluate(at);
-        }
-    }
-
-    fn evaluate(&mut self, at: f64) {
-        self.is_placed = true;
-        let mut variance = [0.0; 3];
-        for k in 0..self.found {
-            let none = [0.0; 3];
-            self.here[k] = match k {
-                0 => [1.0, 0.0, 0.0],
-                _ => {
-                    let (here, before) = (
-                        self.here[k - 1],
-                        if k > 1 { self.here[k - 2] } else { none },
-                    );
-                    let (a, b) = (self.a[k - 1], self.b[k - 1]);
-                    per_derivative(|m| {
-                        let inner = if m > 0 { m as f64 * here[m - 1] } else { 0.0 };
-                        (at - a) * here[m] + inner - b * before[m]
-                    })
+    pub(crate) fn place<S: Simd>(&mut self, simd: S, at: f64) {
+        let zero = simd.splat_f64s(0.0);
+        let at = simd.splat_f64s(at);
+        for i in 0..CANDIDATES / S::F64_LANES {
+            let mut last = [simd.splat_f64s(1.0), zero, zero];
+            let (mut before, mut sums) = ([zero; 3], [zero; 3]);
+            for k in 0..TERMS {
+                if k > 0 {
+                    let a = vector::<S>(&self.a[k - 1], i);
+                    let b = vector::<S>(&self.b[k - 1], i);
+                    let own = std::array::from_fn(|m| {
+                        let known = simd.mul_f64s(simd.sub_f64s(at, a), last[m]);
+                        let inner = match m {
+                            0 => zero,
+                            _ => simd.mul_f64s(simd.splat_f64s(m as f64), last[m - 1]),
+                        };
+                        simd.sub_f64s(simd.add_f64s(known, inner), simd.mul_f64s(b, before[m]))
+                    });
+                    (before, last) = (last, own);
                 }
-            };
-            variance = per_derivative(|m| {
-                variance[m] + self.here[k][m] * self.here[k][m] * self.per_norm[k]
-            });
-            self.deviation[k] = variance.map(f64::sqrt);
+                let per_norm = vector::<S>(&self.per_norm[k], i);
+                for m in 0..3 {
+                    let square = simd.mul_f64s(simd.mul_f64s(last[m], last[m]), per_norm);
+                    sums[m] = simd.add_f64s(sums[m], square);
+                    set::<S>(&mut self.here[k][m], i, last[m]);
+                    set::<S>(&mut self.variance[k][m], i, sums[m]);
+                }
+            }
         }
     }
 
     /// `<x, p_k>` of all polynomials, for values `x` with these moments.
     #[inline(always)]
-    pub(crate) fn products(&self, moments: &[f64; LANES]) -> [f64; LANES] {
-        let mut products = [0.0; LANES];
-        for (moment, own) in moments.iter().zip(&self.by_power) {
-            for k in 0..LANES {
-                products[k] += moment * own[k];
+    pub(crate) fn products<S: Simd>(
+        &self,
+        simd: S,
+        moments: &[PerWindow; LANES],
+    ) -> [PerWindow; TERMS] {
+        let mut products = [NONE; TERMS];
+        for i in 0..CANDIDATES / S::F64_LANES {
+            let moments = moments.each_ref().map(|own| vector::<S>(own, i));
+            for (k, product) in products.iter_mut().enumerate() {
+                let mut sum = simd.splat_f64s(0.0);
+                for (moment, own) in moments.iter().zip(&self.by_power[k]).take(k + 1) {
+                    sum = simd.add_f64s(sum, simd.mul_f64s(*moment, vector::<S>(own, i)));
+                }
+                set::<S>(product, i, sum);
             }
         }
         products
     }
 
-    /// The least-squares polynomial of degree `N - 1` for values with these products, in powers of
-    /// `v`.
+    /// The least-squares polynomial of degree `N - 1` of one window, for values with these
+    /// products, in powers of `v`.
     #[inline(always)]
-    pub(crate) fn polynomial<const N: usize>(&self, products: &[f64; LANES]) -> [f64; N] {
+    pub(crate) fn polynomial<const N: usize>(
+        &self,
+        products: &[PerWindow; TERMS],
+        window: usize,
+    ) -> [f64; N] {
         let mut polynomial = [0.0; N];
-        for (sum, own) in polynomial.iter_mut().zip(&self.by_power) {
-            for k in 0..N {
-                *sum += products[k] * self.per_norm[k] * own[k];
+        let norms = self.per_norm.iter().zip(&self.by_power);
+        for (product, (per_norm, own)) in products.iter().zip(norms).take(N) {
+            let coefficient = product[window] * per_norm[window];
+            for (sum, own) in polynomial.iter_mut().zip(own) {
+                *sum += coefficient * own[window];
             }
         }
         polynomial
     }
 }
 
-pub(crate) fn per_derivative(f: impl FnMut(usize) -> f64) -> [f64; 3] {
-    core::array::from_fn(f)
+/// Vector number `i` of one number of each window.
+#[inline(always)]
+pub(crate) fn vector<S: Simd>(numbers: &PerWindow, i: usize) -> S::f64s {
+    S::as_simd_f64s(numbers).0[i]
+}
+
+#[inline(always)]
+pub(crate) fn set<S: Simd>(numbers: &mut PerWindow, i: usize, to: S::f64s) {
+    S::as_mut_simd_f64s(numbers).0[i] = to;
 }
 
 /// The next longer window to try, at most `most`.

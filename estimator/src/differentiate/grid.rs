@@ -1,8 +1,25 @@
 //! The stamp-dependent part of differentiation, shared by channels with equal stamps.
 
-use crate::differentiate::basis::{Basis, CANDIDATES, LANES, longer};
+use crate::differentiate::basis::{Bases, CANDIDATES, LANES, longer};
 use crate::differentiate::estimate::{MAX_SAMPLES, MIN_SAMPLES};
 use proprio_topics::Nanos;
+use pulp::Simd;
+
+/// The binary digits of 0 to 7, lowest first, and their complements.
+const DIGITS: [([f64; LANES], [f64; LANES]); 3] = [
+    (
+        [0., 1., 0., 1., 0., 1., 0., 1.],
+        [1., 0., 1., 0., 1., 0., 1., 0.],
+    ),
+    (
+        [0., 0., 1., 1., 0., 0., 1., 1.],
+        [1., 1., 0., 0., 1., 1., 0., 0.],
+    ),
+    (
+        [0., 0., 0., 0., 1., 1., 1., 1.],
+        [1., 1., 1., 1., 0., 0., 0., 0.],
+    ),
+];
 
 /// The results that depend on the stamps of the samples alone, not on the values: more than half of
 /// the work of an estimate.
@@ -19,14 +36,13 @@ pub struct Grid {
     pub(crate) span: f64,
     /// `v` of each sample, newest first.
     pub(crate) times: [f64; MAX_SAMPLES],
-    /// `v^0 ... v^7` of each sample.
+    /// `v^0 ... v^6` of each sample, and a zero.
     pub(crate) powers: [[f64; LANES]; MAX_SAMPLES],
     /// Window lengths to try, in growing order; the last one is all samples.
     pub(crate) lengths: [usize; CANDIDATES],
     pub(crate) tried: usize,
-    /// The basis of each window length.
-    pub(crate) bases: [Basis; CANDIDATES],
-    /// The instant that `Basis::here` is for, in the unit of `v`.
+    pub(crate) bases: Bases,
+    /// The instant that `Bases::here` is for, in the unit of `v`.
     pub(crate) at: f64,
 }
 
@@ -48,7 +64,7 @@ impl Grid {
             powers: [[0.0; LANES]; MAX_SAMPLES],
             lengths: [0; CANDIDATES],
             tried: 0,
-            bases: [Basis::NONE; CANDIDATES],
+            bases: Bases::NONE,
             at: f64::NAN,
         }
     }
@@ -56,7 +72,7 @@ impl Grid {
     /// Computes the grid for these stamps, newest first, unless they are those of the last one but
     /// for a shift. Call it with at least [`MIN_SAMPLES`] of them.
     #[inline(always)]
-    pub(crate) fn make(&mut self, stamps: &[Nanos]) {
+    pub(crate) fn make<S: Simd>(&mut self, simd: S, stamps: &[Nanos]) {
         let newest = stamps[0].0;
         let mut difference = i64::from(self.used != stamps.len());
         for (stamp, before) in stamps.iter().zip(&self.before) {
@@ -77,38 +93,54 @@ impl Grid {
             *v = -before.seconds() * per_span;
         }
         self.tried = 0;
+        self.bases.sums = Bases::NONE.sums;
         let (mut low, mut high) = ([0.0; LANES], [0.0; LANES]);
         let (mut from, mut samples) = (0, MIN_SAMPLES);
-        for (length, basis) in self.lengths.iter_mut().zip(&mut self.bases) {
+        for (window, length) in self.lengths.iter_mut().enumerate() {
             let times = &self.times[from..samples];
             for (v, powers) in times.iter().zip(&mut self.powers[from..samples]) {
-                let mut own = [1.0; LANES];
-                for k in 1..LANES {
-                    own[k] = own[k - 1] * v;
+                let square = v * v;
+                let fourth = square * square;
+                let eighth = simd.splat_f64s(fourth * fourth);
+                let factors = [*v, square, fourth].map(|power| simd.splat_f64s(power));
+                let sums = (S::as_mut_simd_f64s(&mut low).0.iter_mut())
+                    .zip(S::as_mut_simd_f64s(&mut high).0);
+                let own = S::as_mut_simd_f64s(powers).0.iter_mut();
+                for (i, (power, (low, high))) in own.zip(sums).enumerate() {
+                    // A product of powers of two, so that none waits for the one before.
+                    let mut product = simd.splat_f64s(1.0);
+                    for ((with, without), factor) in DIGITS.iter().zip(factors) {
+                        let with = S::as_simd_f64s(with).0[i];
+                        let without = S::as_simd_f64s(without).0[i];
+                        product =
+                            simd.mul_f64s(product, simd.mul_add_e_f64s(factor, with, without));
+                    }
+                    *power = product;
+                    *low = simd.add_f64s(*low, product);
+                    *high = simd.mul_add_e_f64s(product, eighth, *high);
                 }
-                let eighth = own[LANES - 1] * v;
-                for k in 0..LANES {
-                    low[k] += own[k];
-                    high[k] += own[k] * eighth;
-                }
-                *powers = own;
+                powers[LANES - 1] = 0.0;
+            }
+            for (own, sum) in self.bases.sums.iter_mut().zip(low.iter().chain(&high)) {
+                own[window] = *sum;
             }
             *length = samples;
-            *basis = Basis::new(low, high);
             self.tried += 1;
             if samples == used {
                 break;
             }
             (from, samples) = (samples, longer(samples, used));
         }
+        self.bases.compute(simd);
     }
 
     /// Sets the requested instant, as time after the newest sample \[s\].
-    pub(crate) fn place(&mut self, time: f64) {
+    #[inline(always)]
+    pub(crate) fn place<S: Simd>(&mut self, simd: S, time: f64) {
         let at = time / self.span;
         if at != self.at {
             self.at = at;
-            self.bases.iter_mut().for_each(Basis::displace);
+            self.bases.place(simd, at);
         }
     }
 

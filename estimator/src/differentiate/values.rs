@@ -1,7 +1,8 @@
 //! Polynomial fits of the values of a window, and their standard deviations.
 
 use crate::differentiate::basis::{
-    CANDIDATES, FIRST_DEGREE, KAPPA, LANES, SHORTEST, STRETCH, TERMS, TOLERANCE,
+    CANDIDATES, FIRST_DEGREE, KAPPA, LANES, NONE, PerWindow, SHORTEST, STRETCH, TERMS, TOLERANCE,
+    set, vector,
 };
 use crate::differentiate::estimate::Estimate;
 use crate::differentiate::grid::Grid;
@@ -26,86 +27,70 @@ pub(crate) struct Values<'a, const D: usize> {
     pub(crate) time: f64,
 }
 
-/// Of each window length, `<x, v^k>`, and in the last lane `<x, x>`.
-type Moments<const D: usize> = [[[f64; LANES]; D]; CANDIDATES];
-
 impl<const D: usize> WithSimd for Values<'_, D> {
     type Output = Estimate<D>;
 
     /// The three steps described in the parent module.
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> Estimate<D> {
-        self.grid.make(self.stamps);
-        self.grid.place(self.time);
-        let moments = self.moments(simd);
-        let Self {
-            grid,
-            values,
-            origin,
-            roughness_square,
-            least_noise,
-            ..
-        } = self;
+        self.grid.make(simd, self.stamps);
+        self.grid.place(simd, self.time);
+        let grid = &*self.grid;
         let mut estimate = Estimate::NONE;
         for component in 0..D {
-            let own = roughness_square[component];
+            let own = self.roughness_square[component];
             let variance = sum(own) / own.len().max(1) as f64;
+            let (values, origin) = (self.values[component], self.origin[component]);
+            let moments = moments(simd, grid, values, origin);
             let own = Component {
-                values: values[component],
-                origin: origin[component],
+                grid,
+                values,
+                origin,
                 // An error uniformly distributed over +-noise has the variance noise^2 / 3.
-                noise: (3.0 * variance).sqrt().max(least_noise),
-                moments: &moments,
+                noise: (3.0 * variance).sqrt().max(self.least_noise),
+                square: moments[LANES - 1],
+                products: grid.bases.products(simd, &moments),
                 component,
             };
-            own.estimate(grid, &mut estimate);
+            own.estimate(simd, &mut estimate);
         }
         estimate
     }
 }
 
-impl<const D: usize> Values<'_, D> {
-    #[inline(always)]
-    fn moments<S: Simd>(&self, simd: S) -> Moments<D> {
-        let (mut moments, mut before, mut from) =
-            ([[[0.0; LANES]; D]; CANDIDATES], [[0.0; LANES]; D], 0);
-        let lengths = &self.grid.lengths[..self.grid.tried];
-        for (&samples, moments) in lengths.iter().zip(&mut moments) {
-            // The sums of the samples that are new in this window begin at zero, so that none
-            // waits for those before it.
-            let (mut sums, mut squares) = ([[simd.splat_f64s(0.0); LANES]; D], [0.0; D]);
-            let powers = &self.grid.powers[from..samples];
-            let mut values: [&[f64]; D] = [&[]; D];
-            for (own, all) in values.iter_mut().zip(&self.values) {
-                *own = &all[from..samples];
+/// Of each window, `<x, v^k>`, and last `<x, x>`; `x` are the values less `origin`.
+#[inline(always)]
+fn moments<S: Simd>(simd: S, grid: &Grid, values: &[f64], origin: f64) -> [PerWindow; LANES] {
+    const LAST: [f64; LANES] = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+    let vectors = LANES / S::F64_LANES;
+    let last = S::as_simd_f64s(&LAST).0[vectors - 1];
+    let (mut moments, mut before, mut from) = ([NONE; LANES], [0.0; LANES], 0);
+    for (window, &samples) in grid.lengths[..grid.tried].iter().enumerate() {
+        // The sums of the samples that are new in this window begin at zero, so that none waits for
+        // those before it.
+        let mut sums = [simd.splat_f64s(0.0); LANES];
+        let all = grid.powers[from..samples].iter();
+        for (powers, value) in all.zip(&values[from..samples]) {
+            let x = simd.splat_f64s(value - origin);
+            let powers = S::as_simd_f64s(powers).0;
+            for i in 0..vectors - 1 {
+                sums[i] = simd.mul_add_e_f64s(x, powers[i], sums[i]);
             }
-            for i in 0..powers.len() {
-                let powers = S::as_simd_f64s(&powers[i]).0;
-                for component in 0..D {
-                    let x = values[component][i] - self.origin[component];
-                    let splat = simd.splat_f64s(x);
-                    for (sum, power) in sums[component].iter_mut().zip(powers) {
-                        *sum = simd.mul_add_e_f64s(splat, *power, *sum);
-                    }
-                    squares[component] += x * x;
-                }
-            }
-            for component in 0..D {
-                let own = &mut moments[component];
-                let vectors = S::as_mut_simd_f64s(own).0.iter_mut();
-                for (to, sum) in vectors.zip(&sums[component]) {
-                    *to = *sum;
-                }
-                own[LANES - 1] = squares[component];
-                for k in 0..LANES {
-                    own[k] += before[component][k];
-                }
-                before[component] = *own;
-            }
-            from = samples;
+            // `x` is the last factor besides the powers.
+            let factors = simd.mul_add_e_f64s(x, last, powers[vectors - 1]);
+            sums[vectors - 1] = simd.mul_add_e_f64s(x, factors, sums[vectors - 1]);
         }
-        moments
+        let mut own = [0.0; LANES];
+        for (to, sum) in S::as_mut_simd_f64s(&mut own).0.iter_mut().zip(&sums) {
+            *to = *sum;
+        }
+        for k in 0..LANES {
+            before[k] += own[k];
+            moments[k][window] = before[k];
+        }
+        from = samples;
     }
+    moments
 }
 
 /// The sum of many numbers, in parts that do not wait for each other.
@@ -126,27 +111,30 @@ pub(crate) fn sum(numbers: &[f64]) -> f64 {
 }
 
 /// One of the `D` numbers.
-struct Component<'a, const D: usize> {
+struct Component<'a> {
+    grid: &'a Grid,
     values: &'a [f64],
     origin: f64,
     noise: f64,
-    moments: &'a Moments<D>,
+    /// `<x, x>` and `<x, p_k>`.
+    square: PerWindow,
+    products: [PerWindow; TERMS],
     component: usize,
 }
 
-impl<const D: usize> Component<'_, D> {
+impl Component<'_> {
     #[inline(always)]
-    fn estimate(&self, grid: &mut Grid, estimate: &mut Estimate<D>) {
+    fn estimate<S: Simd, const D: usize>(&self, simd: S, estimate: &mut Estimate<D>) {
         let (mut degree, mut end, mut longest) = (0, 0, 0.0);
         for (d, stretch) in STRETCH.into_iter().enumerate() {
             // A degree is not tried if the span of all samples is too short for it.
-            if end > 0 && grid.span < stretch * longest {
+            if end > 0 && self.grid.span < stretch * longest {
                 continue;
             }
             let (tried, widest) = match d {
-                0 => self.grow::<3>(grid),
-                1 => self.grow::<4>(grid),
-                _ => self.grow::<5>(grid),
+                0 => self.grow::<S, 3>(simd),
+                1 => self.grow::<S, 4>(simd),
+                _ => self.grow::<S, 5>(simd),
             };
             if let Some(widest) = widest
                 && (end == 0 || widest >= stretch * longest)
@@ -156,9 +144,9 @@ impl<const D: usize> Component<'_, D> {
         }
         match degree {
             0 => {}
-            2 => self.trim::<3>(grid, end, estimate),
-            3 => self.trim::<4>(grid, end, estimate),
-            _ => self.trim::<5>(grid, end, estimate),
+            2 => self.trim::<S, 3, D>(simd, end, estimate),
+            3 => self.trim::<S, 4, D>(simd, end, estimate),
+            _ => self.trim::<S, 5, D>(simd, end, estimate),
         }
     }
 
@@ -169,94 +157,121 @@ impl<const D: usize> Component<'_, D> {
     /// if it is within the square of the tolerance, that window and all shorter ones fit. Only
     /// from the longest such window on, the residuals themselves are computed.
     #[inline(always)]
-    fn grow<const N: usize>(&self, grid: &mut Grid) -> (usize, Option<f64>) {
+    fn grow<S: Simd, const N: usize>(&self, simd: S) -> (usize, Option<f64>) {
+        let (grid, bases) = (self.grid, &self.grid.bases);
         let tolerance = TOLERANCE * self.noise;
-        let (mut fitting, mut widest) = (0, None);
-        for number in (0..grid.tried).rev() {
-            let samples = grid.lengths[number];
-            let basis = &mut grid.bases[number];
-            if samples < N || basis.count(samples) < N {
-                continue;
+        let mut left = NONE;
+        for i in 0..CANDIDATES / S::F64_LANES {
+            let all = vector::<S>(&self.square, i);
+            let mut sum = simd.mul_f64s(all, simd.splat_f64s(1.0 + ROUNDING));
+            for k in 0..N {
+                let product = vector::<S>(&self.products[k], i);
+                let square = simd.mul_f64s(product, product);
+                sum = simd.sub_f64s(
+                    sum,
+                    simd.mul_f64s(square, vector::<S>(&bases.per_norm[k], i)),
+                );
             }
-            let moments = &self.moments[number][self.component];
-            let products = basis.products(moments);
-            let all = moments[LANES - 1];
-            let mut left = all * (1.0 + ROUNDING);
-            for (product, per_norm) in products.iter().zip(&basis.per_norm).take(N) {
-                left -= product * product * per_norm;
-            }
-            // The comparisons use `<=`, so that NaN does not fit.
-            if left <= tolerance * tolerance {
-                (fitting, widest) = (number + 1, Some(grid.seconds(samples)));
-                break;
-            }
+            set::<S>(&mut left, i, sum);
         }
-        let certain = fitting;
-        for number in certain..grid.tried {
-            let samples = grid.lengths[number];
-            let basis = &mut grid.bases[number];
+        // The comparisons use `<=`, so that NaN does not fit.
+        let certain = (0..grid.tried)
+            .rev()
+            .find(|&window| bases.has(N, window) && left[window] <= tolerance * tolerance);
+        let mut widest = certain.map(|window| grid.seconds(grid.lengths[window]));
+        let first = certain.map_or(0, |window| window + 1);
+        let mut fitting = first;
+        for window in first..grid.tried {
+            let samples = grid.lengths[window];
             if samples < N {
                 continue;
             }
-            if basis.count(samples) >= N {
-                let products = basis.products(&self.moments[number][self.component]);
-                let polynomial = basis.polynomial::<N>(&products);
-                let mut fits = true;
-                for (value, v) in self.values[..samples].iter().zip(&grid.times) {
-                    let mut fitted = 0.0;
-                    for coefficient in polynomial.iter().rev() {
-                        fitted = fitted * v + coefficient;
-                    }
-                    fits &= (value - self.origin - fitted).abs() <= tolerance;
-                }
-                if !fits {
+            if bases.has(N, window) {
+                let polynomial = bases.polynomial::<N>(&self.products, window);
+                if !self.fits(simd, &polynomial, samples, tolerance) {
                     break;
                 }
                 widest = Some(grid.seconds(samples));
             }
-            fitting = number + 1;
+            fitting = window + 1;
         }
         (fitting, widest)
     }
 
+    /// Whether the residuals of so many samples are within the tolerance.
+    #[inline(always)]
+    fn fits<S: Simd>(&self, simd: S, polynomial: &[f64], samples: usize, tolerance: f64) -> bool {
+        let (values, rest) = S::as_simd_f64s(&self.values[..samples]);
+        let (times, times_of_rest) = S::as_simd_f64s(&self.grid.times[..samples]);
+        let (least, most) = (simd.splat_f64s(-tolerance), simd.splat_f64s(tolerance));
+        let origin = simd.splat_f64s(self.origin);
+        let mut fits = simd.less_than_or_equal_f64s(least, most);
+        for (value, v) in values.iter().zip(times) {
+            let mut fitted = simd.splat_f64s(0.0);
+            for coefficient in polynomial.iter().rev() {
+                fitted = simd.mul_add_e_f64s(fitted, *v, simd.splat_f64s(*coefficient));
+            }
+            let residual = simd.sub_f64s(simd.sub_f64s(*value, origin), fitted);
+            for is_within in [
+                simd.less_than_or_equal_f64s(least, residual),
+                simd.less_than_or_equal_f64s(residual, most),
+            ] {
+                fits = simd.and_m64s(fits, is_within);
+            }
+        }
+        let misses = simd.select_f64s(fits, simd.splat_f64s(0.0), simd.splat_f64s(1.0));
+        let mut fits = simd.reduce_sum_f64s(misses) == 0.0;
+        for (value, v) in rest.iter().zip(times_of_rest) {
+            let fitted = (polynomial.iter().rev()).fold(0.0, |sum, own| sum * v + own);
+            fits &= (value - self.origin - fitted).abs() <= tolerance;
+        }
+        fits
+    }
+
     /// Step 3 for degree `N - 1`, on the first `end` lengths.
     #[inline(always)]
-    fn trim<const N: usize>(&self, grid: &mut Grid, end: usize, estimate: &mut Estimate<D>) {
+    fn trim<S: Simd, const N: usize, const D: usize>(
+        &self,
+        simd: S,
+        end: usize,
+        estimate: &mut Estimate<D>,
+    ) {
+        let (grid, bases) = (self.grid, &self.grid.bases);
         let component = self.component;
         let most = end.checked_sub(1).map_or(0, |last| grid.lengths[last]);
         let sigma = self.noise / 3.0_f64.sqrt();
         let per_span = 1.0 / grid.span;
         let scale = [1.0, per_span, per_span * per_span];
+        let mut values = [NONE; 3];
+        for i in 0..CANDIDATES / S::F64_LANES {
+            let mut sums = [simd.splat_f64s(0.0); 3];
+            for k in 0..N {
+                let product = vector::<S>(&self.products[k], i);
+                let coefficient = simd.mul_f64s(product, vector::<S>(&bases.per_norm[k], i));
+                for (sum, here) in sums.iter_mut().zip(&bases.here[k]) {
+                    let part = simd.mul_f64s(coefficient, vector::<S>(here, i));
+                    *sum = simd.add_f64s(*sum, part);
+                }
+            }
+            for (to, sum) in values.iter_mut().zip(sums) {
+                set::<S>(to, i, sum);
+            }
+        }
         let (mut best, mut variance, mut samples) = ([f64::NAN; 3], [f64::NAN; 3], [0; 3]);
         let (mut low, mut high) = ([f64::NEG_INFINITY; 3], [f64::INFINITY; 3]);
         let mut meets = [true; 3];
-        for number in 0..end {
-            let length = grid.lengths[number];
-            let basis = &mut grid.bases[number];
-            if (length as f64) < SHORTEST * most as f64 || basis.count(length) < N {
+        for (window, &length) in grid.lengths[..end].iter().enumerate() {
+            if (length as f64) < SHORTEST * most as f64 || !bases.has(N, window) {
                 continue;
             }
-            basis.place(grid.at);
-            let products = basis.products(&self.moments[number][component]);
-            let mut value = [0.0; 3];
-            let fitted = products.iter().zip(&basis.per_norm).take(N);
-            for ((product, per_norm), here) in fitted.zip(&basis.here) {
-                let coefficient = product * per_norm;
-                for (value, here) in value.iter_mut().zip(here) {
-                    *value += coefficient * here;
-                }
-            }
             // One degree more, to estimate the truncation error of this one.
-            let next = match basis.found > N {
-                true => products[N] * basis.per_norm[N],
-                false => 0.0,
-            };
+            let next = self.products[N][window] * bases.per_norm[N][window];
             for m in 0..3 {
-                let s = sigma * scale[m] * basis.deviation[N - 1][m];
+                let s = sigma * scale[m] * bases.variance[N - 1][m][window].sqrt();
                 if !meets[m] || !s.is_finite() {
                     continue;
                 }
-                let e = value[m] * scale[m];
+                let e = values[m][window] * scale[m];
                 low[m] = low[m].max(e - KAPPA[m] * s);
                 high[m] = high[m].min(e + KAPPA[m] * s);
                 meets[m] = low[m] <= high[m];
@@ -267,7 +282,7 @@ impl<const D: usize> Component<'_, D> {
                 // Quantisation errors do not average out at rest, so the value is not better than
                 // one sample.
                 let s = if m == 0 { s.max(sigma) } else { s };
-                let omitted = next * basis.here[N.min(TERMS - 1)][m] * scale[m];
+                let omitted = next * bases.here[N][m][window] * scale[m];
                 variance[m] = s * s + omitted * omitted;
                 samples[m] = length;
             }
