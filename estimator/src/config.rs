@@ -295,7 +295,8 @@ pub enum Presence {
     /// It is always present, unless it is declared absent.
     #[default]
     Always,
-    /// It is absent unless it is declared present, or F/T readings show it.
+    /// It is absent unless it is declared present, or F/T readings show it. Where they can not,
+    /// because of a fault, and nobody declares it, nothing that rests on its absence is valid.
     Possible,
 }
 

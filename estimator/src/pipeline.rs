@@ -15,6 +15,8 @@
 //! 5. The F/T residual of each sub-tree is tested (`residuals`). A possible contact that explains a
 //!    significant residual is taken as present. Without such a contact, the torques of the sub-tree
 //!    are not valid.
+//!    Where it can not be tested because of a fault, what rests on the absence of a possible contact
+//!    is not valid either.
 //! 6. Every torque and contact wrench is written with its validity and reason (`validity`,
 //!    `estimate`).
 //!
@@ -50,7 +52,8 @@
 //! # Identification
 //! With identification on ([`proprio_identification::online`]), the inertial parameters, offsets
 //! and their covariance are those of the last solution put in use. The owner of the pipeline runs
-//! its jobs ([`Pipeline::take_job`]), immediately or in another thread.
+//! its jobs ([`Pipeline::take_job`]), immediately or in another thread. A sensor whose device tells
+//! of a new zero has an unknown offset until a solution has it; without identification for good.
 //!
 //! # Uncertainty
 //! Standard deviations contain F/T noise, the uncertainty of inertial parameters and F/T offsets

@@ -5,7 +5,7 @@ use super::Pipeline;
 use super::motion::OperatingPoint;
 use super::residuals;
 use crate::pipeline::estimate::root_of_squares;
-use crate::pipeline::validity::ValidityCheck;
+use crate::pipeline::validity::{ValidityCheck, first_fault};
 use proprio_dynamics::spatial::Pose;
 use proprio_dynamics::{Certainty, ContactSet, Dependence, DofSet, FrameMotion, JointState};
 use proprio_identification::robot::ChannelRole;
@@ -112,6 +112,7 @@ impl Pipeline {
         let validity = ValidityCheck {
             channels: &self.setup.robot.channels,
             faults: &self.faults,
+            first_fault: first_fault(&self.faults),
             base_fault: self.base_fault,
             lost: &[],
             detected: ContactSet::EMPTY,
@@ -156,6 +157,7 @@ impl Pipeline {
         let validity = ValidityCheck {
             channels: &self.setup.robot.channels,
             faults: &self.faults,
+            first_fault: first_fault(&self.faults),
             base_fault: self.base_fault,
             lost: self.contacts.lost(),
             detected,
@@ -190,6 +192,9 @@ impl Pipeline {
         let balances = balances.filter(|(residual, _)| residual.is_disturbed());
         let before = balances.fold(DofSet::EMPTY, |all, (_, own)| all.union(&own.dofs));
         let stuck = |dependence: &Dependence| {
+            if before.is_empty() {
+                return None;
+            }
             let mut encoders = channels.iter().zip(&self.sanity);
             encoders.position(|(channel, sanity)| match channel.role {
                 ChannelRole::Joint(dof) => {

@@ -44,6 +44,8 @@ impl Dependences {
 pub(crate) struct ValidityCheck<'a> {
     pub(crate) channels: &'a [Channel],
     pub(crate) faults: &'a [Reason],
+    /// [`first_fault`] of these.
+    pub(crate) first_fault: usize,
     pub(crate) base_fault: Reason,
     /// Per contact, the channel of the skin whose touch is lost, or [`NO_CAUSE`].
     pub(crate) lost: &'a [u32],
@@ -52,6 +54,12 @@ pub(crate) struct ValidityCheck<'a> {
     /// Contacts that nobody declares and no skin feels, where F/T readings can not show them: why
     /// not, and the channel.
     pub(crate) unwatched: &'a [(ContactSet, Reason, u32)],
+}
+
+/// The number of the first channel that has a fault: mostly there is none.
+pub(crate) fn first_fault(faults: &[Reason]) -> usize {
+    let first = faults.iter().position(|fault| *fault != Reason::None);
+    first.unwrap_or(faults.len())
 }
 
 impl ValidityCheck<'_> {
@@ -64,7 +72,8 @@ impl ValidityCheck<'_> {
         };
         // A channel without any sample comes first: then the output has no value at all.
         let mut found = (Reason::None, NO_CAUSE);
-        for ((channel, fault), number) in self.channels.iter().zip(self.faults).zip(0..) {
+        let channels = self.channels.iter().zip(self.faults).zip(0..);
+        for ((channel, fault), number) in channels.skip(self.first_fault) {
             if *fault == Reason::None || !needed(channel.role) {
                 continue;
             }
