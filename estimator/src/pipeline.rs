@@ -15,8 +15,8 @@
 //! 5. The F/T residual of each sub-tree is tested (`residuals`). A possible contact that explains a
 //!    significant residual is taken as present. Without such a contact, the torques of the sub-tree
 //!    are not valid.
-//!    Where it can not be tested because of a fault, what rests on the absence of a possible contact
-//!    is not valid either.
+//!    Where it can not be tested because of a fault, what rests on the absence of a possible
+//!    contact is not valid either.
 //! 6. Every torque and contact wrench is written with its validity and reason (`validity`,
 //!    `estimate`).
 //!
