@@ -91,11 +91,17 @@ pub struct Shown {
 }
 
 impl Shown {
+    /// Whether more good readings are off than may be.
+    #[must_use]
+    pub const fn is_off(&self) -> bool {
+        self.readings[1] > self.excused
+    }
+
     /// Whether something that must hold does not.
     #[must_use]
     pub fn is_broken(&self) -> bool {
         self.outcome.is_broken()
-            || self.readings[1] > self.excused
+            || self.is_off()
             || !self.missing.is_empty()
             || !self.silent.is_empty()
     }
@@ -156,6 +162,7 @@ fn at(t: f64) -> Nanos {
 struct Running {
     bus: Bus<Shared>,
     status: Arc<BusStatus>,
+    clock: SimulatedClock,
     /// What the wire had delivered when it was started.
     before: u64,
 }
@@ -168,7 +175,6 @@ struct Chain {
     family: Family,
     /// Bus and number of the device that has it.
     target: (usize, usize),
-    clocks: Vec<SimulatedClock>,
     wires: Vec<End>,
     /// None while the gateway is killed.
     buses: Vec<Running>,
@@ -206,11 +212,6 @@ impl Chain {
             boards,
         } = rig;
         let domain = Domain::open(&DomainConfig::new(folder, "chain")).expect("a domain");
-        let clocks: Vec<_> = plan
-            .buses
-            .iter()
-            .map(|_| SimulatedClock::at(START))
-            .collect();
         let device = &plan.buses[target.0].devices[target.1];
         let claims = build(device, None).expect("a device").claims().to_vec();
         let wires = boards
@@ -230,7 +231,7 @@ impl Chain {
                     Vec::new()
                 };
                 let random = Random::new(seed, &format!("wire {bus}"));
-                let wire = Wire::new(boards, planned, clocks[bus].clone(), random);
+                let wire = Wire::new(boards, planned, SimulatedClock::at(START), random);
                 End(Arc::new(Mutex::new(wire)))
             });
         let wires = wires.collect();
@@ -261,7 +262,6 @@ impl Chain {
             fault,
             family,
             target,
-            clocks,
             wires,
             buses: Vec::new(),
             published: 0,
@@ -294,6 +294,7 @@ impl Chain {
             let end = self.wires[number as usize].clone();
             self.buses.push(Running {
                 before: end.with(|wire| wire.passed.delivered),
+                clock: end.with(|wire| wire.clock.clone()),
                 bus: Bus::new(Box::new(end), decoder, sink, Arc::clone(&status)),
                 status,
             });
@@ -343,31 +344,16 @@ impl Chain {
                 }
                 continue;
             }
-            for ((running, end), clock) in self.buses.iter_mut().zip(&self.wires).zip(&self.clocks)
-            {
+            for (Running { bus, clock, .. }, end) in self.buses.iter_mut().zip(&self.wires) {
                 end.with(|wire| wire.horizon = t);
                 let mut turns = 0;
                 while clock.now() < t {
-                    running.bus.turn(clock);
+                    bus.turn(clock);
                     turns += 1;
                     assert!(turns < 10_000, "a loop without an end: {}", self.name);
                 }
             }
             self.take();
-            if std::env::var_os("DBG").is_some() && (t.0 / 1_000_000) % 1000 == 0 {
-                for (r, end) in self.buses.iter().zip(&self.wires) {
-                    let d = r.status.devices().next().unwrap();
-                    eprintln!(
-                        "{t:?} {:?} {:?} full {} fail {} frames {} {:?}",
-                        d.name,
-                        d.state.get(),
-                        r.status.queue_full.load(Relaxed),
-                        r.status.send_failures.load(Relaxed),
-                        r.status.frames.load(Relaxed),
-                        end.with(|w| w.passed)
-                    );
-                }
-            }
         }
         self.finish()
     }

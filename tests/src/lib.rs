@@ -20,6 +20,7 @@ mod browser;
 pub mod can;
 pub mod chain;
 pub mod fuzz;
+mod parallel;
 mod process;
 pub mod promise;
 pub mod truth;
@@ -27,4 +28,5 @@ pub mod watch;
 
 pub use arm::{Arm, Written};
 pub use browser::browse;
+pub use parallel::on_all_processors;
 pub use process::{PATIENCE, Process, Rig, now, uml, until};

@@ -28,7 +28,6 @@ use random::Random;
 use robot::Robot;
 use std::f64::consts::TAU;
 use std::fmt::Write as _;
-use toml::Table;
 use trouble::Series;
 use world::{DURATION, World};
 
@@ -70,11 +69,7 @@ impl Run {
                 sensor.insert("offset_nm".into(), off([*nx, *ny, *nz], 0.03 * by));
             }
         }
-        let mut identification = Table::new();
-        identification.insert("enabled".into(), learn.into());
-        robot
-            .config
-            .insert("identification".into(), identification.into());
+        robot::set(&mut robot.config, "identification", "enabled", learn);
         let setup = Setup::with_model(&robot.config(), robot.cad.clone());
         let setup = setup.unwrap_or_else(|e| panic!("{}: {e}\n{}", robot.name, robot.config));
         let mut world = World::new(&robot, &setup, trouble, seed);

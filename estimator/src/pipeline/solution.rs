@@ -119,14 +119,10 @@ impl Pipeline {
             unwatched: &[],
         };
         let structure = &self.setup.robot.structure;
-        let watched = self.contacts.watched(t);
         for (own, dependence) in (structure.subtrees().iter()).zip(&self.dependences.subtrees) {
-            let unwatched = own.contacts.difference(&watched);
-            if own.sensors.is_empty() || unwatched.is_empty() {
-                continue;
-            }
             let (reason, cause) = validity.reason_and_cause(dependence);
-            if reason != Reason::None {
+            if reason != Reason::None && !own.sensors.is_empty() {
+                let unwatched = own.contacts.difference(&self.contacts.watched(t));
                 self.unwatched.push((unwatched, reason, cause));
             }
         }

@@ -7,9 +7,8 @@
 //! What is broken is printed, with the words that repeat it; so is a single run.
 
 use proprio_tests::chain::{DURATION, FAMILIES, Family, Fault, Shown, run};
+use proprio_tests::on_all_processors;
 use std::process::ExitCode;
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 struct Case {
     seed: u64,
@@ -52,21 +51,28 @@ fn main() -> ExitCode {
             }
         }
     }
-    let shown = all(&cases);
-    let by_fault = |name: &str| {
-        shown
-            .iter()
-            .filter(|(k, _)| cases[*k].fault.0 == name)
-            .collect()
+    let shown = on_all_processors(
+        &cases,
+        |Case {
+             seed,
+             family,
+             fault,
+         }| {
+            let one = run(*seed, *family, fault.1)?;
+            if one.is_broken() || cases.len() == 1 {
+                eprintln!("{seed} {seed} {:?} {:?}: {one:?}", family.name, fault.0);
+            }
+            Some(one)
+        },
+    );
+    let those = |is: &dyn Fn(&Case) -> bool| -> Vec<&Shown> {
+        let own = shown.iter().filter(|(case, _)| is(case));
+        own.map(|(_, shown)| shown).collect()
     };
-    let by_family = |name: &str| {
-        shown
-            .iter()
-            .filter(|(k, _)| cases[*k].family.name == name)
-            .collect()
-    };
-    table("fault", &names, by_fault);
-    table("family", &families, by_family);
+    table("fault", &names, |name| those(&|case| case.fault.0 == name));
+    table("family", &families, |name| {
+        those(&|case| case.family.name == name)
+    });
     let broken = shown.iter().filter(|(_, shown)| shown.is_broken()).count();
     let frames: u64 = shown.iter().map(|(_, shown)| shown.frames).sum();
     println!(
@@ -77,12 +83,10 @@ fn main() -> ExitCode {
     ExitCode::from(u8::from(broken > 0))
 }
 
-type Of<'a> = Vec<&'a (usize, Shown)>;
-
 /// A line for each name that has runs.
-fn table<'a>(title: &str, names: &[&str], of: impl Fn(&str) -> Of<'a>) {
+fn table<'a>(title: &str, names: &[&str], of: impl Fn(&str) -> Vec<&'a Shown>) {
     println!(
-        "\n| {title} | runs | broken promise | readings off | missing | silent | valid before, \\
+        "\n| {title} | runs | broken promise | readings off | missing | silent | valid before, \
          during, after | named | worst |\n|---|---|---|---|---|---|---|---|---|"
     );
     for name in names {
@@ -90,16 +94,16 @@ fn table<'a>(title: &str, names: &[&str], of: impl Fn(&str) -> Of<'a>) {
         if runs.is_empty() {
             continue;
         }
-        let count = |is: &dyn Fn(&Shown) -> bool| runs.iter().filter(|(_, s)| is(s)).count();
+        let count = |is: &dyn Fn(&Shown) -> bool| runs.iter().filter(|s| is(s)).count();
         let mean = |of: &dyn Fn(&Shown) -> f64| {
             let all: Vec<f64> = runs
                 .iter()
-                .map(|(_, s)| of(s))
+                .map(|s| of(s))
                 .filter(|x| x.is_finite())
                 .collect();
             all.iter().sum::<f64>() / all.len() as f64
         };
-        let worst = runs.iter().filter_map(|(_, s)| s.outcome.worst.as_ref());
+        let worst = runs.iter().filter_map(|s| s.outcome.worst.as_ref());
         let worst = worst.max_by(|a, b| a.share.total_cmp(&b.share));
         let worst = worst.map_or_else(String::new, |worst| {
             format!("{:.2} Nm, {:.0} deviations", worst.error, worst.deviations)
@@ -108,7 +112,7 @@ fn table<'a>(title: &str, names: &[&str], of: impl Fn(&str) -> Of<'a>) {
             "| {name} | {} | {} | {} | {} | {} | {:.2}, {:.2}, {:.2} | {:.2} | {worst} |",
             runs.len(),
             count(&|s| s.outcome.is_broken()),
-            count(&|s| s.readings[1] > 0),
+            count(&|s| s.is_off()),
             count(&|s| !s.missing.is_empty()),
             count(&|s| !s.silent.is_empty()),
             mean(&|s| s.valid[0]),
@@ -117,36 +121,4 @@ fn table<'a>(title: &str, names: &[&str], of: impl Fn(&str) -> Of<'a>) {
             mean(&|s| s.named[1] as f64 / s.named[0] as f64),
         );
     }
-}
-
-/// The runs of all cases whose robot has such a device, on all processors.
-fn all(cases: &[Case]) -> Vec<(usize, Shown)> {
-    let (next, shown) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
-    std::thread::scope(|scope| {
-        for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
-            scope.spawn(|| {
-                loop {
-                    let number = next.fetch_add(1, Ordering::Relaxed);
-                    let Some(Case {
-                        seed,
-                        family,
-                        fault,
-                    }) = cases.get(number)
-                    else {
-                        return;
-                    };
-                    let Some(one) = run(*seed, *family, fault.1) else {
-                        continue;
-                    };
-                    if one.is_broken() || cases.len() == 1 {
-                        eprintln!("{seed} {seed} {:?} {:?}: {one:?}", family.name, fault.0);
-                    }
-                    shown.lock().expect("no panic").push((number, one));
-                }
-            });
-        }
-    });
-    let mut shown = shown.into_inner().expect("no panic");
-    shown.sort_by_key(|(number, _)| *number);
-    shown
 }

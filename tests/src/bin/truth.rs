@@ -6,10 +6,9 @@
 //! truth --keep FOLDER SEED TROUBLE   writes one run's log, configuration and URDF
 //! ```
 
+use proprio_tests::on_all_processors;
 use proprio_tests::truth::{Outcome, Run, TROUBLES, Trouble};
 use std::process::ExitCode;
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 fn main() -> ExitCode {
     let words: Vec<String> = std::env::args().skip(1).collect();
@@ -31,14 +30,16 @@ fn main() -> ExitCode {
         [first, last, ref names @ ..] => (first, last, names),
         _ => ("1", "12", &[][..]),
     };
-    let seeds = first.parse().expect("a seed")..=last.parse().expect("a seed");
+    let seeds: Vec<u64> =
+        (first.parse().expect("a seed")..=last.parse().expect("a seed")).collect();
     let (mut runs, mut broken) = (0, 0);
     println!(
         "| trouble | broken | valid late | deviation / range | named | worst |\n\
          |---|---|---|---|---|---|"
     );
     for (name, trouble) in named(names) {
-        let outcomes = all(seeds.clone().collect(), trouble);
+        let run = |seed: &u64| Some(Run::new(*seed, trouble)?.judged());
+        let outcomes = on_all_processors(&seeds, run);
         let (line, few) = line(&outcomes);
         println!("| {name} | {few} of {} | {line} |", outcomes.len());
         for (seed, outcome) in outcomes.iter().filter(|(_, outcome)| outcome.is_broken()) {
@@ -61,28 +62,8 @@ fn named(names: &[&str]) -> Vec<(&'static str, Trouble)> {
     all.filter(|(known, _)| is_meant(known)).collect()
 }
 
-/// The runs of all seeds, on all processors.
-fn all(seeds: Vec<u64>, trouble: Trouble) -> Vec<(u64, Outcome)> {
-    let (next, outcomes) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
-    std::thread::scope(|scope| {
-        for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
-            scope.spawn(|| {
-                while let Some(seed) = seeds.get(next.fetch_add(1, Ordering::Relaxed)) {
-                    if let Some(run) = Run::new(*seed, trouble) {
-                        let outcome = run.judged();
-                        outcomes.lock().expect("no panic").push((*seed, outcome));
-                    }
-                }
-            });
-        }
-    });
-    let mut outcomes = outcomes.into_inner().expect("no panic");
-    outcomes.sort_by_key(|(seed, _)| *seed);
-    outcomes
-}
-
 /// The line of the table, and how many runs break the promise.
-fn line(outcomes: &[(u64, Outcome)]) -> (String, usize) {
+fn line(outcomes: &[(&u64, Outcome)]) -> (String, usize) {
     let of = || outcomes.iter().map(|(_, outcome)| outcome);
     let broken = of().filter(|outcome| outcome.is_broken()).count();
     let [all, valid] = [0, 1].map(|k| of().map(|outcome| outcome.late[k]).sum::<usize>());

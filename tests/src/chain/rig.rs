@@ -2,7 +2,7 @@
 //! the simulated boards.
 
 use crate::truth::random::Random;
-use crate::truth::robot::{Robot, numbers, tables};
+use crate::truth::robot::{Robot, numbers, set, tables};
 use proprio_dynamics::model::JointKind;
 use proprio_estimator::config::Config;
 use proprio_estimator::setup::Setup;
@@ -11,7 +11,6 @@ use proprio_simulator::{Robot as SimulatedRobot, Settings, Simulation, Simulator
 use proprio_topics::{Kind, Nanos};
 use std::fmt::Write as _;
 use std::path::Path;
-use toml::Table;
 
 /// A device family in one of its configurations.
 #[derive(Debug, Clone, Copy)]
@@ -240,17 +239,14 @@ impl Rig {
         };
         let families = [Kind::Wrench, Kind::Imu, Kind::Joint].map(|kind| of(kind, random));
         let finest = families[2].half_step / families[2].ratio;
-        let mut differentiation = Table::new();
         let noise = 4.8e-4_f64.max(finest + 1e-4);
-        differentiation.insert("position_noise_rad".into(), noise.into());
-        robot
-            .config
-            .insert("differentiation".into(), differentiation.into());
-        let mut identification = Table::new();
-        identification.insert("enabled".into(), true.into());
-        robot
-            .config
-            .insert("identification".into(), identification.into());
+        set(
+            &mut robot.config,
+            "differentiation",
+            "position_noise_rad",
+            noise,
+        );
+        set(&mut robot.config, "identification", "enabled", true);
         let setup = Setup::with_model(&robot.config(), robot.cad.clone());
         let setup = setup.unwrap_or_else(|e| panic!("{}: {e}\n{}", robot.name, robot.config));
         if setup.channels().all(|(kind, _)| kind != family.kind) {

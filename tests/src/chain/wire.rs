@@ -172,7 +172,7 @@ pub(super) struct Passed {
 
 /// A bus with its boards.
 pub(super) struct Wire {
-    clock: SimulatedClock,
+    pub(super) clock: SimulatedClock,
     boards: BusSimulator,
     /// The end of the present slice of time.
     pub(super) horizon: Nanos,
@@ -242,12 +242,12 @@ impl Wire {
         self.free = self.free.max(t) + FRAME;
         let mut arrival = self.free;
         let mut again = None;
-        let present = (self.planned.iter()).find(|p| p.is_in(t) && p.concerns(frame.id));
+        let present = self.fault(t, Some(frame.id));
         let mut is_lost = false;
         let length = frame.data().len();
         let random = &mut self.random;
         let seconds = |random: &mut Random, from, to| Nanos::from_seconds(random.uniform(from, to));
-        match present.map_or(Fault::None, |p| p.fault) {
+        match present {
             Fault::Off => is_lost = true,
             Fault::Garbage if random.happens(0.1) => {
                 let data: Vec<u8> = (0..length).map(|_| random.below(256) as u8).collect();

@@ -175,13 +175,8 @@ impl Robot {
         config.insert("schema".into(), 1.into());
         config.insert("robot".into(), "truth".into());
         config.insert("model".into(), "model.urdf".into());
-        let mut set = |table: &str, key: &str, value: f64| {
-            let table = config.entry(table).or_insert_with(|| Table::new().into());
-            let table = table.as_table_mut().expect("a table");
-            table.insert(key.into(), value.into());
-        };
-        set("input", "max_silence_ms", 50.0);
-        set("output", "max_wait_ms", 20.0);
+        set(&mut config, "input", "max_silence_ms", 50.0);
+        set(&mut config, "output", "max_wait_ms", 20.0);
         let joints: Vec<String> = tables(&mut config, "force_torque")
             .filter_map(|sensor| Some(sensor.get("joint")?.as_str()?.to_owned()))
             .collect();
@@ -230,6 +225,13 @@ pub(crate) fn tables<'a>(
 ) -> impl Iterator<Item = &'a mut Table> + use<'a> {
     let array = config.get_mut(name).and_then(Value::as_array_mut);
     array.into_iter().flatten().filter_map(Value::as_table_mut)
+}
+
+/// Sets a key in a table of the configuration.
+pub(crate) fn set(config: &mut Table, table: &str, key: &str, value: impl Into<Value>) {
+    let table = config.entry(table).or_insert_with(|| Table::new().into());
+    let table = table.as_table_mut().expect("a table");
+    table.insert(key.into(), value.into());
 }
 
 fn tables_mut<'a>(config: &'a mut Table, name: &str) -> &'a mut Vec<Value> {
