@@ -48,6 +48,8 @@ pub(super) struct Calibration {
     /// \[N or Nm per gauge count\], once all is known.
     per_count: Option<[[f64; 6]; 6]>,
     refusal: Option<Refusal>,
+    /// The last answer that differs from an earlier one: row, pair of columns, values.
+    other: Option<(u8, usize, [u64; 2])>,
     /// The current request.
     question: u8,
     answered: bool,
@@ -72,6 +74,7 @@ impl Calibration {
             asked_rows: Default::default(),
             per_count: None,
             refusal: None,
+            other: None,
             question: 0,
             answered: false,
             sent: 0,
@@ -145,7 +148,6 @@ impl Calibration {
             }
             _ => out.fault(Counter::Length, 1, frame.id),
         }
-        self.complete();
     }
 
     /// Counts (0) or units (1); `None` is a value that cannot be used.
@@ -168,7 +170,10 @@ impl Calibration {
                 out.fault(Counter::Changed, 1, frame.id);
                 self.refuse(Refusal::Changed, frame);
             }
-            _ => *known = Some([force, torque]),
+            _ => {
+                *known = Some([force, torque]);
+                self.complete();
+            }
         }
     }
 
@@ -203,6 +208,15 @@ impl Calibration {
                 .zip(told)
                 .all(|(a, b)| a.to_bits() == b.to_bits());
             if *known & bit != 0 && !same {
+                // An answer that was long on its way, as after a loss of the link, is that of
+                // another row: the row is asked for again.
+                let other = Some((row, pair, told.map(f64::to_bits)));
+                if self.mode == Mode::Supervise && self.other != other {
+                    self.other = other;
+                    self.asked_rows.iter_mut().for_each(ArrayVec::clear);
+                    self.attempts.slow_down(frame.t);
+                    return out.fault(Counter::Unexpected, 1, frame.id);
+                }
                 out.fault(Counter::Changed, 1, frame.id);
                 return self.refuse(Refusal::Changed, frame);
             }
@@ -214,6 +228,7 @@ impl Calibration {
         }
         if is_row(values) {
             self.answered |= self.question == ROWS + row;
+            self.complete();
         } else {
             *known = 0;
             out.fault(Counter::Value, 1, frame.id);
@@ -242,17 +257,19 @@ impl Calibration {
             self.known = [0; 6];
         }
         self.per_count = None;
+        self.complete();
     }
 
-    /// Computes the conversion, if all is known.
+    /// Computes the conversion, if all is known: then an answer also ends a refusal.
     fn complete(&mut self) {
         let rows_known = self.known.iter().all(|known| *known == 0b111);
         let (Some(counts), Some(units), true) = (self.counts, self.units, rows_known) else {
             return;
         };
-        if self.per_count.is_some() || self.refusal == Some(Refusal::Changed) {
+        if self.refusal == Some(Refusal::Changed) {
             return;
         }
+        self.refusal = None;
         let ([force, torque], [newton, newton_metre]) = (counts, units);
         let [fx, fy, fz, tx, ty, tz] = self.matrix;
         let scaled = |row: [f64; 6], unit: f64| row.map(|x| x * unit);
@@ -265,7 +282,6 @@ impl Calibration {
             scaled(ty, t),
             scaled(tz, t),
         ]);
-        self.refusal = None;
     }
 
     /// Whether the current request is not needed.

@@ -456,6 +456,72 @@ fn a_sensor_that_does_not_tell_its_calibration_is_refused_by_name() {
 }
 
 #[test]
+fn a_sensor_that_was_off_for_long_streams_again() {
+    let mut rig = rig("");
+    rig.run(400);
+    assert_eq!(rig.device.state(), State::Streaming);
+    rig.board_loses = Box::new(|_, _| true);
+    rig.run(3000);
+    let refused = State::Refused(Refusal::NoCalibration);
+    assert_eq!(rig.device.state(), refused);
+    rig.board_loses = Box::new(|_, _| false);
+    rig.run(1500);
+    assert_eq!(rig.device.state(), State::Streaming);
+}
+
+/// While the link is down, answers wait on the board's side; they come when the matrix is read anew.
+/// A matrix that really is another one is refused.
+#[test]
+fn old_answers_are_not_taken_for_another_matrix() {
+    for is_other in [false, true] {
+        let mut rig = rig("");
+        rig.run(400);
+        rig.device.restart(rig.now);
+        let mut answers = proprio_drivers::Frames::new();
+        for row in 3..5 {
+            let request = frame(&format!("202#0{row}"), 0.0);
+            rig.board.on_frame(&request, &mut answers);
+        }
+        if is_other {
+            let other = options("ati_netcanoem", parts()[2]);
+            rig.board = other.board(&spec(0x20, Mode::Supervise, &[])).unwrap();
+        }
+        // They come right after the first request for a row.
+        let is_row = |sent: &String| sent.starts_with("202#");
+        let before = rig.sent.iter().filter(|sent| is_row(sent)).count();
+        rig.board_loses = Box::new(|_, frame| frame.to_string().starts_with("202"));
+        while rig.sent.iter().filter(|sent| is_row(sent)).count() == before {
+            rig.run(1);
+        }
+        let mut out = Decoded::new();
+        for answer in answers {
+            let answer = answer.at(rig.now, proprio_topics::StampKind::Software);
+            rig.device.on_frame(&answer, &mut out);
+        }
+        assert!(is_other || !out.faults.is_empty());
+        rig.board_loses = Box::new(|_, _| false);
+        rig.run(3000);
+        let state = match is_other {
+            true => State::Refused(Refusal::Changed),
+            false => State::Streaming,
+        };
+        assert_eq!(rig.device.state(), state);
+    }
+}
+
+/// What was known before does not end the refusal.
+#[test]
+fn numbers_that_become_bad_are_refused() {
+    let (mut frames, _) = session(true);
+    frames.push(frame("3F7#", 900.0));
+    frames.push(frame("3F7#00000000000007D0", 900.1));
+    let mut device = session_listener("");
+    decode(&mut *device, &frames);
+    let refused = State::Refused(Refusal::BadCalibration { channel: 0 });
+    assert_eq!(device.state(), refused);
+}
+
+#[test]
 fn a_calibration_that_changes_is_refused() {
     let (mut frames, _) = session(true);
     // Counts, then units, then a row, told again with another value.
