@@ -37,6 +37,8 @@ pub(super) struct Sanity {
     /// An encoder's readings repeat themselves as its noise makes impossible, or since it stopped
     /// at once.
     is_still: bool,
+    /// It has stopped at once, and a residual has shown since then that something is wrong.
+    is_stuck: bool,
 }
 
 impl Sanity {
@@ -46,6 +48,7 @@ impl Sanity {
     pub(super) fn of_encoder(peak: f64) -> Self {
         Self {
             is_encoder: true,
+            jumps: Jumps::of_encoders([peak; 6]),
             ..Self::of_noisy([peak; 6])
         }
     }
@@ -57,12 +60,25 @@ impl Sanity {
             jumps: Jumps::new(peaks),
             is_encoder: false,
             is_still: false,
+            is_stuck: false,
         }
     }
 
-    /// Whether this is an encoder that stands or is stuck.
-    pub(super) const fn is_still(&self) -> bool {
-        self.is_still
+    /// A residual beyond this encoder shows that something is wrong.
+    pub(super) fn suspect(&mut self) {
+        self.is_stuck |= self.is_encoder && self.jumps.has_stopped();
+    }
+
+    /// Whether this is an encoder that may be stuck; `is_suspect`: a residual shows at present that
+    /// something is wrong. One that has stopped at once stays a suspect until it goes on: in some
+    /// postures its error hardly shows.
+    pub(super) const fn may_be_stuck(&self, is_suspect: bool) -> bool {
+        self.is_stuck || self.is_still && is_suspect
+    }
+
+    /// Whether the last reading does not continue the motion of those before.
+    pub(super) fn has_stepped(&self) -> bool {
+        self.jumps.has_stepped()
     }
 
     /// The flags of a reading at `t`, NaN where it has fewer than six values, with `quality` as its
@@ -81,6 +97,7 @@ impl Sanity {
         let least = least.clamp(2, LONGEST);
         let is_repeated = self.repeats.look(values, quality, least) != 0;
         self.is_still = self.is_encoder && (is_repeated || self.jumps.has_stopped());
+        self.is_stuck &= self.jumps.has_stopped();
         let mut flags = quality;
         if is_repeated && !self.is_encoder {
             flags |= Quality::FROZEN;

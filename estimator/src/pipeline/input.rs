@@ -45,11 +45,11 @@ impl Pipeline {
                     return;
                 }
                 if admit(is_valid) {
-                    if !is_continued {
-                        window.interrupt();
-                    }
                     const NONE: f64 = f64::NAN;
                     let quality = judged([j.position, NONE, NONE, NONE, NONE, NONE]);
+                    if !is_continued || sanity.is_some_and(|sanity| sanity.has_stepped()) {
+                        window.interrupt();
+                    }
                     // A position that is not to be trusted is kept, but not differentiated.
                     match Reason::of_quality(quality, Quality::UNTRUSTED_ENCODER) {
                         Reason::None => {

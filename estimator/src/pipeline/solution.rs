@@ -187,14 +187,21 @@ impl Pipeline {
         let balances = self.residuals.subtrees().zip(&self.dependences.subtrees);
         let balances = balances.filter(|(residual, _)| residual.is_disturbed());
         let before = balances.fold(DofSet::EMPTY, |all, (_, own)| all.union(&own.dofs));
-        let stuck = |dependence: &Dependence| {
-            if before.is_empty() {
-                return None;
+        let mut may_be_stuck = false;
+        for (channel, sanity) in channels.iter().zip(&mut self.sanity) {
+            if let ChannelRole::Joint(dof) = channel.role {
+                let is_suspect = before.contains(dof);
+                if is_suspect {
+                    sanity.suspect();
+                }
+                may_be_stuck |= sanity.may_be_stuck(is_suspect);
             }
+        }
+        let stuck = |dependence: &Dependence| {
             let mut encoders = channels.iter().zip(&self.sanity);
             encoders.position(|(channel, sanity)| match channel.role {
                 ChannelRole::Joint(dof) => {
-                    before.contains(dof) && dependence.dofs.contains(dof) && sanity.is_still()
+                    dependence.dofs.contains(dof) && sanity.may_be_stuck(before.contains(dof))
                 }
                 _ => false,
             })
@@ -232,6 +239,7 @@ impl Pipeline {
                 reason = moved(dof).find_map(doubted).unwrap_or_default();
             }
             if reason == Reason::None
+                && may_be_stuck
                 && let Some(channel) = stuck(dependence)
             {
                 let number = u32::try_from(channel).unwrap_or(NO_CAUSE);

@@ -30,9 +30,11 @@
 //! # Jumps
 //! A value that is far from where those before it lead is doubtful until the next one confirms it:
 //! one wrong reading is no motion and no load. A value that stops at once, in the midst of a
-//! motion, is not confirmed by its repeats. See [`Jumps`].
+//! motion, is not confirmed by its repeats. A joint does not jump at all: an encoder that does is
+//! off until it jumps back. See [`Jumps`].
 
 use crate::{Nanos, Quality};
+use core::f64::consts::TAU;
 
 /// Minus the logarithm of the probability of a false alarm per reading: 1e-12.
 const CERTAINTY: f64 = 27.6;
@@ -202,6 +204,10 @@ const FIRST: u32 = 16;
 const BRAKING: f64 = 0.02;
 /// A stop counts as at once from so many times the largest recent distance on.
 const STOP: f64 = 2.0;
+/// No joint of a robot moves faster \[rad/s, m/s\]: eight turns a second.
+const FASTEST: f64 = 50.0;
+/// A reading that comes later than this is of no use \[s\].
+const LATE: f64 = 0.1;
 /// How much larger the expected distance becomes by one reading, at most: two wrong readings that
 /// confirm each other by chance shall not make the third a usual one.
 const GROWTH: f64 = 2.0;
@@ -230,6 +236,13 @@ struct Path {
     doubtful: Option<(Nanos, f64, f64)>,
     /// It has stopped at once, and its value has been the same since then.
     has_stopped: bool,
+    /// The last reading confirmed that the value is another one, without a motion.
+    has_stepped: bool,
+    /// Of an encoder, whose joint moves no faster than this: where the joint is, by all smooth
+    /// changes, and when it was last seen to move there. What does not lead there is off.
+    fastest: f64,
+    joint: (Nanos, f64),
+    is_off: bool,
 }
 
 impl Path {
@@ -245,6 +258,10 @@ impl Path {
         resumes: false,
         doubtful: None,
         has_stopped: false,
+        has_stepped: false,
+        fastest: f64::INFINITY,
+        joint: (Nanos::ZERO, 0.0),
+        is_off: false,
     };
 
     /// Takes a reading; returns whether it is doubtful.
@@ -264,11 +281,14 @@ impl Path {
             } else {
                 after
             };
+            (self.joint, self.is_off) = ((t, value), false);
             return self.accept(t, value, if self.count > 2 { distance } else { 0.0 });
         }
         if self.resumes {
+            (self.joint, self.is_off) = ((t, value), false);
             return self.accept(t, value, 0.0);
         }
+        self.has_stepped = false;
         let most = self.most.max(self.step).max(self.least);
         // A joint that moves steadily never shows its resolution, so that does not count here.
         let is_at_once = distance > STOP * self.most * (after / self.period).max(1.0);
@@ -285,6 +305,10 @@ impl Path {
         // Smooth values bend with the square of the time.
         let longer = (after / self.period).max(1.0);
         if distance <= usual * longer * longer {
+            // A joint that is stuck for the gateway goes on.
+            if value != self.value {
+                self.joint = (t, self.joint.1 + value - self.value);
+            }
             return self.accept(t, value, distance / (longer * longer));
         }
         if let Some((then, before, off)) = self.doubtful {
@@ -297,6 +321,14 @@ impl Path {
                     true => 0.0,
                     false => off.min(GROWTH * most),
                 };
+                let late = self.rate.abs() * LATE;
+                self.land(then, before, late);
+                self.has_stepped = is_near;
+                if is_near {
+                    self.joint.1 += value - before;
+                } else if !self.is_off {
+                    self.land(t, value, late);
+                }
                 (self.t, self.value) = (then, before);
                 return self.accept(t, value, most);
             }
@@ -305,7 +337,20 @@ impl Path {
         true
     }
 
-    /// Goes on from this reading, which is not doubtful.
+    /// The path goes on from elsewhere: whether the joint can be there. It may have moved by
+    /// `late` while readings were on their way.
+    fn land(&mut self, t: Nanos, value: f64, late: f64) {
+        let (then, before) = self.joint;
+        let apart = (value - before).abs();
+        // A position within a turn begins anew after each.
+        let apart = apart.min((apart - TAU).abs());
+        self.is_off = apart > self.fastest * (t - then).seconds() + late;
+        if !self.is_off {
+            self.joint = (t, value);
+        }
+    }
+
+    /// Goes on from this reading, which is not doubtful but for what the encoder is off.
     fn accept(&mut self, t: Nanos, value: f64, distance: f64) -> bool {
         let after = (t - self.t).seconds();
         self.resumes = after > GAP * self.period;
@@ -316,7 +361,7 @@ impl Path {
         self.period += (after.min(2.0 * self.period) - self.period) / MEMORY;
         self.most = (self.most * (1.0 - 1.0 / MEMORY)).max(distance);
         (self.t, self.value, self.doubtful) = (t, value, None);
-        false
+        self.is_off
     }
 }
 
@@ -346,6 +391,19 @@ impl<const N: usize> Jumps<N> {
         }))
     }
 
+    /// For encoders, in rad or m: a joint is never at once elsewhere. One that has jumped by more
+    /// than a joint can move reads another zero from then on; all its readings are doubtful until
+    /// it jumps back to where the joint has moved meanwhile, or until a new zero, or a gap in which
+    /// the joint can have moved there. A jump by a turn is none.
+    #[must_use]
+    pub fn of_encoders(peaks: [f64; N]) -> Self {
+        let paths = Self::new(peaks).0;
+        Self(paths.map(|path| Path {
+            fastest: FASTEST,
+            ..path
+        }))
+    }
+
     /// The usual time between two readings \[s\]: one that comes early or late hardly changes it.
     /// Not known before the second reading.
     #[must_use]
@@ -360,9 +418,17 @@ impl<const N: usize> Jumps<N> {
         self.0.iter().any(|path| path.has_stopped)
     }
 
+    /// Whether an axis has another value since the reading before the last one, to which no motion
+    /// leads: what came before and what follows are not one smooth motion.
+    #[must_use]
+    pub fn has_stepped(&self) -> bool {
+        self.0.iter().any(|path| path.has_stepped)
+    }
+
     /// Takes a reading at `t`, NaN where it has none; returns whether it is doubtful.
     pub fn look(&mut self, t: Nanos, values: &[f64; N], quality: Quality) -> bool {
-        if quality.intersects(Quality::ZERO_CHANGED) {
+        // An encoder that does not know its zero yet will jump.
+        if quality.intersects(Quality::ZERO_CHANGED | Quality::NOT_CALIBRATED) {
             self.0.iter_mut().for_each(|path| path.count = 0);
         }
         let all = self.0.iter_mut().zip(values);

@@ -347,6 +347,57 @@ fn what_has_changed_is_confirmed_by_the_next_reading() {
     assert!(!channel.read(700.0));
 }
 
+/// An encoder whose readings are another bit off, at times, in another direction; then one that was
+/// stuck, and goes on from where the joint is meanwhile.
+#[test]
+fn an_encoder_that_jumps_is_off_until_it_jumps_back() {
+    let mut channel = Channel {
+        jumps: Jumps::of_encoders([1e-4]),
+        t: 0,
+    };
+    let swing = |t: i64| 0.8 * (t as f64 * 2e-3).sin();
+    let mut run = |count: usize, off: f64| {
+        let mut last = (0, 0.0);
+        for _ in 0..count {
+            let value = swing(channel.t + 10) + off;
+            last = (last.0 + usize::from(channel.read(value)), value);
+        }
+        last
+    };
+    assert_eq!(run(500, 0.0).0, 0);
+    for off in [0.7, -46850.8, 46850.8, -0.7] {
+        assert_eq!(run(300, off).0, 300, "{off}");
+    }
+    let back = run(300, 0.0).0;
+    assert!(back <= 2, "{back}");
+    // One reading, and two, are off.
+    assert!(run(1, 3.0).0 == 1 && run(300, 0.0).0 == 0);
+    assert!(run(2, 3.0).0 == 2 && run(300, 0.0).0 <= 2);
+    let (_, stuck) = run(1, 0.0);
+    for _ in 0..100 {
+        channel.read(stuck);
+    }
+    let mut run = |count: usize| {
+        (0..count)
+            .filter(|_| channel.read(swing(channel.t + 10)))
+            .count()
+    };
+    assert!(run(100) <= 1);
+}
+
+/// A position from 0 to a turn begins anew.
+#[test]
+fn a_joint_that_turns_on_does_not_jump() {
+    let mut channel = Channel {
+        jumps: Jumps::of_encoders([1e-4]),
+        t: 0,
+    };
+    let turn = TAU;
+    let doubtful = (0..6000).filter(|k| channel.read((0.02 * f64::from(*k)).rem_euclid(turn)));
+    // The first reading of each of the turns.
+    assert_eq!(doubtful.count(), 19);
+}
+
 /// An encoder that is stuck stops at once; a joint that stops has to brake.
 #[test]
 fn what_stops_at_once_has_stopped() {
