@@ -111,12 +111,10 @@ impl InertialState {
                 if let Some(place) = self.offsets.get_mut(sensor) {
                     *place = offset.reading;
                 }
-                set_noise(
-                    &mut self.excess_variance,
-                    &robot.structure,
-                    sensor,
-                    offset.noise.torque_first().map(|x| x * x),
-                );
+                let noise = offset.noise.torque_first().map(|x| x * x);
+                if let Some(place) = self.excess_variance.get_mut(sensor) {
+                    *place = excess(&robot.structure, sensor, &noise);
+                }
                 if let (Some(place), Some(found)) =
                     (self.calibrations.get_mut(sensor), &offset.calibrated)
                 {
@@ -276,20 +274,13 @@ impl InertialState {
     }
 }
 
-/// Sets the excess variance of a sensor from the variance `found` of its readings [torque; force].
-pub(crate) fn set_noise(
-    excess_variance: &mut [[f64; 6]],
-    structure: &Structure,
-    sensor: usize,
-    found: [f64; 6],
-) {
-    if let (Some(place), Some(cut)) = (
-        excess_variance.get_mut(sensor),
-        structure.sensors().get(sensor),
-    ) {
-        let stated = Wrench::from_parts(cut.noise().force, cut.noise().torque).torque_first();
-        *place = std::array::from_fn(|i| (found[i] - stated[i] * stated[i]).max(0.0));
-    }
+/// The excess of the variance `found` of a sensor's readings over the stated one [torque; force].
+pub(crate) fn excess(structure: &Structure, sensor: usize, found: &[f64; 6]) -> [f64; 6] {
+    let Some(cut) = structure.sensors().get(sensor) else {
+        return [0.0; 6];
+    };
+    let stated = Wrench::from_parts(cut.noise().force, cut.noise().torque).torque_first();
+    std::array::from_fn(|i| (found[i] - stated[i] * stated[i]).max(0.0))
 }
 
 /// A group's root, extended by one row and one column for each unknown of its sensors'

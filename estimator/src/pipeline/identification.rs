@@ -16,7 +16,7 @@ use proprio_topics::{InertiaEstimate, LinkInertia, Name, Nanos, Quality, Reason,
 
 use super::buffers::{ChannelBuffer, OrReason, temperature_at};
 use crate::history::History;
-use crate::inertial::{PosteriorBlock, set_noise};
+use crate::inertial::{PosteriorBlock, excess};
 use crate::propagation::{Covariance, Propagation};
 use crate::setup::Setup;
 use proprio_dynamics::spatial::{RigidInertia, Vec3, Wrench};
@@ -480,7 +480,8 @@ impl OnlineIdentification {
 
     /// Puts a solution in use if its stamp has been reached; whether it did. The noise of the
     /// sensors that are `touched` does not grow: a push that lasts would look like noise, and end
-    /// for the residual test.
+    /// for the residual test. But it is that of the worst of the last undisturbed seconds: a sensor that
+    /// turns worse (late, vibrating) looks like a contact that comes and goes.
     pub(super) fn apply(
         &mut self,
         setup: &mut Setup,
@@ -534,15 +535,16 @@ impl OnlineIdentification {
                     *place = *offset;
                 }
             }
-            for (&sensor, found) in component.sensors.iter().zip(&component.noise) {
-                let most = match setup.state.excess_variance.get(sensor) {
-                    Some(before) if touched.contains(sensor) => *before,
-                    _ => [f64::INFINITY; 6],
-                };
-                let all = &mut setup.state.excess_variance;
-                set_noise(all, &setup.robot.structure, sensor, *found);
-                if let Some(excess) = all.get_mut(sensor) {
-                    *excess = std::array::from_fn(|i| excess[i].min(most[i]));
+            let found = component.noise.iter().zip(&component.latest);
+            for (&sensor, (found, latest)) in component.sensors.iter().zip(found) {
+                let structure = &setup.robot.structure;
+                let [found, latest] = [found, latest].map(|v| excess(structure, sensor, v));
+                if let Some(place) = setup.state.excess_variance.get_mut(sensor) {
+                    let most = match touched.contains(sensor) {
+                        true => *place,
+                        false => [f64::INFINITY; 6],
+                    };
+                    *place = std::array::from_fn(|i| found[i].min(most[i]).max(latest[i]));
                 }
             }
         }

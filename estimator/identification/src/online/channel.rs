@@ -39,6 +39,10 @@ const PAUSE: f64 = 3.0;
 /// distribution, in stated standard deviations.
 const DISTURBED: f64 = 0.02;
 const RANGE: f64 = 1000.0;
+/// Memory of a second that is worse than the others \[s\].
+const LATELY: f64 = 10.0;
+/// Probability from which on a second's mean is none.
+const LIKELY_NOISE: f64 = 0.5;
 /// Limit of the log-likelihood by data at rest, which say little of the noise in motion: `e^3`,
 /// odds of twenty.
 const AT_REST: f64 = 3.0;
@@ -90,6 +94,8 @@ pub(crate) struct Channel {
     products: (f64, f64),
     /// Mean square of observations about the mean of their second; None before the first.
     scatter: Option<f64>,
+    /// That of the worst of the last [`LATELY`] seconds whose mean was no disturbance.
+    latest: f64,
 }
 
 impl Channel {
@@ -102,6 +108,7 @@ impl Channel {
             innovation: f64::NAN,
             products: (CORRELATED.0 * CORRELATED.1, CORRELATED.1),
             scatter: None,
+            latest: 0.0,
         }
     }
 
@@ -160,6 +167,9 @@ impl Channel {
             }
         }
         let (innovation, share) = best.1;
+        if share > LIKELY_NOISE {
+            self.latest = second.scatter.max(self.latest * (1.0 - 1.0 / LATELY));
+        }
         let scatter = self.scatter.unwrap_or(second.scatter);
         self.scatter = Some(scatter + share * (second.scatter - scatter) / MEMORY);
         let last = std::mem::replace(&mut self.innovation, innovation.clamp(-LARGE, LARGE));
@@ -175,6 +185,11 @@ impl Channel {
     pub(crate) fn reading(&self) -> f64 {
         let slow = self.noise().0 * self.period;
         (self.scatter.unwrap_or(0.0) + slow).max(self.stated)
+    }
+
+    /// The largest scatter of the last [`LATELY`] seconds whose mean was no disturbance.
+    pub(crate) const fn latest(&self) -> f64 {
+        self.latest
     }
 
     /// `V`, and the standard deviation of the drift in a second: means over the grid by likelihood

@@ -360,6 +360,9 @@ impl Part {
         for (to, six) in solution.noise.iter_mut().zip(self.channels.chunks_exact(6)) {
             *to = std::array::from_fn(|i| six[i].reading());
         }
+        for (to, six) in (solution.latest.iter_mut()).zip(self.channels.chunks_exact(6)) {
+            *to = std::array::from_fn(|i| six[i].latest());
+        }
         for (place, offset) in solution.offsets.iter_mut().enumerate() {
             let six = |i: usize| self.reference[6 * place + i] + offsets[6 * place + i];
             *offset = Wrench::from_torque_first(std::array::from_fn(six));

@@ -206,6 +206,9 @@ pub struct ComponentSolution {
     /// Variance of one reading about its prediction [Nm^2, N^2], [torque; force]: sensor noise,
     /// vibration, late stamps.
     pub noise: Vec<[f64; 6]>,
+    /// Its part within a second, in the worst of the last ones in which nothing disturbed the
+    /// sensor.
+    pub latest: Vec<[f64; 6]>,
     /// The stamp of the newest data used.
     pub data: Nanos,
     /// The prior's weight; NaN before the first solution.
