@@ -53,10 +53,14 @@ const START: Nanos = Nanos::from_millis(5_000);
 const SLICE: Nanos = Nanos::from_millis(1);
 /// How long a killed gateway is away \[s\].
 const AWAY: f64 = 0.5;
+/// Of a long run: a fault begins so often, and is present for half of the time \[s\].
+const EVERY: f64 = 20.0;
+/// So many of them are a stage of it.
+const MANY: usize = 50;
 
 /// Old frames of a device that is asked for each reading: the most of those that are taken for the
 /// answer, because they come between a request and it. A device that streams gives no sign.
-const TAKEN: f64 = 0.25;
+const TAKEN: f64 = 0.5;
 
 /// How far a good reading may be off the truth at its stamp: resolution and noise of the coarsest
 /// family \[rad\], \[N\], \[Nm\], \[m/s^2\], \[rad/s\].
@@ -114,22 +118,45 @@ impl Shown {
 /// If the robot cannot be simulated.
 #[must_use]
 pub fn run(seed: u64, family: Family, fault: Fault) -> Option<Shown> {
+    let (from, until) = PRESENT;
+    let troubles = vec![Trouble { fault, from, until }];
     let folder = tempfile::tempdir().expect("a folder");
-    let random = Random::new(seed, "fault");
-    let settings = |plan: &Plan| {
-        let target = device_of(plan, family.kind, &mut random.clone());
-        let name = |(bus, device): (usize, usize)| plan.buses[bus].devices[device].name.clone();
-        Settings {
-            seed,
-            still: REST,
-            push: seed.is_multiple_of(2),
-            cycle: DURATION,
-            noise: true,
-            faults: target.map_or_else(Vec::new, |target| board_fault(fault, name(target))),
+    Some(Chain::open(seed, family, troubles, DURATION, folder.path())?.run(&mut |_| {}))
+}
+
+/// The same for a run of `duration` \[s\], with a fault in turn from the tenth second on: all of the
+/// list, in an order at random. After each stage `during` is told the time \[s\].
+///
+/// # Panics
+/// If the robot cannot be simulated.
+#[must_use]
+pub fn soak(
+    seed: u64,
+    family: Family,
+    duration: f64,
+    during: &mut dyn FnMut(f64),
+) -> Option<Shown> {
+    let random = &mut Random::new(seed, "troubles");
+    // The last one ends long before the run does.
+    let count = (duration / EVERY) as usize - 1;
+    let troubles = (0..count).map(|number| {
+        let from = EVERY * (number as f64 + 0.5);
+        Trouble {
+            fault: Fault::ALL[random.below(Fault::ALL.len())].1,
+            from,
+            until: from + 0.5 * EVERY,
         }
-    };
-    let rig = Rig::new(seed, family, settings, START, folder.path())?;
-    Some(Chain::new(rig, seed, fault, family, folder.path()).run())
+    });
+    let (troubles, folder) = (troubles.collect(), tempfile::tempdir().expect("a folder"));
+    Some(Chain::open(seed, family, troubles, duration, folder.path())?.run(during))
+}
+
+/// A fault, and when it is present \[s\].
+#[derive(Debug, Clone, Copy)]
+struct Trouble {
+    fault: Fault,
+    from: f64,
+    until: f64,
 }
 
 /// A device that measures `kind`: its bus and number.
@@ -142,15 +169,15 @@ fn device_of(plan: &Plan, kind: Kind, random: &mut Random) -> Option<(usize, usi
 }
 
 /// The fault that the board itself has.
-fn board_fault(fault: Fault, device: String) -> Vec<BoardFault> {
-    let (from, until) = PRESENT;
-    match fault {
-        Fault::Stuck => vec![BoardFault::Freeze {
+fn board_fault(trouble: &Trouble, device: String) -> Option<BoardFault> {
+    let (from, until) = (trouble.from, trouble.until);
+    match trouble.fault {
+        Fault::Stuck => Some(BoardFault::Freeze {
             device,
             window: Window { from, until },
-        }],
-        Fault::Reboot => vec![BoardFault::Reboot { device, at: from }],
-        _ => Vec::new(),
+        }),
+        Fault::Reboot => Some(BoardFault::Reboot { device, at: from }),
+        _ => None,
     }
 }
 
@@ -171,9 +198,11 @@ struct Running {
 struct Chain {
     plan: Plan,
     simulation: Simulation,
-    fault: Fault,
+    /// In the order of time.
+    troubles: Vec<Trouble>,
+    duration: f64,
     family: Family,
-    /// Bus and number of the device that has it.
+    /// Bus and number of the device that has the faults.
     target: (usize, usize),
     wires: Vec<End>,
     /// None while the gateway is killed.
@@ -193,15 +222,51 @@ struct Chain {
     named: [u64; 2],
     /// Per channel of the pipeline, whether the fault concerns it.
     concerned: Vec<bool>,
-    /// Per channel of the gateway, a wrench sensor's zero.
-    zeros: Vec<Option<[f64; 6]>>,
+    /// Per channel of the gateway, a wrench sensor's zero, and how well it is known.
+    zeros: Vec<Option<[[f64; 2]; 6]>>,
     readings: [u64; 2],
     first: Option<String>,
     missing: Vec<String>,
 }
 
 impl Chain {
-    fn new(rig: Rig, seed: u64, fault: Fault, family: Family, folder: &Path) -> Self {
+    /// The robot of `seed` with its processes.
+    fn open(
+        seed: u64,
+        family: Family,
+        troubles: Vec<Trouble>,
+        duration: f64,
+        folder: &Path,
+    ) -> Option<Self> {
+        let random = Random::new(seed, "fault");
+        let settings = |plan: &Plan| {
+            let target = device_of(plan, family.kind, &mut random.clone());
+            let name = |(bus, device): (usize, usize)| plan.buses[bus].devices[device].name.clone();
+            let faults = target.map(name).into_iter().flat_map(|device| {
+                let own = |trouble| board_fault(trouble, device.clone());
+                troubles.iter().filter_map(own).collect::<Vec<_>>()
+            });
+            Settings {
+                seed,
+                still: REST,
+                push: seed.is_multiple_of(2),
+                cycle: DURATION,
+                noise: true,
+                faults: faults.collect(),
+            }
+        };
+        let rig = Rig::new(seed, family, settings, START, folder)?;
+        Some(Self::new(rig, seed, troubles, duration, family, folder))
+    }
+
+    fn new(
+        rig: Rig,
+        seed: u64,
+        troubles: Vec<Trouble>,
+        duration: f64,
+        family: Family,
+        folder: &Path,
+    ) -> Self {
         let kind = family.kind;
         let target = device_of(&rig.plan, kind, &mut Random::new(seed, "fault")).expect("one");
         let Rig {
@@ -219,17 +284,14 @@ impl Chain {
             .into_iter()
             .enumerate()
             .map(|(bus, boards)| {
-                let planned = Planned {
-                    fault,
-                    from: at(PRESENT.0),
-                    until: at(PRESENT.1),
+                let own = troubles.iter().filter(|_| bus == target.0);
+                let planned = own.map(|trouble| Planned {
+                    fault: trouble.fault,
+                    from: at(trouble.from),
+                    until: at(trouble.until),
                     claims: claims.clone(),
-                };
-                let planned = if bus == target.0 {
-                    vec![planned]
-                } else {
-                    Vec::new()
-                };
+                });
+                let planned = planned.collect();
                 let random = Random::new(seed, &format!("wire {bus}"));
                 let wire = Wire::new(boards, planned, SimulatedClock::at(START), random);
                 End(Arc::new(Mutex::new(wire)))
@@ -238,7 +300,7 @@ impl Chain {
         let joints = setup.robot.joint_names().map(Into::into).collect();
         let names = setup.channels().map(|(_, name)| name.into()).collect();
         let mut truth = |t: f64| torques(&mut simulation, t);
-        let judge = Judge::new(joints, names, &mut truth, DURATION, REST + 10.0);
+        let judge = Judge::new(joints, names, &mut truth, duration, REST + 10.0);
         let map: Vec<Option<usize>> = plan
             .channels
             .iter()
@@ -246,7 +308,8 @@ impl Chain {
             .collect();
         let is_concerned = |name: &str| {
             let mut own = plan.channels.iter().filter(|c| c.name == name);
-            own.any(|c| c.bus == target.0 && (!fault.is_of_device() || c.device == target.1))
+            let is_of_device = troubles.iter().all(|trouble| trouble.fault.is_of_device());
+            own.any(|c| c.bus == target.0 && (!is_of_device || c.device == target.1))
         };
         let concerned = setup
             .channels()
@@ -259,7 +322,8 @@ impl Chain {
         let mut this = Self {
             plan,
             simulation,
-            fault,
+            troubles,
+            duration,
             family,
             target,
             wires,
@@ -327,12 +391,35 @@ impl Chain {
         }
     }
 
-    fn run(mut self) -> Shown {
+    /// The fault that is present, or was until `tail` ago \[s\].
+    fn trouble(&self, t: f64, tail: f64) -> Option<Trouble> {
+        let begun = self.troubles.partition_point(|trouble| trouble.from <= t);
+        let last = begun
+            .checked_sub(1)
+            .and_then(|last| self.troubles.get(last));
+        last.filter(|trouble| t < trouble.until + tail).copied()
+    }
+
+    fn run(mut self, during: &mut dyn FnMut(f64)) -> Shown {
         let mut t = START;
-        let (killed, back) = (at(PRESENT.0), at(PRESENT.0 + AWAY));
-        while t < at(DURATION) {
+        let (mut begun, mut epoch) = (0, 1);
+        while t < at(self.duration) {
             t += SLICE;
-            if self.fault == Fault::Restart && t > killed && t <= back {
+            while self
+                .troubles
+                .get(begun)
+                .is_some_and(|trouble| at(trouble.until) < t)
+            {
+                begun += 1;
+                if begun % MANY == 0 {
+                    self.judge.forget();
+                    during((t - START).seconds());
+                }
+            }
+            let present = self.troubles.get(begun);
+            let restart = present.filter(|trouble| trouble.fault == Fault::Restart);
+            let back = restart.map_or(Nanos::MIN, |trouble| at(trouble.from + AWAY));
+            if restart.is_some_and(|trouble| at(trouble.from) < t) && t <= back {
                 if !self.buses.is_empty() {
                     self.kill();
                 }
@@ -340,7 +427,8 @@ impl Chain {
                     .iter()
                     .for_each(|end| end.with(|wire| wire.pass_unheard(t)));
                 if t == back {
-                    self.start(2);
+                    epoch += 1;
+                    self.start(epoch);
                 }
                 continue;
             }
@@ -422,17 +510,19 @@ impl Chain {
         let channel = &self.plan.channels[sample.channel as usize];
         let t = (sample.header.acquired - START).seconds();
         // A fault's last frames arrive later.
-        let is_present = PRESENT.0 <= t && t < PRESENT.1 + 0.3;
-        let is_here = is_present && channel.bus == self.target.0;
+        let present = (self.trouble(t, 0.3)).filter(|_| channel.bus == self.target.0);
         // Some motors share an identifier: the frames of one may become those of another.
-        let is_bad = is_here && self.fault.is_of_values();
+        let is_bad = present.is_some_and(|trouble| trouble.fault.is_of_values());
         let Some(reading) = sample.reading() else {
             return;
         };
         if sample.header.quality.0 & !noted != 0 || is_bad {
+            if sample.header.quality.contains(Quality::ZERO_CHANGED) {
+                self.zeros[sample.channel as usize] = None;
+            }
             return;
         }
-        let lag = BEFORE + if is_here { self.fault.delay() } else { 0.0 };
+        let lag = BEFORE + present.map_or(0.0, |trouble| trouble.fault.delay());
         let name = channel.name.clone();
         let mut least = [f64::INFINITY; 6];
         let mut most = [f64::NEG_INFINITY; 6];
@@ -459,16 +549,20 @@ impl Chain {
                 let ([fx, fy, fz], [tx, ty, tz]) = (wrench.force, wrench.torque);
                 let (force, torque) = (OFF[1], OFF[2]);
                 let mut values = [fx, fy, fz, tx, ty, tz];
+                let mut off = [force, force, force, torque, torque, torque];
                 // Some sensors take the load at their start for zero, and the gateway knows.
                 let zero = &mut self.zeros[sample.channel as usize];
                 if zero.is_none() || sample.header.quality.contains(Quality::ZERO_CHANGED) {
-                    let middle = |axis: usize| 0.5 * (least[axis] + most[axis]);
-                    *zero = Some(std::array::from_fn(|axis| values[axis] - middle(axis)));
+                    *zero = Some(std::array::from_fn(|axis| {
+                        let (least, most) = (least[axis], most[axis]);
+                        [values[axis] - 0.5 * (least + most), 0.5 * (most - least)]
+                    }));
                 }
-                for (value, zero) in values.iter_mut().zip(zero.unwrap_or_default()) {
-                    *value -= zero;
+                for (axis, [zero, doubt]) in zero.unwrap_or_default().into_iter().enumerate() {
+                    values[axis] -= zero;
+                    off[axis] += doubt;
                 }
-                (values, [force, force, force, torque, torque, torque], 6)
+                (values, off, 6)
             }
             Reading::Imu(imu) => {
                 let number = self.simulation.imu(&name).expect("an IMU");
@@ -495,8 +589,9 @@ impl Chain {
             if value < least[axis] - off || value > most[axis] + off {
                 self.readings[1] += 1;
                 self.first.get_or_insert_with(|| {
+                    let fault = present.map(|trouble| trouble.fault);
                     format!(
-                        "{name}, t = {t:.4}: axis {axis} is {value}, and was {} to {}",
+                        "{name}, t = {t:.4}, {fault:?}: axis {axis} is {value}, and was {} to {}",
                         least[axis], most[axis]
                     )
                 });
@@ -532,10 +627,14 @@ impl Chain {
                     .push(format!("{passed:?}, {under_way} under way"));
             }
         }
-        let excused = match (self.fault, self.family.drops_old) {
-            (Fault::Old, true) => (TAKEN * added as f64) as u64,
-            (Fault::Old, false) => added,
-            _ => 0,
+        let has_old = self
+            .troubles
+            .iter()
+            .any(|trouble| trouble.fault == Fault::Old);
+        let excused = match (has_old, self.family.drops_old) {
+            (true, true) => (TAKEN * added as f64) as u64,
+            (true, false) => added,
+            (false, _) => 0,
         };
         self.pipeline.finish();
         self.judge();

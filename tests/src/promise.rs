@@ -180,6 +180,11 @@ impl Judge {
         }
     }
 
+    /// Forgets the deviations so far: a long run has many.
+    pub(crate) fn forget(&mut self) {
+        self.deviations.clear();
+    }
+
     /// What the run of `robot` showed, with trouble in `channel`.
     pub(crate) fn outcome(mut self, robot: String, channel: Option<String>) -> Outcome {
         (self.outcome.robot, self.outcome.channel) = (robot, channel);

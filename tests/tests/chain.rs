@@ -2,7 +2,7 @@
 //! fault.
 #![allow(missing_docs)]
 
-use proprio_tests::chain::{FAMILIES, Family, Fault, Shown, run};
+use proprio_tests::chain::{FAMILIES, Family, Fault, Shown, run, soak};
 
 fn family(name: &str) -> Family {
     let found = FAMILIES.iter().find(|family| family.name == name);
@@ -83,4 +83,18 @@ fn one_seed_is_one_run() {
     assert_eq!(format!("{one:?}"), format!("{other:?}"));
     let another = shown(4, "moteus", Fault::Loss);
     assert_ne!(one.frames, another.frames);
+}
+
+/// A longer run with one fault after the other.
+#[test]
+fn all_is_accounted_for_after_many_faults() {
+    let shown = soak(5, family("icub_motor"), 60.0, &mut |_| {}).expect("a robot with joints");
+    assert!(
+        shown.missing.is_empty() && shown.silent.is_empty(),
+        "{shown:#?}"
+    );
+    assert!(
+        shown.frames > 30_000 && shown.readings[0] > 30_000,
+        "{shown:#?}"
+    );
 }

@@ -2,13 +2,19 @@
 //!
 //! ```text
 //! chain [FIRST LAST [NAME..]]    seeds, and names of faults or families; default: 1 2, all
+//! chain soak SECONDS FAMILY..    one long run for each family, with all faults in turn
 //! ```
 //!
-//! What is broken is printed, with the words that repeat it; so is a single run.
+//! What is broken is printed, with the words that repeat it; so is a single run. The last line has
+//! the memory and the descriptors that this process had after a tenth of the runs, and at its end:
+//! each run opens and closes gateway, ports and estimator.
 
-use proprio_tests::chain::{DURATION, FAMILIES, Family, Fault, Shown, run};
-use proprio_tests::on_all_processors;
+use proprio_tests::chain::{DURATION, FAMILIES, Family, Fault, Shown, run, soak};
+use proprio_tests::{now, on_all_processors};
 use std::process::ExitCode;
+use std::sync::OnceLock;
+use std::sync::atomic::AtomicUsize;
+use std::sync::atomic::Ordering::Relaxed;
 
 struct Case {
     seed: u64,
@@ -19,6 +25,9 @@ struct Case {
 fn main() -> ExitCode {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    if let ["soak", seconds, ref families @ ..] = words[..] {
+        return soak_all(seconds.parse().expect("seconds"), families);
+    }
     let (first, last, words) = match words[..] {
         [first, last, ref words @ ..] => (first, last, words),
         _ => ("1", "2", &[][..]),
@@ -51,6 +60,8 @@ fn main() -> ExitCode {
             }
         }
     }
+    let early = OnceLock::new();
+    let done = AtomicUsize::new(0);
     let shown = on_all_processors(
         &cases,
         |Case {
@@ -61,6 +72,9 @@ fn main() -> ExitCode {
             let one = run(*seed, *family, fault.1)?;
             if one.is_broken() || cases.len() == 1 {
                 eprintln!("{seed} {seed} {:?} {:?}: {one:?}", family.name, fault.0);
+            }
+            if done.fetch_add(1, Relaxed) >= cases.len() / 10 {
+                early.get_or_init(held);
             }
             Some(one)
         },
@@ -80,7 +94,49 @@ fn main() -> ExitCode {
         shown.len(),
         DURATION * shown.len() as f64
     );
+    let [(memory, descriptors), (later, more)] = [early.into_inner().unwrap_or_default(), held()];
+    println!("memory {memory} and {later} kB, descriptors {descriptors} and {more}");
     ExitCode::from(u8::from(broken > 0))
+}
+
+/// One long run for each of these families. Memory and descriptors are those of all together.
+fn soak_all(seconds: f64, names: &[&str]) -> ExitCode {
+    let find = |name: &&str| FAMILIES.iter().find(|family| family.name == *name);
+    let families: Vec<(u64, Family)> = (1..)
+        .zip(names.iter().map(|name| *find(name).expect("a family")))
+        .collect();
+    let shown = on_all_processors(&families, |(seed, family)| {
+        let (begin, mut tenth) = (now(), 1.0);
+        soak(*seed, *family, seconds, &mut |t| {
+            if t >= 0.1 * tenth * seconds {
+                tenth += 1.0;
+                let (memory, descriptors) = held();
+                println!(
+                    "{}: {t:.0} s after {:.0} s, memory {memory} kB, descriptors {descriptors}",
+                    family.name,
+                    (now() - begin).seconds()
+                );
+            }
+        })
+    });
+    let mut frames = 0;
+    for ((seed, family), shown) in &shown {
+        frames += shown.frames;
+        println!("{} {seed}: {shown:?}", family.name);
+    }
+    let is_bad = |shown: &Shown| !shown.missing.is_empty() || !shown.silent.is_empty();
+    let bad = shown.iter().any(|(_, shown)| is_bad(shown));
+    println!("{frames} frames in {seconds} s of each robot");
+    ExitCode::from(u8::from(bad))
+}
+
+/// The memory that this process holds \[kB\], and its descriptors.
+fn held() -> (u64, usize) {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    let memory = line.and_then(|line| line.split_whitespace().next()?.parse().ok());
+    let descriptors = std::fs::read_dir("/proc/self/fd").map_or(0, Iterator::count);
+    (memory.unwrap_or(0), descriptors)
 }
 
 /// A line for each name that has runs.

@@ -176,7 +176,8 @@ pub(super) struct Wire {
     boards: BusSimulator,
     /// The end of the present slice of time.
     pub(super) horizon: Nanos,
-    planned: Vec<Planned>,
+    /// In the order of time, without those that are over.
+    planned: VecDeque<Planned>,
     random: Random,
     /// Frames on their way, sorted by arrival.
     under_way: VecDeque<(Nanos, Frame)>,
@@ -197,7 +198,7 @@ const FRAME: Nanos = Nanos::from_micros(120);
 impl Wire {
     pub(super) fn new(
         boards: BusSimulator,
-        planned: Vec<Planned>,
+        planned: VecDeque<Planned>,
         clock: SimulatedClock,
         random: Random,
     ) -> Self {
@@ -221,7 +222,8 @@ impl Wire {
 
     fn fault(&self, t: Nanos, id: Option<Id>) -> Fault {
         let concerned = |p: &&Planned| p.is_in(t) && id.is_none_or(|id| p.concerns(id));
-        let present = self.planned.iter().find(concerned);
+        let mut begun = self.planned.iter().take_while(|p| p.from <= t);
+        let present = begun.find(concerned);
         present.map_or(Fault::None, |p| p.fault)
     }
 
@@ -230,7 +232,8 @@ impl Wire {
             let since = (t - p.from).seconds();
             p.fault == Fault::BusOff && p.is_in(t) && since % 3.0 < 0.3
         };
-        match self.planned.iter().any(is_off) {
+        let mut begun = self.planned.iter().take_while(|p| p.from <= t);
+        match begun.any(is_off) {
             true => LinkState::BusOff,
             false => LinkState::Up,
         }
@@ -323,6 +326,13 @@ impl Wire {
         let end = deadline.min(self.horizon);
         loop {
             let now = self.clock.now();
+            if self
+                .planned
+                .front()
+                .is_some_and(|planned| planned.until < now)
+            {
+                self.planned.pop_front();
+            }
             let state = self.state_at(now);
             if state != self.told {
                 self.told = state;
