@@ -25,7 +25,7 @@
 //! The driver asks for matrix, counts and units before it asks for readings, and refuses the sensor
 //! (`Refusal::NoCalibration`) as long as one is missing; a row of zeros, a number that is not
 //! finite and zero counts are refused by name. A reply that differs from an earlier one is refused
-//! too; that of a row is asked for again before.
+//! too; where the driver asks, a row that differs twice in the same way.
 //!
 //! Both halves of a reading have identifiers of different priority: the second may leave the board
 //! after the first half of the next reading. Each half comes in the order of the requests, so they

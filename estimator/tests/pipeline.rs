@@ -1879,7 +1879,8 @@ fn a_changed_zero_is_no_motion() {
         let unmarked = largest(&moved(step, Quality::GOOD));
         let bound = 1.2 * never.max(always);
         assert!(marked < bound, "{timing:?} {marked} {bound}");
-        assert!(unmarked > 2.0 * bound, "{timing:?} {unmarked} {bound}");
+        // Nor is a jump that nobody tells of.
+        assert!(unmarked < bound, "{timing:?} {unmarked} {bound}");
     }
 }
 

@@ -124,8 +124,8 @@ pub fn run(seed: u64, family: Family, fault: Fault) -> Option<Shown> {
     Some(Chain::open(seed, family, troubles, DURATION, folder.path())?.run(&mut |_| {}))
 }
 
-/// The same for a run of `duration` \[s\], with a fault in turn from the tenth second on: all of the
-/// list, in an order at random. After each stage `during` is told the time \[s\].
+/// The same for a run of `duration` \[s\], with one fault after the other from the tenth second on:
+/// all of the list, in an order at random. After each stage `during` is told the time \[s\].
 ///
 /// # Panics
 /// If the robot cannot be simulated.

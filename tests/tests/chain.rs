@@ -98,3 +98,17 @@ fn all_is_accounted_for_after_many_faults() {
         "{shown:#?}"
     );
 }
+
+/// What the long set has found, one of each kind: an encoder that jumps by turns; frames of an F/T
+/// sensor that become late; a push that goes on while an encoder is away.
+#[test]
+fn what_the_long_set_has_found_stays_mended() {
+    for (seed, name, fault) in [
+        (31, "myactuator v2", Fault::Wrong),
+        (21, "robotous_rft", Fault::Delayed),
+        (44, "moteus", Fault::Slow),
+    ] {
+        let shown = shown(seed, name, fault);
+        assert!(!shown.is_broken(), "{name}, {fault:?}: {shown:#?}");
+    }
+}

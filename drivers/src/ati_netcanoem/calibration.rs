@@ -49,7 +49,7 @@ pub(super) struct Calibration {
     per_count: Option<[[f64; 6]; 6]>,
     refusal: Option<Refusal>,
     /// The last answer that differs from an earlier one: row, pair of columns, values.
-    other: Option<(u8, usize, [u64; 2])>,
+    differing: Option<(u8, usize, [u64; 2])>,
     /// The current request.
     question: u8,
     answered: bool,
@@ -74,7 +74,7 @@ impl Calibration {
             asked_rows: Default::default(),
             per_count: None,
             refusal: None,
-            other: None,
+            differing: None,
             question: 0,
             answered: false,
             sent: 0,
@@ -129,7 +129,10 @@ impl Calibration {
             return out.fault(Counter::Unexpected, 1, frame.id);
         }
         match (opcode, data.len()) {
-            (opcode::SELECT, 1) if data.first().copied() == self.select => self.answered = true,
+            (opcode::SELECT, 1) if data.first().copied() == self.select => {
+                self.answered = true;
+                self.complete();
+            }
             // Another program selects another calibration: what was read before is void.
             (opcode::SELECT, 1) if self.mode == Mode::Listen => self.forget(),
             (opcode::SELECT, 1) => out.fault(Counter::Value, 1, frame.id),
@@ -155,6 +158,11 @@ impl Calibration {
         let [Some(force), Some(torque)] = told else {
             out.fault(Counter::Value, 1, frame.id);
             let channel = if told[0].is_none() { 0 } else { 3 };
+            match which {
+                0 if !self.configured[0] => self.counts = None,
+                1 if !self.configured[1] => self.units = None,
+                _ => {}
+            }
             return self.refuse(Refusal::BadCalibration { channel }, frame);
         };
         self.answered = true;
@@ -210,9 +218,10 @@ impl Calibration {
             if *known & bit != 0 && !same {
                 // An answer that was long on its way, as after a loss of the link, is that of
                 // another row: the row is asked for again.
-                let other = Some((row, pair, told.map(f64::to_bits)));
-                if self.mode == Mode::Supervise && self.other != other {
-                    self.other = other;
+                let differing = Some((row, pair, told.map(f64::to_bits)));
+                if self.mode == Mode::Supervise && self.differing != differing {
+                    self.differing = differing;
+                    self.answered = false;
                     self.asked_rows.iter_mut().for_each(ArrayVec::clear);
                     self.attempts.slow_down(frame.t);
                     return out.fault(Counter::Unexpected, 1, frame.id);
@@ -305,6 +314,7 @@ impl Calibration {
 
 impl Inquiry for Calibration {
     fn begin(&mut self) {
+        self.differing = None;
         self.question = 0;
         self.answered = false;
         self.sent = 0;

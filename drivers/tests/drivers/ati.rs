@@ -469,7 +469,7 @@ fn a_sensor_that_was_off_for_long_streams_again() {
     assert_eq!(rig.device.state(), State::Streaming);
 }
 
-/// While the link is down, answers wait on the board's side; they come when the matrix is read anew.
+/// While the link is down, answers wait at the board; they come when the matrix is read anew.
 /// A matrix that really is another one is refused.
 #[test]
 fn old_answers_are_not_taken_for_another_matrix() {
@@ -515,6 +515,8 @@ fn numbers_that_become_bad_are_refused() {
     let (mut frames, _) = session(true);
     frames.push(frame("3F7#", 900.0));
     frames.push(frame("3F7#00000000000007D0", 900.1));
+    frames.push(frame("3F8#", 901.0));
+    frames.push(frame("3F8#0101", 901.1));
     let mut device = session_listener("");
     decode(&mut *device, &frames);
     let refused = State::Refused(Refusal::BadCalibration { channel: 0 });

@@ -37,7 +37,7 @@ pub(super) struct Sanity {
     /// An encoder's readings repeat themselves as its noise makes impossible, or since it stopped
     /// at once.
     is_still: bool,
-    /// It has stopped at once, and a residual has shown since then that something is wrong.
+    /// It has stopped at once, and an unexplained residual has spoken against it since then.
     is_stuck: bool,
 }
 
@@ -64,16 +64,16 @@ impl Sanity {
         }
     }
 
-    /// A residual beyond this encoder shows that something is wrong.
-    pub(super) fn suspect(&mut self) {
-        self.is_stuck |= self.is_encoder && self.jumps.has_stopped();
+    /// Whether a residual that nothing else explains shows at present that something is wrong.
+    pub(super) fn suspect(&mut self, is_unexplained: bool) {
+        self.is_stuck |= is_unexplained && self.is_encoder && self.jumps.has_stopped();
     }
 
-    /// Whether this is an encoder that may be stuck; `is_suspect`: a residual shows at present that
-    /// something is wrong. One that has stopped at once stays a suspect until it goes on: in some
-    /// postures its error hardly shows.
-    pub(super) const fn may_be_stuck(&self, is_suspect: bool) -> bool {
-        self.is_stuck || self.is_still && is_suspect
+    /// Whether this is an encoder that may be stuck; `is_disturbed`: there is a residual at
+    /// present. One that has stopped at once, and that an unexplained residual spoke against, may
+    /// be stuck until it goes on: in some postures its error hardly shows.
+    pub(super) const fn may_be_stuck(&self, is_disturbed: bool) -> bool {
+        self.is_stuck || self.is_still && is_disturbed
     }
 
     /// Whether the last reading does not continue the motion of those before.

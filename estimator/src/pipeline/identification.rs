@@ -480,7 +480,7 @@ impl OnlineIdentification {
 
     /// Puts a solution in use if its stamp has been reached; whether it did. The noise of the
     /// sensors that are `touched` does not grow: a push that lasts would look like noise, and end
-    /// for the residual test. But it is that of the worst of the last undisturbed seconds: a sensor that
+    /// for the residual test. But it is that of the worst undisturbed second of late: a sensor that
     /// turns worse (late, vibrating) looks like a contact that comes and goes.
     pub(super) fn apply(
         &mut self,

@@ -23,7 +23,8 @@
 //!
 //! A contact that is detected from the start on may as well be a wrong offset, a wrong mounting, or
 //! another direction of gravity. So it counts only once the residual of its sub-tree has been
-//! plausible without it for [`FREE`].
+//! plausible without it for [`FREE`]. One that was there before the residual could not be tested,
+//! because of a fault, may still be there after it.
 
 use super::steps::{SIGNIFICANT, Step, TIME_CONSTANT, kept};
 use nalgebra::{Matrix6, Vector6};
@@ -214,7 +215,11 @@ impl ResidualMonitor {
                 covariance(number)
             };
             let Some(model_covariance) = model_covariance else {
-                (state.mean, state.lingering) = (None, None);
+                // A contact that was there may still be there after the fault.
+                state.mean = None;
+                if !declared.is_empty() {
+                    state.lingering = None;
+                }
                 state.steps.iter_mut().for_each(Step::end);
                 continue;
             };
@@ -279,7 +284,6 @@ impl ResidualMonitor {
     pub(super) fn reset(&mut self) {
         for subtree in &mut self.subtrees {
             (subtree.residual, subtree.mean) = (SubtreeResidual::NOTHING, None);
-            subtree.lingering = None;
             subtree.steps.iter_mut().for_each(Step::end);
         }
     }

@@ -3,7 +3,7 @@
 
 use super::Pipeline;
 use super::motion::OperatingPoint;
-use super::residuals;
+use super::residuals::{self, SubtreeResidual};
 use crate::pipeline::estimate::root_of_squares;
 use crate::pipeline::validity::{ValidityCheck, first_fault};
 use proprio_dynamics::spatial::Pose;
@@ -184,27 +184,26 @@ impl Pipeline {
         };
         // An encoder that stands before a residual may be stuck: then no contact explains it.
         let channels = &self.setup.robot.channels;
-        let balances = self.residuals.subtrees().zip(&self.dependences.subtrees);
-        let balances = balances.filter(|(residual, _)| residual.is_disturbed());
-        let before = balances.fold(DofSet::EMPTY, |all, (_, own)| all.union(&own.dofs));
-        let mut may_be_stuck = false;
+        let before = |is_one: fn(&SubtreeResidual) -> bool| {
+            let balances = self.residuals.subtrees().zip(&self.dependences.subtrees);
+            let balances = balances.filter(|(residual, _)| is_one(residual));
+            balances.fold(DofSet::EMPTY, |all, (_, own)| all.union(&own.dofs))
+        };
+        let disturbed = before(SubtreeResidual::is_disturbed);
+        let unexplained = before(|residual| residual.is_unexplained);
+        let mut stuck = DofSet::EMPTY;
         for (channel, sanity) in channels.iter().zip(&mut self.sanity) {
             if let ChannelRole::Joint(dof) = channel.role {
-                let is_suspect = before.contains(dof);
-                if is_suspect {
-                    sanity.suspect();
+                sanity.suspect(unexplained.contains(dof));
+                if sanity.may_be_stuck(disturbed.contains(dof)) {
+                    stuck.insert(dof);
                 }
-                may_be_stuck |= sanity.may_be_stuck(is_suspect);
             }
         }
         let stuck = |dependence: &Dependence| {
-            let mut encoders = channels.iter().zip(&self.sanity);
-            encoders.position(|(channel, sanity)| match channel.role {
-                ChannelRole::Joint(dof) => {
-                    dependence.dofs.contains(dof) && sanity.may_be_stuck(before.contains(dof))
-                }
-                _ => false,
-            })
+            let dof = dependence.dofs.intersection(&stuck).iter().next()?;
+            let role = ChannelRole::Joint(dof);
+            channels.iter().position(|channel| channel.role == role)
         };
         let moved = |dof: usize| structure.moved_by(dof).iter().copied();
         let identification = self.identification.as_ref();
@@ -239,7 +238,6 @@ impl Pipeline {
                 reason = moved(dof).find_map(doubted).unwrap_or_default();
             }
             if reason == Reason::None
-                && may_be_stuck
                 && let Some(channel) = stuck(dependence)
             {
                 let number = u32::try_from(channel).unwrap_or(NO_CAUSE);

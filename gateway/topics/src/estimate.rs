@@ -41,8 +41,7 @@ pub enum Reason {
     /// A sensor it depends on repeats its readings instead of measuring ([`Quality::FROZEN`]), and
     /// is not saturated.
     Frozen = 12,
-    /// A reading it depends on contradicts the ones before it, and no later one has confirmed it
-    /// ([`Quality::IMPLAUSIBLE`]).
+    /// A reading it depends on contradicts the ones before it ([`Quality::IMPLAUSIBLE`]).
     Implausible = 13,
     /// The readings contradict what is configured: something else explains them better, such as an
     /// encoder reversed, a sensor turned, or a contact that has been there since the start.

@@ -74,8 +74,9 @@ impl Quality {
     /// joint's new offset): no motion or load lies between them.
     pub const ZERO_CHANGED: Self = Self(1 << 7);
 
-    /// The value is far from where those before it lead, and no later one has confirmed it yet
-    /// ([`crate::sanity`]). The estimator finds it.
+    /// The value is far from where those before it lead, and no later one has confirmed it yet; or
+    /// the encoder has jumped further than its joint can move ([`crate::sanity`]). The estimator
+    /// finds it.
     pub const IMPLAUSIBLE: Self = Self(1 << 8);
 
     /// The flags that make an encoder's position unusable.

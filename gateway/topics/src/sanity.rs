@@ -238,10 +238,13 @@ struct Path {
     has_stopped: bool,
     /// The last reading confirmed that the value is another one, without a motion.
     has_stepped: bool,
-    /// Of an encoder, whose joint moves no faster than this: where the joint is, by all smooth
-    /// changes, and when it was last seen to move there. What does not lead there is off.
+    /// The greatest speed of an encoder's joint; infinite if this is none.
     fastest: f64,
+    /// Its last speed, were the stamps in step.
+    speed: f64,
+    /// Where the joint is by all smooth changes, and when it was last seen to move.
     joint: (Nanos, f64),
+    /// The readings can not be where the joint is.
     is_off: bool,
 }
 
@@ -260,6 +263,7 @@ impl Path {
         has_stopped: false,
         has_stepped: false,
         fastest: f64::INFINITY,
+        speed: 0.0,
         joint: (Nanos::ZERO, 0.0),
         is_off: false,
     };
@@ -270,6 +274,8 @@ impl Path {
         if !value.is_finite() || after <= 0.0 && self.count > 0 {
             return false;
         }
+        self.has_stepped = false;
+        let had_stopped = core::mem::take(&mut self.has_stopped);
         if self.value.is_finite() && value != self.value {
             self.step = self.step.min((value - self.value).abs());
         }
@@ -285,14 +291,13 @@ impl Path {
             return self.accept(t, value, if self.count > 2 { distance } else { 0.0 });
         }
         if self.resumes {
-            (self.joint, self.is_off) = ((t, value), false);
+            self.move_on(t, value);
             return self.accept(t, value, 0.0);
         }
-        self.has_stepped = false;
         let most = self.most.max(self.step).max(self.least);
         // A joint that moves steadily never shows its resolution, so that does not count here.
         let is_at_once = distance > STOP * self.most * (after / self.period).max(1.0);
-        self.has_stopped = value == self.value && (self.has_stopped || is_at_once);
+        self.has_stopped = value == self.value && (had_stopped || is_at_once);
         // The last good value again and again, without time to brake: it is stuck.
         if let Some((then, before, _)) = self.doubtful
             && value == before
@@ -305,29 +310,28 @@ impl Path {
         // Smooth values bend with the square of the time.
         let longer = (after / self.period).max(1.0);
         if distance <= usual * longer * longer {
-            // A joint that is stuck for the gateway goes on.
-            if value != self.value {
-                self.joint = (t, self.joint.1 + value - self.value);
-            }
+            self.move_on(t, value);
             return self.accept(t, value, distance / (longer * longer));
         }
         if let Some((then, before, off)) = self.doubtful {
             let (since, between) = ((then - self.t).seconds(), (t - then).seconds());
             let rate = (before - self.value) / since;
-            let is_near = (value - before).abs() <= usual;
+            // As it was before, or going on as before.
+            let is_near = (value - before).abs() <= usual
+                || (value - before - self.rate * between).abs() <= usual;
             if is_near || (value - before - rate * between).abs() <= off {
                 // A step; or a motion, whose readings bend so much.
                 let most = match is_near {
                     true => 0.0,
                     false => off.min(GROWTH * most),
                 };
-                let late = self.rate.abs() * LATE;
-                self.land(then, before, late);
-                self.has_stepped = is_near;
+                let step = (before - self.value).abs();
+                self.has_stepped = is_near && step > self.rate.abs() * since + usual;
+                self.judge_place(then, before);
                 if is_near {
                     self.joint.1 += value - before;
                 } else if !self.is_off {
-                    self.land(t, value, late);
+                    self.judge_place(t, value);
                 }
                 (self.t, self.value) = (then, before);
                 return self.accept(t, value, most);
@@ -337,23 +341,39 @@ impl Path {
         true
     }
 
-    /// The path goes on from elsewhere: whether the joint can be there. It may have moved by
-    /// `late` while readings were on their way.
-    fn land(&mut self, t: Nanos, value: f64, late: f64) {
+    /// The reading goes on smoothly, and the joint with it. What repeats itself is no motion: the
+    /// encoder may be stuck, and the joint elsewhere when it goes on.
+    fn move_on(&mut self, t: Nanos, value: f64) {
+        if value != self.value {
+            self.joint = (t, self.joint.1 + value - self.value);
+        }
+    }
+
+    /// The path goes on from elsewhere: judges whether the joint can be there. It may have moved
+    /// while readings were on their way, and stamps may be closer together than the readings were.
+    fn judge_place(&mut self, t: Nanos, value: f64) {
         let (then, before) = self.joint;
         let apart = (value - before).abs();
         // A position within a turn begins anew after each.
         let apart = apart.min((apart - TAU).abs());
-        self.is_off = apart > self.fastest * (t - then).seconds() + late;
+        let moved = self.fastest * (t - then).seconds().max(self.period);
+        self.is_off = apart > moved + self.speed.min(self.fastest) * LATE;
         if !self.is_off {
             self.joint = (t, value);
         }
     }
 
-    /// Goes on from this reading, which is not doubtful but for what the encoder is off.
+    /// Goes on from this reading. Returns whether the encoder is off.
     fn accept(&mut self, t: Nanos, value: f64, distance: f64) -> bool {
         let after = (t - self.t).seconds();
         self.resumes = after > GAP * self.period;
+        if self.resumes && after > LATE {
+            (self.joint, self.is_off) = ((t, value), false);
+        }
+        self.speed = match self.value.is_finite() {
+            true => (value - self.value).abs() / after.max(self.period),
+            false => 0.0,
+        };
         self.rate = match self.value.is_finite() && after > 0.0 {
             true => (value - self.value) / after,
             false => 0.0,
@@ -428,8 +448,12 @@ impl<const N: usize> Jumps<N> {
     /// Takes a reading at `t`, NaN where it has none; returns whether it is doubtful.
     pub fn look(&mut self, t: Nanos, values: &[f64; N], quality: Quality) -> bool {
         // An encoder that does not know its zero yet will jump.
-        if quality.intersects(Quality::ZERO_CHANGED | Quality::NOT_CALIBRATED) {
-            self.0.iter_mut().for_each(|path| path.count = 0);
+        let has_no_zero =
+            |path: &Path| quality.contains(Quality::NOT_CALIBRATED) && path.fastest.is_finite();
+        for path in &mut self.0 {
+            if quality.contains(Quality::ZERO_CHANGED) || has_no_zero(path) {
+                path.count = 0;
+            }
         }
         let all = self.0.iter_mut().zip(values);
         all.fold(false, |any, (path, value)| path.take(t, *value) || any)

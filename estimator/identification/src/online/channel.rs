@@ -39,7 +39,7 @@ const PAUSE: f64 = 3.0;
 /// distribution, in stated standard deviations.
 const DISTURBED: f64 = 0.02;
 const RANGE: f64 = 1000.0;
-/// Memory of a second that is worse than the others \[s\].
+/// Seconds over which one that is worse than the others fades.
 const LATELY: f64 = 10.0;
 /// Probability from which on a second's mean is none.
 const LIKELY_NOISE: f64 = 0.5;
@@ -94,7 +94,8 @@ pub(crate) struct Channel {
     products: (f64, f64),
     /// Mean square of observations about the mean of their second; None before the first.
     scatter: Option<f64>,
-    /// That of the worst of the last [`LATELY`] seconds whose mean was no disturbance.
+    /// That of the worst second of late whose mean was no disturbance; it fades with each such
+    /// second.
     latest: f64,
 }
 
@@ -167,7 +168,7 @@ impl Channel {
             }
         }
         let (innovation, share) = best.1;
-        if share > LIKELY_NOISE {
+        if since.is_some() && share > LIKELY_NOISE {
             self.latest = second.scatter.max(self.latest * (1.0 - 1.0 / LATELY));
         }
         let scatter = self.scatter.unwrap_or(second.scatter);
@@ -187,7 +188,7 @@ impl Channel {
         (self.scatter.unwrap_or(0.0) + slow).max(self.stated)
     }
 
-    /// The largest scatter of the last [`LATELY`] seconds whose mean was no disturbance.
+    /// The scatter of the worst second of late whose mean was no disturbance.
     pub(crate) const fn latest(&self) -> f64 {
         self.latest
     }
