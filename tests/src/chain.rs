@@ -416,10 +416,10 @@ impl Chain {
                     during((t - START).seconds());
                 }
             }
-            let present = self.troubles.get(begun);
-            let restart = present.filter(|trouble| trouble.fault == Fault::Restart);
-            let back = restart.map_or(Nanos::MIN, |trouble| at(trouble.from + AWAY));
-            if restart.is_some_and(|trouble| at(trouble.from) < t) && t <= back {
+            let present = self.troubles.get(begun).filter(|last| at(last.from) < t);
+            let restart = present.filter(|last| last.fault == Fault::Restart);
+            let back = restart.map_or(Nanos::MIN, |restart| at(restart.from + AWAY));
+            if t <= back {
                 if !self.buses.is_empty() {
                     self.kill();
                 }

@@ -155,22 +155,21 @@ impl Calibration {
 
     /// Counts (0) or units (1); `None` is a value that cannot be used.
     fn take(&mut self, which: usize, told: [Option<f64>; 2], frame: &Frame, out: &mut Decoded) {
-        let [Some(force), Some(torque)] = told else {
-            out.fault(Counter::Value, 1, frame.id);
-            let channel = if told[0].is_none() { 0 } else { 3 };
-            match which {
-                0 if !self.configured[0] => self.counts = None,
-                1 if !self.configured[1] => self.units = None,
-                _ => {}
-            }
-            return self.refuse(Refusal::BadCalibration { channel }, frame);
-        };
-        self.answered = true;
+        let is_configured = self.configured.get(which) == Some(&true);
         let known = match which {
             0 => &mut self.counts,
             _ => &mut self.units,
         };
-        if self.configured.get(which) == Some(&true) {
+        let [Some(force), Some(torque)] = told else {
+            if !is_configured {
+                *known = None;
+            }
+            out.fault(Counter::Value, 1, frame.id);
+            let channel = if told[0].is_none() { 0 } else { 3 };
+            return self.refuse(Refusal::BadCalibration { channel }, frame);
+        };
+        self.answered = true;
+        if is_configured {
             return;
         }
         match *known {

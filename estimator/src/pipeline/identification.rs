@@ -535,16 +535,16 @@ impl OnlineIdentification {
                     *place = *offset;
                 }
             }
-            let found = component.noise.iter().zip(&component.latest);
-            for (&sensor, (found, latest)) in component.sensors.iter().zip(found) {
+            let found = component.noise.iter().zip(&component.worst);
+            for (&sensor, (found, worst)) in component.sensors.iter().zip(found) {
                 let structure = &setup.robot.structure;
-                let [found, latest] = [found, latest].map(|v| excess(structure, sensor, v));
+                let [found, worst] = [found, worst].map(|v| excess(structure, sensor, v));
                 if let Some(place) = setup.state.excess_variance.get_mut(sensor) {
                     let most = match touched.contains(sensor) {
                         true => *place,
                         false => [f64::INFINITY; 6],
                     };
-                    *place = std::array::from_fn(|i| found[i].min(most[i]).max(latest[i]));
+                    *place = std::array::from_fn(|i| found[i].min(most[i]).max(worst[i]));
                 }
             }
         }

@@ -96,7 +96,7 @@ pub(crate) struct Channel {
     scatter: Option<f64>,
     /// That of the worst second of late whose mean was no disturbance; it fades with each such
     /// second.
-    latest: f64,
+    worst: f64,
 }
 
 impl Channel {
@@ -109,7 +109,7 @@ impl Channel {
             innovation: f64::NAN,
             products: (CORRELATED.0 * CORRELATED.1, CORRELATED.1),
             scatter: None,
-            latest: 0.0,
+            worst: 0.0,
         }
     }
 
@@ -169,7 +169,7 @@ impl Channel {
         }
         let (innovation, share) = best.1;
         if since.is_some() && share > LIKELY_NOISE {
-            self.latest = second.scatter.max(self.latest * (1.0 - 1.0 / LATELY));
+            self.worst = second.scatter.max(self.worst * (1.0 - 1.0 / LATELY));
         }
         let scatter = self.scatter.unwrap_or(second.scatter);
         self.scatter = Some(scatter + share * (second.scatter - scatter) / MEMORY);
@@ -189,8 +189,8 @@ impl Channel {
     }
 
     /// The scatter of the worst second of late whose mean was no disturbance.
-    pub(crate) const fn latest(&self) -> f64 {
-        self.latest
+    pub(crate) const fn worst(&self) -> f64 {
+        self.worst
     }
 
     /// `V`, and the standard deviation of the drift in a second: means over the grid by likelihood

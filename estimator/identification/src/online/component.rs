@@ -314,7 +314,7 @@ impl Component {
             noise: (self.least.chunks_exact(6))
                 .map(|six| std::array::from_fn(|i| six[i]))
                 .collect(),
-            latest: vec![[0.0; 6]; self.sensors.len()],
+            worst: vec![[0.0; 6]; self.sensors.len()],
             tau: f64::NAN,
             ..ComponentSolution::default()
         }

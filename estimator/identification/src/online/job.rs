@@ -357,11 +357,10 @@ impl Part {
         {
             to.copy_from_slice(rates);
         }
-        for (to, six) in solution.noise.iter_mut().zip(self.channels.chunks_exact(6)) {
-            *to = std::array::from_fn(|i| six[i].reading());
-        }
-        for (to, six) in (solution.latest.iter_mut()).zip(self.channels.chunks_exact(6)) {
-            *to = std::array::from_fn(|i| six[i].latest());
+        let noise = solution.noise.iter_mut().zip(&mut solution.worst);
+        for ((noise, worst), six) in noise.zip(self.channels.chunks_exact(6)) {
+            *noise = std::array::from_fn(|i| six[i].reading());
+            *worst = std::array::from_fn(|i| six[i].worst());
         }
         for (place, offset) in solution.offsets.iter_mut().enumerate() {
             let six = |i: usize| self.reference[6 * place + i] + offsets[6 * place + i];

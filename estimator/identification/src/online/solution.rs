@@ -208,7 +208,7 @@ pub struct ComponentSolution {
     pub noise: Vec<[f64; 6]>,
     /// Its part within a second, in the worst of the last ones in which nothing disturbed the
     /// sensor.
-    pub latest: Vec<[f64; 6]>,
+    pub worst: Vec<[f64; 6]>,
     /// The stamp of the newest data used.
     pub data: Nanos,
     /// The prior's weight; NaN before the first solution.
