@@ -59,8 +59,14 @@ fn process(unit: &str) -> u32 {
     if is_active { id } else { 0 }
 }
 
+/// What the journal has, once it has taken in all that it was sent: this machine is slow.
+fn journal(options: &str) -> String {
+    let line = format!("journalctl --sync; journalctl --no-pager -o cat {options}");
+    sh(&line)
+}
+
 fn log(unit: &str) -> String {
-    sh(&format!("journalctl --no-pager -o cat -u {unit}"))
+    journal(&format!("-u {unit}"))
 }
 
 /// Waits until `condition` holds.
@@ -244,10 +250,7 @@ fn a_package_waits_for_a_configuration_and_a_purge_leaves_nothing() {
         let owner = fs::metadata(format!("/proc/{id}")).expect("it runs").uid();
         assert_eq!(owner.to_string(), sh("id -u proprio"), "{unit}");
     }
-    let of_a_device = sh(&format!(
-        "journalctl --no-pager -o cat -u {} DEVICE=l_arm_ft_sensor",
-        UNITS[0]
-    ));
+    let of_a_device = journal(&format!("-u {} DEVICE=l_arm_ft_sensor", UNITS[0]));
     assert!(of_a_device.contains("streaming"), "{of_a_device}");
     assert!(
         !Path::new("/usr/local/bin/proprio").exists(),
@@ -394,7 +397,7 @@ fn a_wrong_configuration_is_told_once_and_a_reload_refuses_it() {
 
     for (unit, file) in UNITS.into_iter().zip(["gateway.toml", "estimator.toml"]) {
         machine.configure(file, |text| "bogus = 1\n".to_owned() + &text);
-        let errors = || sh(&format!("journalctl --no-pager -o cat -p err -u {unit}"));
+        let errors = || journal(&format!("-p err -u {unit}"));
         let told = errors().matches("bogus = 1").count();
         let (_, restarted) = attempt(&format!("systemctl restart {unit}"));
         assert!(!restarted, "{unit} starts with a wrong file");

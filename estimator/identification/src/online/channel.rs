@@ -94,9 +94,12 @@ pub(crate) struct Channel {
     products: (f64, f64),
     /// Mean square of observations about the mean of their second; None before the first.
     scatter: Option<f64>,
-    /// That of the worst second of late whose mean was no disturbance; it fades with each such
-    /// second.
+    /// The worst scatter of late, which fades with each second; pushes do not count.
     worst: f64,
+    /// The last second had no push.
+    has_none: bool,
+    /// The scatter in the last second; it counts unless the next one shows that a push began.
+    candidate: Option<f64>,
 }
 
 impl Channel {
@@ -110,6 +113,8 @@ impl Channel {
             products: (CORRELATED.0 * CORRELATED.1, CORRELATED.1),
             scatter: None,
             worst: 0.0,
+            has_none: false,
+            candidate: None,
         }
     }
 
@@ -131,10 +136,10 @@ impl Channel {
         self.last = None;
     }
 
-    /// Takes in a second.
-    pub(crate) fn take(&mut self, second: &SecondMean) {
+    /// Takes in a second. Returns whether its mean is likely to be noise.
+    pub(crate) fn take(&mut self, second: &SecondMean) -> bool {
         if !(second.mean.is_finite() && second.of_bodies.is_finite() && second.count > 0.0) {
-            return;
+            return false;
         }
         let since = (self.last.replace(second.t))
             .map(|last| second.t - last)
@@ -168,9 +173,6 @@ impl Channel {
             }
         }
         let (innovation, share) = best.1;
-        if since.is_some() && share > LIKELY_NOISE {
-            self.worst = second.scatter.max(self.worst * (1.0 - 1.0 / LATELY));
-        }
         let scatter = self.scatter.unwrap_or(second.scatter);
         self.scatter = Some(scatter + share * (second.scatter - scatter) / MEMORY);
         let last = std::mem::replace(&mut self.innovation, innovation.clamp(-LARGE, LARGE));
@@ -179,6 +181,18 @@ impl Channel {
             self.products.0 = self.products.0 * keep + last * self.innovation;
             self.products.1 = self.products.1 * keep + self.innovation * self.innovation;
         }
+        since.is_some() && share > LIKELY_NOISE
+    }
+
+    /// Takes in the scatter of a second; None if a push makes it, on any axis. A second beside one
+    /// that is a push does not count: there the push begins or ends.
+    fn take_scatter(&mut self, second: Option<&Residuals>) {
+        let confirmed = second.and(self.candidate).unwrap_or(0.0);
+        let had_none = std::mem::replace(&mut self.has_none, second.is_some());
+        self.candidate = second
+            .filter(|own| had_none && own.is_likely_noise)
+            .map(|own| own.scatter);
+        self.worst = confirmed.max(self.worst * (1.0 - 1.0 / LATELY));
     }
 
     /// Variance of one reading about its prediction: the scatter within a second, and the changes
@@ -188,9 +202,9 @@ impl Channel {
         (self.scatter.unwrap_or(0.0) + slow).max(self.stated)
     }
 
-    /// The scatter of the worst second of late whose mean was no disturbance.
-    pub(crate) const fn worst(&self) -> f64 {
-        self.worst
+    /// The worst scatter of late that is no push.
+    pub(crate) fn worst(&self) -> f64 {
+        self.worst.max(self.candidate.unwrap_or(0.0))
     }
 
     /// `V`, and the standard deviation of the drift in a second: means over the grid by likelihood
@@ -240,6 +254,35 @@ impl Filter {
         self.likelihood *= (-share * dt / MEMORY).exp();
         self.likelihood += (regular + disturbed).ln();
         (innovation / total.sqrt(), share)
+    }
+}
+
+/// The residuals of one axis in a second.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Residuals {
+    /// Their mean, and the mean square about it.
+    pub mean: f64,
+    pub scatter: f64,
+    /// Whether the mean is likely to be noise.
+    pub is_likely_noise: bool,
+}
+
+impl Residuals {
+    pub(crate) const NONE: Self = Self {
+        mean: f64::NAN,
+        scatter: f64::NAN,
+        is_likely_noise: false,
+    };
+}
+
+/// Takes in the residuals of a sensor in one second. The mean of a second that a push fills for the
+/// greater part has a larger square than the scatter has.
+pub(crate) fn take_scatters(axes: &mut [Channel], second: &[Residuals]) {
+    let excess = (axes.iter().zip(second))
+        .map(|(axis, own)| (own.mean * own.mean - own.scatter) / axis.stated)
+        .sum::<f64>();
+    for (axis, own) in axes.iter_mut().zip(second) {
+        axis.take_scatter((excess <= 0.0).then_some(own));
     }
 }
 
@@ -430,5 +473,40 @@ mod tests {
         assert!((1.0..1.3).contains(&(quiet / STATED)), "{quiet}");
         let loud = after(100, 100.0, 0.01, 1, |_| 0.0).reading();
         assert!((70.0..130.0).contains(&(loud / STATED)), "{loud}");
+    }
+
+    /// The worst scatter after seconds of a mean and a scatter, on two axes of which the second is
+    /// quiet.
+    fn worst(seconds: &[(f64, f64)]) -> f64 {
+        let mut axes = [(); 2].map(|()| Channel::new(STATED, PERIOD));
+        for second in seconds {
+            let residuals = |(mean, scatter)| Residuals {
+                mean,
+                scatter,
+                is_likely_noise: true,
+            };
+            take_scatters(&mut axes, &[*second, (0.0, STATED)].map(residuals));
+        }
+        axes[0].worst()
+    }
+
+    #[test]
+    fn a_noisy_second_counts_at_once_and_fades_but_a_push_does_not() {
+        let (quiet, noisy) = ((0.0, STATED), (0.0, 100.0));
+        assert_eq!(worst(&[quiet, noisy]), 100.0);
+        let later = [&[quiet, noisy][..], &[quiet; 11]].concat();
+        assert!((30.0..40.0).contains(&worst(&later)), "{}", worst(&later));
+        // A push of 20 from some part of a second on, and one that ends there.
+        for part in [0.1, 0.4, 0.6, 0.9] {
+            let edge = (20.0 * part, 400.0 * part * (1.0 - part));
+            let during = (20.0, 1.0);
+            for seconds in [
+                [quiet, quiet, edge, during, during],
+                [during, during, edge, quiet, quiet],
+            ] {
+                let found = worst(&seconds);
+                assert!(found <= STATED, "{part}: {found}");
+            }
+        }
     }
 }

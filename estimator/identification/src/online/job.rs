@@ -3,7 +3,7 @@
 
 use crate::linear::information::{Information, Panel};
 use crate::online::bank::{self, Bank, LATEST, Tick};
-use crate::online::channel::{Channel, SecondMean};
+use crate::online::channel::{Channel, Residuals, SecondMean, take_scatters};
 use crate::online::component::{Component, channels};
 use crate::online::parameters::Parameters;
 use crate::online::rows::{self, Kinds, Rows, spread};
@@ -412,6 +412,7 @@ impl Part {
         };
         let of_bodies = &self.newest.root * (&sensitivities - before);
         self.before = Some((sensitivities, bodies.to_vec()));
+        let mut seconds = vec![Residuals::NONE; offset_count];
         for (channel, own) in self.channels.iter_mut().enumerate() {
             // An offset jump is no drift.
             if self.change.is_some() || self.has_new_zero {
@@ -425,16 +426,27 @@ impl Part {
             let (count, share) = (counts[channel], shares[channel]);
             if count > 0.0 {
                 let mean = seen().sum::<f64>() / count;
-                own.take(&SecondMean {
+                let squares = seen().map(|x| (x - mean) * (x - mean)).sum::<f64>();
+                let (mean, scatter) = (mean / share.sqrt(), squares / (count * share));
+                let is_likely_noise = own.take(&SecondMean {
                     t: (span.first as f64 + 0.5 * span.count as f64) * self.period,
-                    mean: self.estimate[channel] + mean / share.sqrt(),
+                    mean: self.estimate[channel] + mean,
                     count,
                     of_bodies: of_bodies.column(channel).norm_squared(),
-                    scatter: seen().map(|x| (x - mean) * (x - mean)).sum::<f64>() / (count * share),
+                    scatter,
                     is_moving: self.is_moving,
                 });
+                seconds[channel] = Residuals {
+                    mean,
+                    scatter,
+                    is_likely_noise,
+                };
             }
             (self.variances[channel], self.drift_rates[channel]) = own.noise();
+        }
+        let sensors = self.channels.chunks_exact_mut(6);
+        for (six, seconds) in sensors.zip(seconds.chunks_exact(6)) {
+            take_scatters(six, seconds);
         }
     }
 
