@@ -85,7 +85,12 @@ impl Glance {
         let names = Described::by(domain, &robot, Publisher::Estimator)?;
         let mut estimates = Reader::<TorqueEstimate>::open(domain, &robot).ok();
         let mut channels = vec![Seen::default(); MAX_CHANNELS];
-        let before = newest::<EstimatorHealth>(domain, &robot)?;
+        // Who publishes no description has no health either; each look for it takes half a second.
+        let health = || match &names {
+            Some(_) => newest::<EstimatorHealth>(domain, &robot),
+            None => Ok(None),
+        };
+        let before = health()?;
         let mut samples = Reader::<Sample>::open(domain, &robot).ok();
         let began = monotonic();
         let until = began + WINDOW;
@@ -106,6 +111,7 @@ impl Glance {
         }
         let now = monotonic();
         let window = now - began;
+        let estimator = health()?;
         let newest_torques = estimates.as_mut().and_then(|reader| reader.latest().ok());
         let torques = newest_torques
             .flatten()
@@ -114,7 +120,6 @@ impl Glance {
                 let description = *names.of(torques.header.epoch)?;
                 Some((torques, description))
             });
-        let estimator = newest::<EstimatorHealth>(domain, &robot)?;
         let estimates = match (&before, &estimator) {
             (Some(a), Some(b)) if b.header.published > a.header.published => {
                 let passed = (b.header.published - a.header.published).seconds();

@@ -1409,23 +1409,41 @@ fn estimates_of(
     table(std::str::from_utf8(&out).unwrap())
 }
 
-/// MuJoCo pushes the hand without a declaration: torques and wrench are the same as with one.
-#[test]
-fn an_undeclared_contact_is_detected() {
-    // First without a contact, so that the setup is confirmed; a minute later with one.
+/// The columns of the log of a pushed hand, and the rows of a free and of a pushed hand in them.
+fn free_and_pushed() -> (String, Vec<String>, Vec<String>) {
     let free = golden("icub_left_arm_mujoco.csv");
     let pushed = golden("icub_left_arm_mujoco_contact.csv");
     let (header, pushed) = pushed.split_once('\n').unwrap();
     // It has the same columns, and those of the push.
     let more = header.split(',').count() - free.lines().next().unwrap().split(',').count();
     assert!(header.starts_with(free.lines().next().unwrap()));
-    let first = (free.lines().skip(1)).map(|line| line.to_owned() + &",".repeat(more) + "\n");
-    let later = pushed.lines().map(|line| {
-        let (t, rest) = line.split_once(',').unwrap();
-        format!("{},{rest}\n", t.parse::<f64>().unwrap() + 60.0)
-    });
-    let count_free = free.lines().count() - 1;
-    let log = format!("{header}\n{}", first.chain(later).collect::<String>());
+    let free = free
+        .lines()
+        .skip(1)
+        .map(|line| line.to_owned() + &",".repeat(more));
+    let pushed = pushed.lines().map(str::to_owned);
+    (header.to_owned(), free.collect(), pushed.collect())
+}
+
+/// A log of parts, each of which is so much later than its own times \[s\].
+fn joined(header: &str, parts: &[(&[String], f64)]) -> String {
+    let mut log = header.to_owned() + "\n";
+    for (rows, later) in parts {
+        for row in *rows {
+            let (t, rest) = row.split_once(',').unwrap();
+            log += &format!("{},{rest}\n", t.parse::<f64>().unwrap() + later);
+        }
+    }
+    log
+}
+
+/// MuJoCo pushes the hand without a declaration: torques and wrench are the same as with one.
+#[test]
+fn an_undeclared_contact_is_detected() {
+    // First without a contact, so that the setup is confirmed; a minute later with one.
+    let (header, free, pushed) = free_and_pushed();
+    let count_free = free.len();
+    let log = joined(&header, &[(&free, 0.0), (&pushed, 60.0)]);
     let found = estimates_of(possible_hand_contact, &log, |_| [0.0; 6]);
     let told = estimates_of(
         |config| {
@@ -1477,6 +1495,30 @@ fn an_undeclared_contact_is_detected() {
             .iter()
             .all(String::is_empty)
     );
+}
+
+/// A contact that was there before an encoder failed may still be there after it: torques rest on
+/// the reading until the residual has been plausible for two seconds.
+#[test]
+fn a_contact_may_be_there_after_a_fault() {
+    let (header, free, mut pushed) = free_and_pushed();
+    let mut columns = header.split(',');
+    let at = (columns.position(|name| name == "joint/l_elbow/position")).unwrap();
+    // The last five of ten seconds; at the end of the first five the push is detected.
+    for row in &mut pushed[101..] {
+        let mut cells: Vec<&str> = row.split(',').collect();
+        cells[at..at + 4].fill("");
+        *row = cells.join(",");
+    }
+    let log = joined(&header, &[(&free, 0.0), (&pushed, 60.0), (&free, 71.0)]);
+    let found = estimates_of(possible_hand_contact, &log, |_| [0.0; 6]);
+    let (during, after) = (free.len() + 150, free.len() + pushed.len());
+    assert_eq!(found["contact/hand/detected"][free.len() + 100], "1");
+    assert_eq!(found["reason/l_wrist_yaw"][during], "stale:l_elbow");
+    let std = |row: usize| found["torque_std/l_elbow"][row].parse::<f64>().unwrap();
+    // The same motion as at first, row by row. The reading is better than the arm's model.
+    assert!((5..35).all(|row| std(after + row) < 0.75 * std(row)));
+    assert!((45..200).all(|row| (std(after + row) / std(row) - 1.0).abs() < 0.01));
 }
 
 #[test]
