@@ -86,9 +86,10 @@ impl Glance {
         let mut estimates = Reader::<TorqueEstimate>::open(domain, &robot).ok();
         let mut channels = vec![Seen::default(); MAX_CHANNELS];
         // Who publishes no description has no health either; each look for it takes half a second.
-        let health = || match &names {
-            Some(_) => newest::<EstimatorHealth>(domain, &robot),
-            None => Ok(None),
+        let is_described = names.is_some();
+        let health = || match is_described {
+            true => newest::<EstimatorHealth>(domain, &robot),
+            false => Ok(None),
         };
         let before = health()?;
         let mut samples = Reader::<Sample>::open(domain, &robot).ok();
@@ -111,7 +112,6 @@ impl Glance {
         }
         let now = monotonic();
         let window = now - began;
-        let estimator = health()?;
         let newest_torques = estimates.as_mut().and_then(|reader| reader.latest().ok());
         let torques = newest_torques
             .flatten()
@@ -120,6 +120,7 @@ impl Glance {
                 let description = *names.of(torques.header.epoch)?;
                 Some((torques, description))
             });
+        let estimator = health()?;
         let estimates = match (&before, &estimator) {
             (Some(a), Some(b)) if b.header.published > a.header.published => {
                 let passed = (b.header.published - a.header.published).seconds();

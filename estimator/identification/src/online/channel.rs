@@ -41,7 +41,7 @@ const DISTURBED: f64 = 0.02;
 const RANGE: f64 = 1000.0;
 /// Seconds over which one that is worse than the others fades.
 const LATELY: f64 = 10.0;
-/// Probability from which on a second's mean is none.
+/// Probability of noise from which on a second's mean is no disturbance.
 const LIKELY_NOISE: f64 = 0.5;
 /// Limit of the log-likelihood by data at rest, which say little of the noise in motion: `e^3`,
 /// odds of twenty.
@@ -96,8 +96,8 @@ pub(crate) struct Channel {
     scatter: Option<f64>,
     /// The worst scatter of late, which fades with each second; pushes do not count.
     worst: f64,
-    /// The last second had no push.
-    has_none: bool,
+    /// No push filled the last second.
+    was_free: bool,
     /// The scatter in the last second; it counts unless the next one shows that a push began.
     candidate: Option<f64>,
 }
@@ -113,7 +113,7 @@ impl Channel {
             products: (CORRELATED.0 * CORRELATED.1, CORRELATED.1),
             scatter: None,
             worst: 0.0,
-            has_none: false,
+            was_free: false,
             candidate: None,
         }
     }
@@ -184,13 +184,13 @@ impl Channel {
         since.is_some() && share > LIKELY_NOISE
     }
 
-    /// Takes in the scatter of a second; None if a push makes it, on any axis. A second beside one
-    /// that is a push does not count: there the push begins or ends.
+    /// Takes in the scatter of a second; None if a push fills the second. One beside such a second
+    /// does not count: there the push begins or ends.
     fn take_scatter(&mut self, second: Option<&Residuals>) {
         let confirmed = second.and(self.candidate).unwrap_or(0.0);
-        let had_none = std::mem::replace(&mut self.has_none, second.is_some());
+        let was_free = std::mem::replace(&mut self.was_free, second.is_some());
         self.candidate = second
-            .filter(|own| had_none && own.is_likely_noise)
+            .filter(|own| was_free && own.is_likely_noise)
             .map(|own| own.scatter);
         self.worst = confirmed.max(self.worst * (1.0 - 1.0 / LATELY));
     }
