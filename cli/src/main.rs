@@ -120,8 +120,12 @@ fn main() -> ExitCode {
 /// Prints an error chain; exit code 2 if its root is a wrong configuration, else 1.
 fn fail(error: &anyhow::Error, is_journal: bool) -> ExitCode {
     if is_journal {
-        // It takes a line of standard error for information.
-        tracing::error!("{error:#}");
+        // Not through the journal's socket: the journal looks up there, by the process, which
+        // service a line is from, and the process may have ended by then (systemd issue 2913).
+        // It knows whose standard error it reads. The prefix is syslog's number of an error.
+        for line in format!("{error:#}").lines() {
+            eprintln!("<3>{line}");
+        }
     } else {
         eprintln!("error: {error:#}");
     }

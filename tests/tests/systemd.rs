@@ -408,8 +408,8 @@ fn a_wrong_configuration_is_told_once_and_a_reload_refuses_it() {
         assert_eq!(
             errors().matches("bogus = 1").count(),
             told + 1,
-            "{}",
-            log(unit)
+            "{unit}: {}",
+            attempt("journalctl --no-pager -o verbose --grep 'bogus = 1'").0
         );
         machine.configure(file, |text| text);
         sh(&format!("systemctl start {unit}"));
