@@ -60,8 +60,11 @@ fn a_device_that_is_off_is_named() {
     for name in ["moteus", "icub_strain"] {
         let shown = shown(3, name, Fault::Off);
         let [all, concerned] = shown.named;
-        assert!(all == concerned, "{name}: {shown:#?}");
-        assert!(name != "moteus" || all > 1000, "{name}: {shown:#?}");
+        assert!(!shown.is_broken(), "{name}: {shown:#?}");
+        // Without its only F/T sensor there is no estimate.
+        let is_told = name != "moteus" || all > 1000;
+        assert!(all == concerned && is_told, "{name}: {shown:#?}");
+        assert!(shown.valid[1] < 0.7, "{name}: {shown:#?}");
         assert!(shown.valid[0] > 0.8, "{name}: {shown:#?}");
         assert!(shown.valid[2] > 0.8, "{name}: {shown:#?}");
     }
@@ -88,25 +91,26 @@ fn one_seed_is_one_run() {
 /// A longer run with one fault after the other.
 #[test]
 fn all_is_accounted_for_after_many_faults() {
-    let shown = soak(5, family("icub_motor"), 60.0, &mut |_| {}).expect("a robot with joints");
+    let shown = soak(5, family("icub_motor"), 160.0, &mut |_| {}).expect("a robot with joints");
     assert!(
         shown.missing.is_empty() && shown.silent.is_empty(),
         "{shown:#?}"
     );
     assert!(
-        shown.frames > 30_000 && shown.readings[0] > 30_000,
+        shown.frames > 80_000 && shown.readings[0] > 80_000,
         "{shown:#?}"
     );
 }
 
 /// What the long set has found, one of each kind: an encoder that jumps by turns; frames of an F/T
-/// sensor that become late; a push that goes on while an encoder is away.
+/// sensor that become late; a push that goes on while an encoder is away; one that begins slowly.
 #[test]
 fn what_the_long_set_has_found_stays_mended() {
     for (seed, name, fault) in [
         (31, "myactuator v2", Fault::Wrong),
         (21, "robotous_rft", Fault::Delayed),
         (44, "moteus", Fault::Slow),
+        (44, "canopen_encoder", Fault::None),
     ] {
         let shown = shown(seed, name, fault);
         assert!(!shown.is_broken(), "{name}, {fault:?}: {shown:#?}");

@@ -17,7 +17,8 @@
 //! one detected before is given an advantage of [`PREVIOUS`]. A detected contact is a force within
 //! [`CONTACT_RADIUS`] of the contact's `position_m`: without that bound, any six numbers could be a
 //! wrench at any contact. It stays present until `q` is plausible without it. In some postures a
-//! load hardly shows, so torques assume that it may still be there until [`GONE`]. If no contact
+//! load hardly shows, so torques assume that it may still be there until [`GONE`]. While a residual
+//! is not plausible without a contact, that may have begun: deviations cover it. If no contact
 //! explains the residual, all torques of the sub-tree are withheld, because the place where the
 //! wrench acts is unknown.
 //!
@@ -61,6 +62,8 @@ pub(super) struct SubtreeResidual {
     pub(super) significance: f64,
     /// The detected contact.
     pub(super) contact: Option<usize>,
+    /// The contact that would explain a residual that is improbable, but not significant.
+    suspected: Option<usize>,
     /// Whether the residual is significant and no contact explains it.
     pub(super) is_unexplained: bool,
     /// Whether it is significant, but the model has not been confirmed without a contact.
@@ -75,6 +78,7 @@ impl SubtreeResidual {
         },
         significance: f64::NAN,
         contact: None,
+        suspected: None,
         is_unexplained: false,
         is_unconfirmed: false,
     };
@@ -194,6 +198,15 @@ impl ResidualMonitor {
         possible
     }
 
+    /// The contacts that may have begun: the residual is not plausible without them.
+    pub(super) fn suspected(&self) -> ContactSet {
+        let mut suspected = ContactSet::EMPTY;
+        self.subtrees()
+            .filter_map(|residual| residual.suspected)
+            .for_each(|contact| suspected.insert(contact));
+        suspected
+    }
+
     /// Tests the residuals at an instant. `covariance` is that of a sub-tree's imbalance without
     /// F/T noise, `P + M`; none where the sub-tree has a fault. Does not allocate.
     pub(super) fn update(
@@ -216,7 +229,7 @@ impl ResidualMonitor {
             };
             let Some(model_covariance) = model_covariance else {
                 // A contact that was there may still be there after the fault.
-                state.mean = None;
+                (state.mean, state.lately) = (None, 0.0);
                 if !declared.is_empty() {
                     state.lingering = None;
                 }
@@ -284,6 +297,7 @@ impl ResidualMonitor {
     pub(super) fn reset(&mut self) {
         for subtree in &mut self.subtrees {
             (subtree.residual, subtree.mean) = (SubtreeResidual::NOTHING, None);
+            subtree.lately = 0.0;
             subtree.steps.iter_mut().for_each(Step::end);
         }
     }
@@ -332,19 +346,13 @@ impl SubtreeTest<'_> {
             significance,
             ..SubtreeResidual::NOTHING
         };
-        // A contact that was present stays until the residual is plausible without it.
-        let limit = if before.is_some() {
-            PLAUSIBLE
-        } else {
-            SIGNIFICANT
-        };
-        if significance <= limit || significance.is_nan() {
+        if significance <= PLAUSIBLE || significance.is_nan() {
             return result;
         }
         let possible = self.solved.structure.subtrees()[self.number]
             .contacts
             .difference(&self.declared);
-        let mut best = PLAUSIBLE;
+        let (mut best, mut found) = (PLAUSIBLE, None);
         for contact in possible.iter() {
             let (left, _) = self.test(least, Some(contact));
             let left = if before == Some(contact) {
@@ -353,8 +361,14 @@ impl SubtreeTest<'_> {
                 left
             };
             if left <= best {
-                (best, result.contact) = (left, Some(contact));
+                (best, found) = (left, Some(contact));
             }
+        }
+        // A contact that was present stays until the residual is plausible without it.
+        if before.is_some() || significance > SIGNIFICANT {
+            result.contact = found;
+        } else {
+            result.suspected = found;
         }
         result.is_unexplained = result.contact.is_none() && significance > SIGNIFICANT;
         result

@@ -37,7 +37,11 @@ impl Pipeline {
                 &self.kinematics,
                 &self.solver,
                 &self.readings,
-                (&active, &self.residuals.possible()),
+                [
+                    &active,
+                    &self.residuals.possible(),
+                    &self.residuals.suspected(),
+                ],
                 self.residuals.steps(),
             );
         }

@@ -1,4 +1,5 @@
-//! Steps of F/T offsets: what a residual may be instead of a contact.
+//! What a residual may be instead of what torques assume: a step of an F/T offset instead of a
+//! contact, or a contact that begins instead of noise. The deviations of torques cover it.
 //!
 //! A blow, a cable that slips or a restart of the sensor's board changes its offset at once, and
 //! any change of the six readings may as well be a wrench at a contact, or elsewhere. So from the
@@ -137,7 +138,8 @@ impl Step {
     }
 }
 
-/// How far the torques may be from those that steps of F/T offsets make likely.
+/// How far the torques may be from those that steps of F/T offsets, or contacts that begin, make
+/// likely.
 pub(super) struct StepCover {
     solver: Solver,
     readings: Vec<Wrench>,
@@ -169,9 +171,9 @@ impl StepCover {
         }
     }
 
-    /// Compares the torques of `solver` with those of all steps that are not refuted. `declared`
-    /// are the contacts that are known to be present, `detected` those that residuals show. Does
-    /// not allocate.
+    /// Compares the torques of `solver` with those of all steps that are not refuted, and with
+    /// those of all contacts that are suspected. `declared` are the contacts that are known to be
+    /// present, `detected` those that residuals show. Does not allocate.
     #[allow(clippy::too_many_arguments, reason = "each of another kind")]
     pub(super) fn update<'a>(
         &mut self,
@@ -180,7 +182,7 @@ impl StepCover {
         kinematics: &Kinematics,
         solver: &Solver,
         readings: &[Wrench],
-        (declared, detected): (&ContactSet, &ContactSet),
+        [declared, detected, suspected]: [&ContactSet; 3],
         steps: impl Iterator<Item = (usize, &'a Step)>,
     ) {
         self.torque.fill(0.0);
@@ -207,6 +209,23 @@ impl StepCover {
             for (deviation, (torque, other)) in self.torque.iter_mut().zip(both) {
                 *deviation = deviation.max((torque - other).abs() / COVERED);
             }
+        }
+        let assumed = declared.union(detected);
+        if suspected.difference(&assumed) == ContactSet::EMPTY {
+            return;
+        }
+        let active = assumed.union(suspected);
+        let solved = (self.solver)
+            .solve(model, structure, kinematics, readings, &active, &[])
+            .and_then(|()| self.solver.update_deviations(structure));
+        if solved.is_err() {
+            return;
+        }
+        let others = self.solver.torque().iter();
+        let others = others.zip(self.solver.torque_deviation());
+        let both = solver.torque().iter().zip(others);
+        for (deviation, (torque, (other, noise))) in self.torque.iter_mut().zip(both) {
+            *deviation = deviation.max(*noise).max((torque - other).abs() / COVERED);
         }
     }
 }
