@@ -213,8 +213,6 @@ fn a_frozen_sensor_gives_no_valid_torque() {
     }
 }
 
-/// A joint moves with jitter, stops, and stays at one count: it is not frozen. An F/T sensor whose
-/// noise ends like that is.
 /// A contact that is possible is absent because the F/T sensor would show it. While that can not
 /// see, the torques that rest on its absence are withheld, unless a program declares it.
 #[test]
@@ -286,6 +284,8 @@ fn a_new_zero_makes_the_offset_unknown() {
     }
 }
 
+/// A joint moves with jitter, stops, and stays at one count: it is not frozen. An F/T sensor whose
+/// noise ends like that is.
 #[test]
 fn a_joint_that_stands_is_not_frozen() {
     let setup = setup(|_| {});

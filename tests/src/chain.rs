@@ -125,7 +125,8 @@ pub fn run(seed: u64, family: Family, fault: Fault) -> Option<Shown> {
 }
 
 /// The same for a run of `duration` \[s\], with one fault after the other from the tenth second on:
-/// all of the list, in an order at random. After each stage `during` is told the time \[s\].
+/// all of the list in turn, each time in an order at random. After each stage `during` is told the
+/// time \[s\].
 ///
 /// # Panics
 /// If the robot cannot be simulated.
@@ -139,10 +140,14 @@ pub fn soak(
     let random = &mut Random::new(seed, "troubles");
     // The last one ends long before the run does.
     let count = (duration / EVERY) as usize - 1;
+    let mut left: Vec<Fault> = Vec::new();
     let troubles = (0..count).map(|number| {
+        if left.is_empty() {
+            left.extend(Fault::ALL.iter().map(|(_, fault)| *fault));
+        }
         let from = EVERY * (number as f64 + 0.5);
         Trouble {
-            fault: Fault::ALL[random.below(Fault::ALL.len())].1,
+            fault: left.swap_remove(random.below(left.len())),
             from,
             until: from + 0.5 * EVERY,
         }
@@ -552,7 +557,9 @@ impl Chain {
                 let mut off = [force, force, force, torque, torque, torque];
                 // Some sensors take the load at their start for zero, and the gateway knows.
                 let zero = &mut self.zeros[sample.channel as usize];
-                if zero.is_none() || sample.header.quality.contains(Quality::ZERO_CHANGED) {
+                let device = &self.plan.buses[channel.bus].devices[channel.device];
+                let is_first = zero.is_none() && device.driver == "jr3_can";
+                if is_first || sample.header.quality.contains(Quality::ZERO_CHANGED) {
                     *zero = Some(std::array::from_fn(|axis| {
                         let (least, most) = (least[axis], most[axis]);
                         [values[axis] - 0.5 * (least + most), 0.5 * (most - least)]

@@ -422,11 +422,12 @@ impl Online {
         }
     }
 
-    /// Whether the solution in use has the present zero of F/T sensor number `sensor`. True for a
-    /// sensor that is not identified.
+    /// Whether the solution in use has the zero that F/T sensor number `sensor` has since
+    /// [`OnlineIdentification::forget_offset`]. Never for a sensor that is not identified.
     pub fn knows_zero(&self, sensor: usize) -> bool {
-        let mut own = (self.components.iter()).filter(|c| c.sensors.contains(&sensor));
-        own.all(|component| !component.is_outdated)
+        let mut own = self.components.iter();
+        own.find(|component| component.sensors.contains(&sensor))
+            .is_some_and(|component| !component.is_outdated)
     }
 
     /// Returns a job to run once a second; None while the last one has not come back or waits for

@@ -218,13 +218,12 @@ impl Contacts {
         &self.lost
     }
 
-    /// The contacts that a program declares, or a skin feels: their absence is known.
+    /// The contacts that a program declares: their absence is known. A skin shows touches, never
+    /// that there are none.
     pub(super) fn watched(&self, t: Nanos) -> ContactSet {
         let mut watched = ContactSet::EMPTY;
-        let declared = (0..self.declarations.len()).filter(|c| self.declared(*c, t).is_some());
-        let felt = self.patches.iter().map(Patch::contact);
-        declared
-            .chain(felt)
+        (0..self.declarations.len())
+            .filter(|contact| self.declared(*contact, t).is_some())
             .for_each(|contact| watched.insert(contact));
         watched
     }

@@ -99,16 +99,17 @@ impl Pipeline {
                         predictor.push(t, &value, fault == Reason::None, is_continued);
                     }
                     history.push(t, value, quality);
-                    // The first reading is of the zero that the configuration is of.
-                    if !is_continued
-                        && newest > Nanos::MIN
-                        && let Some(ChannelRole::Sensor(number)) = role
-                        && let Some(since) = self.new_zeros.get_mut(number)
-                    {
-                        since.get_or_insert(newest);
-                        if let Some(identification) = &mut self.identification {
-                            identification.begin_zero(number, t);
-                        }
+                }
+                // The first reading is of the zero that the configuration is of. A reading that is
+                // of no use tells of a new zero all the same.
+                if !is_continued
+                    && newest > Nanos::MIN
+                    && let Some(ChannelRole::Sensor(number)) = role
+                    && let Some(since) = self.new_zeros.get_mut(number)
+                {
+                    since.get_or_insert(newest);
+                    if let Some(identification) = &mut self.identification {
+                        identification.begin_zero(number, t);
                     }
                 }
                 is_valid

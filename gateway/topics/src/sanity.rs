@@ -242,7 +242,7 @@ struct Path {
     fastest: f64,
     /// Its last speed, were the stamps in step.
     speed: f64,
-    /// Where the joint is by all smooth changes, and when it was last seen to move.
+    /// Where the joint is by all smooth changes, and when it was last known to be there.
     joint: (Nanos, f64),
     /// The readings can not be where the joint is.
     is_off: bool,
@@ -291,6 +291,7 @@ impl Path {
             return self.accept(t, value, if self.count > 2 { distance } else { 0.0 });
         }
         if self.resumes {
+            self.has_stopped = had_stopped && value == self.value;
             self.move_on(t, value);
             return self.accept(t, value, 0.0);
         }
@@ -341,10 +342,10 @@ impl Path {
         true
     }
 
-    /// The reading goes on smoothly, and the joint with it. What repeats itself is no motion: the
-    /// encoder may be stuck, and the joint elsewhere when it goes on.
+    /// The reading goes on smoothly, and the joint with it. One that has stopped at once may be
+    /// stuck, and the joint elsewhere when it goes on.
     fn move_on(&mut self, t: Nanos, value: f64) {
-        if value != self.value {
+        if !self.has_stopped {
             self.joint = (t, self.joint.1 + value - self.value);
         }
     }

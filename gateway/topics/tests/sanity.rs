@@ -385,6 +385,45 @@ fn an_encoder_that_jumps_is_off_until_it_jumps_back() {
     assert!(run(100) <= 1);
 }
 
+/// One that stood is not elsewhere, however long it stood.
+#[test]
+fn an_encoder_that_jumps_while_it_stands_is_off() {
+    let mut channel = Channel {
+        jumps: Jumps::of_encoders([1e-4]),
+        t: 0,
+    };
+    let mut run = |value: f64| {
+        let counts = (0..500).map(|k| f64::from(u8::from(k % 100 == 50)));
+        counts.filter(|k| channel.read(value + 1e-3 * k)).count()
+    };
+    assert_eq!(run(0.4), 0);
+    assert_eq!(run(3.4), 500);
+    assert!(run(0.4) <= 2);
+}
+
+/// A gap in its readings does not show that a stopped encoder goes on.
+#[test]
+fn what_stops_at_once_has_stopped_after_a_gap_too() {
+    let mut channel = noisy(0.5);
+    let mut last = 0.0;
+    for k in 0..100 {
+        last = f64::from(50 * k + k % 2);
+        channel.read(last);
+    }
+    for _ in 0..10 {
+        channel.read(last);
+    }
+    assert!(channel.jumps.has_stopped());
+    channel.t += 300;
+    for _ in 0..10 {
+        channel.read(last);
+        assert!(channel.jumps.has_stopped());
+    }
+    channel.t += 300;
+    channel.read(last + 60.0);
+    assert!(!channel.jumps.has_stopped());
+}
+
 /// A position from 0 to a turn begins anew.
 #[test]
 fn a_joint_that_turns_on_does_not_jump() {

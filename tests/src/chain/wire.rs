@@ -49,7 +49,7 @@ pub enum Fault {
     Deaf,
     /// Error frames with any content, 200 a second.
     ErrorFrames,
-    /// The controller is bus-off for .3 s, three times.
+    /// The controller is bus-off for .3 s, every three seconds.
     BusOff,
     /// The queue for sending is full.
     Full,

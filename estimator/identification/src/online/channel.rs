@@ -275,14 +275,15 @@ impl Residuals {
     };
 }
 
-/// Takes in the residuals of a sensor in one second. The mean of a second that a push fills for the
-/// greater part has a larger square than the scatter has.
+/// Takes in the residuals of a sensor in one second, NaN where it has none. The mean of a second
+/// that a push fills for the greater part has a larger square than the scatter has.
 pub(crate) fn take_scatters(axes: &mut [Channel], second: &[Residuals]) {
     let excess = (axes.iter().zip(second))
         .map(|(axis, own)| (own.mean * own.mean - own.scatter) / axis.stated)
+        .filter(|excess| excess.is_finite())
         .sum::<f64>();
     for (axis, own) in axes.iter_mut().zip(second) {
-        axis.take_scatter((excess <= 0.0).then_some(own));
+        axis.take_scatter((excess <= 0.0 && own.scatter.is_finite()).then_some(own));
     }
 }
 
@@ -475,19 +476,40 @@ mod tests {
         assert!((70.0..130.0).contains(&(loud / STATED)), "{loud}");
     }
 
-    /// The worst scatter after seconds of a mean and a scatter, on two axes of which the second is
-    /// quiet.
+    fn residuals((mean, scatter): (f64, f64)) -> Residuals {
+        Residuals {
+            mean,
+            scatter,
+            is_likely_noise: true,
+        }
+    }
+
+    /// The worst scatter after seconds of a mean and a scatter, on three axes of which the second
+    /// is quiet and the third is not measured.
     fn worst(seconds: &[(f64, f64)]) -> f64 {
-        let mut axes = [(); 2].map(|()| Channel::new(STATED, PERIOD));
+        let mut axes = [(); 3].map(|()| Channel::new(STATED, PERIOD));
         for second in seconds {
-            let residuals = |(mean, scatter)| Residuals {
-                mean,
-                scatter,
-                is_likely_noise: true,
-            };
-            take_scatters(&mut axes, &[*second, (0.0, STATED)].map(residuals));
+            let all = [*second, (0.0, STATED), (f64::NAN, f64::NAN)];
+            take_scatters(&mut axes, &all.map(residuals));
         }
         axes[0].worst()
+    }
+
+    #[test]
+    fn what_one_axis_shows_as_a_push_counts_as_noise_on_none() {
+        let mut axes = [(); 2].map(|()| Channel::new(STATED, PERIOD));
+        for _ in 0..3 {
+            take_scatters(&mut axes, &[(20.0, 1.0), (0.0, 100.0)].map(residuals));
+        }
+        assert_eq!(axes[1].worst(), 0.0);
+        // Too short a push to fill a second: its mean is no likely noise.
+        let (quiet, short) = ((0.0, STATED), (8.0, 96.0));
+        for second in [quiet, quiet, short, quiet] {
+            let mut second = [second, quiet].map(residuals);
+            second[0].is_likely_noise = second[0].mean == 0.0;
+            take_scatters(&mut axes, &second);
+        }
+        assert!(axes[0].worst() <= STATED, "{}", axes[0].worst());
     }
 
     #[test]

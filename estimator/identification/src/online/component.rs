@@ -112,6 +112,8 @@ pub(crate) struct Component {
     /// Whether the solution in use is from before that job.
     pub(crate) is_outdated: bool,
     pub(crate) paused: Paused,
+    /// The last instant without a fault.
+    seen: Nanos,
     pub(crate) last_change: Option<Change>,
     pub(crate) counts: Counts,
     /// Amount of absorbed data: seconds in motion, rows.
@@ -275,6 +277,7 @@ impl Component {
             waits: false,
             is_outdated: false,
             paused: Paused::No,
+            seen: Nanos::ZERO,
             last_change: None,
             counts: Counts::default(),
             motion: 0.0,
@@ -375,8 +378,8 @@ impl Component {
             .chain(of_sensors)
             .chain(of_joints);
         if let Some((reason, channel)) = faults.find(|(reason, _)| *reason != Reason::None) {
-            // One doubtful reading is no pause.
-            if reason != Reason::Implausible {
+            // A doubtful reading, or a few, are no pause.
+            if reason != Reason::Implausible || t - self.seen >= BLOCK {
                 self.paused = Paused::Fault(reason, channel);
             }
             let counts = &mut self.counts;
@@ -390,6 +393,7 @@ impl Component {
             } += 1;
             return;
         }
+        self.seen = t;
         let made = (self.current_rows).make(&self.kinds, stacked, &self.reference, &self.variances);
         if made == 0 {
             self.paused = Paused::Contact;

@@ -372,12 +372,12 @@ impl Part {
     /// residuals are mapped back to channels (Gauss, Markov).
     pub(crate) fn update_noise(&mut self) {
         let (offset_count, unknowns) = (self.variances.len(), self.information.unknowns());
-        if self.estimate.len() != unknowns || self.newest.root.ncols() + offset_count != unknowns {
-            return;
-        }
+        let mut seconds = vec![Residuals::NONE; offset_count];
         let rows = [&self.learnt, &self.rejected_rows];
-        let Some(span) = Span::of(rows.into_iter()) else {
-            return;
+        let is_solved =
+            self.estimate.len() == unknowns && self.newest.root.ncols() + offset_count == unknowns;
+        let Some(span) = Span::of(rows.into_iter()).filter(|_| is_solved) else {
+            return self.take_seconds(&seconds);
         };
         let observations = span.count;
         let (series, shown) = self.series(&rows, &span, &self.estimate);
@@ -412,7 +412,6 @@ impl Part {
         };
         let of_bodies = &self.newest.root * (&sensitivities - before);
         self.before = Some((sensitivities, bodies.to_vec()));
-        let mut seconds = vec![Residuals::NONE; offset_count];
         for (channel, own) in self.channels.iter_mut().enumerate() {
             // An offset jump is no drift.
             if self.change.is_some() || self.has_new_zero {
@@ -444,6 +443,11 @@ impl Part {
             }
             (self.variances[channel], self.drift_rates[channel]) = own.noise();
         }
+        self.take_seconds(&seconds);
+    }
+
+    /// Takes in the residuals of each channel in this second.
+    fn take_seconds(&mut self, seconds: &[Residuals]) {
         let sensors = self.channels.chunks_exact_mut(6);
         for (six, seconds) in sensors.zip(seconds.chunks_exact(6)) {
             take_scatters(six, seconds);
