@@ -3038,7 +3038,7 @@ fn readings_that_nothing_explains_are_said() {
 fn simulated_arm_is_identified_and_its_uncertainty_is_true() {
     for memory in [0.01, 8.0] {
         let (mut covered, mut all, mut squares, mut gains) = (0.0, Vec::new(), 0.0, Vec::new());
-        let seeds = 20;
+        let seeds = 12;
         for seed in 0..seeds {
             let setup = arm();
             let truth = real(&setup, seed);

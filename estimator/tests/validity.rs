@@ -258,19 +258,25 @@ fn a_contact_that_nothing_would_show_is_not_assumed_absent() {
 }
 
 /// The offset in use is that of the zero before: until another one is given, nothing that depends
-/// on the sensor is valid. The first reading of all is of the zero that the configuration is of.
+/// on the sensor is valid, also if the reading that tells of it is not a number. The first reading
+/// of all is of the zero that the configuration is of.
 #[test]
 fn a_new_zero_makes_the_offset_unknown() {
     let setup = setup(|_| {});
     let wrench = |c: &Channel| c.kind == Kind::Wrench;
     let ft = setup.robot.channels.iter().position(wrench).unwrap();
     let shoulder = |estimate: &Estimate| estimate.torques.joints()[0];
-    for zero_at in [0, 60] {
-        let found = estimates(&setup, 120, |instant, channel, _| {
-            match (instant, channel) == (zero_at, ft) {
-                true => Quality::ZERO_CHANGED,
-                false => Quality::GOOD,
+    for (zero_at, is_lost) in [(0, false), (60, false), (60, true)] {
+        let found = estimates(&setup, 120, |instant, channel, reading| {
+            if (instant, channel) != (zero_at, ft) {
+                return Quality::GOOD;
             }
+            if let Reading::Wrench(wrench) = reading
+                && is_lost
+            {
+                wrench.force[0] = f64::NAN;
+            }
+            Quality::ZERO_CHANGED
         });
         let (before, after) = (shoulder(&found[50]), shoulder(found.last().unwrap()));
         assert_eq!(before.valid, 1, "{before:?}");

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// The permitted direct dependencies between members of the workspace.
-const DIRECTIONS: [(&str, &[&str]); 9] = [
+const DIRECTIONS: [(&str, &[&str]); 10] = [
     ("proprio-topics", &[]),
     ("proprio-drivers", &["proprio-topics"]),
     ("proprio-gateway", &["proprio-drivers", "proprio-topics"]),
@@ -39,6 +39,10 @@ const DIRECTIONS: [(&str, &[&str]); 9] = [
     ),
     ("proprio-cli", &EVERYTHING),
     ("proprio-tests", &EVERYTHING),
+    (
+        "peers-ours",
+        &["proprio-dynamics", "proprio-identification"],
+    ),
 ];
 const EVERYTHING: [&str; 7] = [
     "proprio-topics",

@@ -291,7 +291,9 @@ fn crates() -> Vec<PathBuf> {
     let members = manifest["workspace"]["members"]
         .as_array()
         .expect("a list of members");
-    let folders = members.iter().filter_map(|member| member.as_str());
+    // The timed program shares a file with another one, by a `path` that is not followed here.
+    let folders = (members.iter().filter_map(|member| member.as_str()))
+        .filter(|member| *member != "tests/peers/ours");
     let roots = folders.flat_map(|member| {
         ["src/lib.rs", "src/main.rs"].map(|file| root().join(member).join(file))
     });

@@ -2,7 +2,7 @@
 //! ../../server.rs)
 
 #[path = "../../server.rs"]
-#[allow(dead_code, reason = "each program uses its own part")]
+#[allow(dead_code, unreachable_pub, reason = "each program uses its own part")]
 mod server;
 
 use std::fmt::Display;
