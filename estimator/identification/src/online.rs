@@ -423,7 +423,7 @@ impl Online {
     }
 
     /// Whether the solution in use has the zero that F/T sensor number `sensor` has since
-    /// [`OnlineIdentification::forget_offset`]. Never for a sensor that is not identified.
+    /// [`Self::forget_offset`]. Never for a sensor that is not identified.
     pub fn knows_zero(&self, sensor: usize) -> bool {
         let mut own = self.components.iter();
         own.find(|component| component.sensors.contains(&sensor))

@@ -183,28 +183,25 @@ impl ResidualMonitor {
 
     /// The detected contacts.
     pub(super) fn detected(&self) -> ContactSet {
-        let mut detected = ContactSet::EMPTY;
-        self.subtrees()
-            .filter_map(|residual| residual.contact)
-            .for_each(|contact| detected.insert(contact));
-        detected
+        self.contacts(|state| state.residual.contact)
     }
 
     /// These, and those that may still be there, though the residual is plausible without them.
     pub(super) fn possible(&self) -> ContactSet {
-        let mut possible = ContactSet::EMPTY;
-        let lingering = self.subtrees.iter().filter_map(|state| state.lingering);
-        lingering.for_each(|contact| possible.insert(contact));
-        possible
+        self.contacts(|state| state.lingering)
     }
 
     /// The contacts that may have begun: the residual is not plausible without them.
     pub(super) fn suspected(&self) -> ContactSet {
-        let mut suspected = ContactSet::EMPTY;
-        self.subtrees()
-            .filter_map(|residual| residual.suspected)
-            .for_each(|contact| suspected.insert(contact));
-        suspected
+        self.contacts(|state| state.residual.suspected)
+    }
+
+    /// One contact of each sub-tree, or none.
+    fn contacts(&self, of: impl Fn(&SubtreeState) -> Option<usize>) -> ContactSet {
+        let mut contacts = ContactSet::EMPTY;
+        let all = self.subtrees.iter().filter_map(of);
+        all.for_each(|contact| contacts.insert(contact));
+        contacts
     }
 
     /// Tests the residuals at an instant. `covariance` is that of a sub-tree's imbalance without

@@ -205,10 +205,7 @@ impl StepCover {
             if solved.is_err() {
                 continue;
             }
-            let both = solver.torque().iter().zip(self.solver.torque());
-            for (deviation, (torque, other)) in self.torque.iter_mut().zip(both) {
-                *deviation = deviation.max((torque - other).abs() / COVERED);
-            }
+            self.cover(solver);
         }
         let assumed = declared.union(detected);
         if suspected.difference(&assumed) == ContactSet::EMPTY {
@@ -221,11 +218,18 @@ impl StepCover {
         if solved.is_err() {
             return;
         }
-        let others = self.solver.torque().iter();
-        let others = others.zip(self.solver.torque_deviation());
-        let both = solver.torque().iter().zip(others);
-        for (deviation, (torque, (other, noise))) in self.torque.iter_mut().zip(both) {
-            *deviation = deviation.max(*noise).max((torque - other).abs() / COVERED);
+        self.cover(solver);
+        let noise = self.solver.torque_deviation();
+        for (deviation, noise) in self.torque.iter_mut().zip(noise) {
+            *deviation = deviation.max(*noise);
+        }
+    }
+
+    /// The deviations cover the last solution, too.
+    fn cover(&mut self, solver: &Solver) {
+        let both = solver.torque().iter().zip(self.solver.torque());
+        for (deviation, (torque, other)) in self.torque.iter_mut().zip(both) {
+            *deviation = deviation.max((torque - other).abs() / COVERED);
         }
     }
 }
