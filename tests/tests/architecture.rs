@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// The permitted direct dependencies between members of the workspace.
-const DIRECTIONS: [(&str, &[&str]); 10] = [
+const DIRECTIONS: [(&str, &[&str]); 11] = [
     ("proprio-topics", &[]),
     ("proprio-drivers", &["proprio-topics"]),
     ("proprio-gateway", &["proprio-drivers", "proprio-topics"]),
@@ -38,13 +38,14 @@ const DIRECTIONS: [(&str, &[&str]); 10] = [
         ],
     ),
     ("proprio-cli", &EVERYTHING),
+    ("proprio-ffi", &["proprio-topics"]),
     ("proprio-tests", &EVERYTHING),
     (
         "peers-ours",
         &["proprio-dynamics", "proprio-identification"],
     ),
 ];
-const EVERYTHING: [&str; 7] = [
+const EVERYTHING: [&str; 8] = [
     "proprio-topics",
     "proprio-drivers",
     "proprio-gateway",
@@ -52,6 +53,7 @@ const EVERYTHING: [&str; 7] = [
     "proprio-identification",
     "proprio-estimator",
     "proprio-simulator",
+    "proprio-ffi",
 ];
 
 /// Libraries that only some members may depend on directly: the name (or a prefix with a star) and
@@ -103,7 +105,10 @@ const BARE: [&str; 20] = [
 ];
 
 /// The files that may contain `unsafe`, with the reason.
-const UNSAFE: [(&str, &str); 9] = [
+const UNSAFE: [(&str, &str); 12] = [
+    ("ffi/src/lib.rs", "pointers from C"),
+    ("ffi/benches/read.rs", "calls what C calls"),
+    ("ffi/tests/values.rs", "calls what C calls"),
     (
         "gateway/src/link/socket.rs",
         "recvmmsg without allocation, and an ioctl that no library wraps",
@@ -148,7 +153,7 @@ const CLOCKS: [(&str, &str); 2] = [
 
 /// The files that may call these clocks: the outermost loops of programs, and tests that wait for
 /// processes.
-const OUTERMOST: [(&str, &str); 13] = [
+const OUTERMOST: [(&str, &str); 15] = [
     ("gateway/topics/src/ipc/clock.rs", "is it"),
     ("gateway/src/clock.rs", "the gateway's clock"),
     ("gateway/topics/src/ipc/bell.rs", "tests of waiting"),
@@ -165,6 +170,8 @@ const OUTERMOST: [(&str, &str); 13] = [
         "the loop of the thread that opens ports",
     ),
     ("gateway/topics/examples/consumer.rs", "a program"),
+    ("ffi/src/lib.rs", "hands the clock to C"),
+    ("ffi/benches/", "measure"),
     ("gateway/topics/benches/", "measure"),
     ("gateway/benches/", "measure"),
     ("estimator/src/daemon.rs", "the daemon's loop"),

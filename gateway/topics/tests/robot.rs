@@ -3,14 +3,13 @@
 // A system call that cuts off all others needs unsafe code.
 #![allow(missing_docs, clippy::unwrap_used, unsafe_code)]
 
+mod fakes;
+
+use fakes::{CHANNELS, Estimator, Gateway, description};
 use proprio_topics::ipc::{
     Domain, DomainConfig, Presence, RobotReader, Unavailable, Writer, monotonic,
 };
-use proprio_topics::{
-    ContactEstimate, ContactWrench, Description, Entry, EstimatorHealth, GatewayHealth, Header,
-    Imu, JointState, JointTorque, Kind, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Nanos,
-    Publisher, Quality, Reading, Reason, Residual, Role, Sample, TorqueEstimate, Wrench,
-};
+use proprio_topics::{GatewayHealth, Kind, Nanos, Publisher, Quality, Role};
 use std::io::Read;
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -24,167 +23,6 @@ fn place() -> (tempfile::TempDir, DomainConfig) {
     let base = tempfile::tempdir_in("/dev/shm").unwrap();
     let config = DomainConfig::new(base.path(), "test");
     (base, config)
-}
-
-fn description(publisher: Publisher, entries: &[(&str, Role, Kind, u32)]) -> Description {
-    let entries = entries.iter().map(|(name, role, kind, index)| Entry {
-        name: Name::new(name).unwrap(),
-        role: role.in_memory(),
-        kind: kind.in_memory(),
-        index: *index,
-        max_silence: Nanos::from_millis(30),
-        ..Entry::NONE
-    });
-    Description::new(publisher, entries)
-}
-
-/// The writers of an estimator; `elbow` and `wrist` are its joints, in this order.
-struct Estimator {
-    torques: Writer<TorqueEstimate>,
-    contacts: Writer<ContactEstimate>,
-    descriptions: Writer<Description>,
-    health: Writer<EstimatorHealth>,
-}
-
-impl Estimator {
-    fn start(domain: &Domain, epoch: u64, joints: [&str; 2]) -> Self {
-        let mut this = Self {
-            health: Writer::create(domain, "icub", epoch).unwrap(),
-            torques: Writer::create(domain, "icub", epoch).unwrap(),
-            contacts: Writer::create(domain, "icub", epoch).unwrap(),
-            descriptions: Writer::create(domain, "icub", epoch).unwrap(),
-        };
-        let entries = [
-            (joints[0], Role::Joint, Kind::Joint, 0),
-            (joints[1], Role::Joint, Kind::Joint, 1),
-            ("hand", Role::Contact, Kind::Wrench, 0),
-            ("ft", Role::Channel, Kind::Wrench, 3),
-        ];
-        let description = description(Publisher::Estimator, &entries);
-        this.descriptions.send(&description, monotonic()).unwrap();
-        this
-    }
-
-    /// Torques of 1.5 Nm, and one that is withheld because of `ft`; a contact of 7 N.
-    fn send(&mut self, t: Nanos, values: [f64; 2]) {
-        let joint = |torque: f64| JointTorque {
-            torque,
-            standard_deviation: 0.1,
-            valid: u32::from(torque < 2.0),
-            reason: if torque < 2.0 {
-                Reason::None
-            } else {
-                Reason::Stale
-            }
-            .in_memory(),
-            cause: 3,
-            ..JointTorque::ABSENT
-        };
-        let header = Header {
-            acquired: t,
-            ..Header::default()
-        };
-        let mut joints = [JointTorque::ABSENT; MAX_JOINTS];
-        (joints[0], joints[1]) = (joint(values[0]), joint(values[1]));
-        let torques = TorqueEstimate {
-            header,
-            count: 2,
-            reserved: 0,
-            joints,
-        };
-        let mut contacts = [ContactWrench::ABSENT; MAX_CONTACTS];
-        contacts[0] = ContactWrench {
-            force: [7.0, 0.0, 0.0],
-            torque: [0.0; 3],
-            standard_deviation: [0.5; 6],
-            valid: 1,
-            reason: Reason::None.in_memory(),
-            detected: 1,
-            position: [0.25, 0.0, 0.0],
-            located: 1,
-            ..ContactWrench::ABSENT
-        };
-        let contacts = ContactEstimate {
-            header,
-            count: 1,
-            residual_count: 0,
-            contacts,
-            residuals: [Residual::ABSENT; MAX_SUBTREES],
-        };
-        // Published long after the instant that it refers to.
-        let now = monotonic();
-        self.torques.send(&torques, now).unwrap();
-        self.contacts.send(&contacts, now).unwrap();
-        self.health.send(&EstimatorHealth::default(), now).unwrap();
-        self.descriptions.update_connections().unwrap();
-    }
-}
-
-/// The writers of a gateway with an encoder, a force/torque sensor and an IMU.
-struct Gateway {
-    samples: Writer<Sample>,
-    descriptions: Writer<Description>,
-    health: Writer<GatewayHealth>,
-}
-
-const CHANNELS: [(&str, Kind); 3] = [
-    ("elbow", Kind::Joint),
-    ("ft", Kind::Wrench),
-    ("chest", Kind::Imu),
-];
-
-impl Gateway {
-    fn start(domain: &Domain, epoch: u64, first: u32) -> Self {
-        let mut this = Self {
-            health: Writer::create(domain, "icub", epoch).unwrap(),
-            samples: Writer::create(domain, "icub", epoch).unwrap(),
-            descriptions: Writer::create(domain, "icub", epoch).unwrap(),
-        };
-        this.describe(first);
-        this
-    }
-
-    fn describe(&mut self, first: u32) {
-        let entries: Vec<_> = (CHANNELS.into_iter().zip(first..))
-            .map(|((name, kind), number)| (name, Role::Channel, kind, number))
-            .collect();
-        let description = description(Publisher::Gateway, &entries);
-        self.descriptions.send(&description, monotonic()).unwrap();
-    }
-
-    fn send(&mut self, t: Nanos, first: u32, quality: Quality) {
-        let header = Header {
-            acquired: t,
-            quality,
-            ..Header::default()
-        };
-        let readings = [
-            Reading::Joint(JointState {
-                position: 0.25,
-                ..JointState::ABSENT
-            }),
-            Reading::Wrench(Wrench {
-                force: [1.0, 2.0, 3.0],
-                torque: [4.0, 5.0, 6.0],
-            }),
-            Reading::Imu(Imu {
-                proper_acceleration: [0.0, 0.0, 9.8],
-                ..Imu::ABSENT
-            }),
-            // Not the main reading of its channel.
-            Reading::Temperature(proprio_topics::Temperature { celsius: 30.0 }),
-        ];
-        let now = monotonic();
-        for (reading, number) in readings
-            .iter()
-            .zip([first, first + 1, first + 2, first + 1])
-        {
-            let sample = Sample::new(header, number, reading);
-            self.samples.send(&sample, now).unwrap();
-        }
-        self.health.send(&GatewayHealth::new(now), now).unwrap();
-        self.descriptions.update_connections().unwrap();
-    }
 }
 
 /// Calls `turn` until it returns true.
@@ -236,6 +74,13 @@ fn values_come_with_a_reason_when_they_do_not_come() {
     assert_eq!(robot.imu(imu).unwrap().value.proper_acceleration[2], 9.8);
     assert_eq!(robot.wrench(other_kind), Err(Unavailable::Unknown));
     assert_eq!(robot.torque_names().collect::<Vec<_>>(), ["elbow", "wrist"]);
+    assert_eq!(robot.contact_names().collect::<Vec<_>>(), ["hand"]);
+    assert_eq!(
+        robot.channel_names().collect::<Vec<_>>(),
+        CHANNELS.map(|(n, k)| (k, n))
+    );
+    assert_eq!(robot.torque_handle("elbow"), elbow, "a name has one handle");
+    assert_ne!(robot.channel_handle(Kind::Wrench, "elbow"), encoder);
     until("both to be seen", || {
         estimator.send(t, [1.5, 2.5]);
         gateway.send(t, 5, Quality::GOOD);

@@ -11,14 +11,15 @@ use super::clock::monotonic;
 use super::presence::Watch;
 use super::{Domain, DomainConfig, Freshness, Presence, Reader, Topic};
 use crate::{
-    Code, ContactEstimate, Description, EstimatorHealth, GatewayHealth, Imu, JointState, Kind,
-    MAX_CHANNELS, Name, Nanos, Publisher, Quality, Reading, Reason, Role, Sample, TorqueEstimate,
-    Wrench,
+    Code, ContactEstimate, Description, Entry, EstimatorHealth, GatewayHealth, Imu, JointState,
+    Kind, MAX_CHANNELS, Name, Nanos, Publisher, Quality, Reading, Reason, Role, Sample,
+    TorqueEstimate, Wrench,
 };
 use core::fmt;
 use core::sync::atomic::AtomicBool;
 use core::sync::atomic::Ordering::{AcqRel, Acquire, Relaxed, Release};
 use iceoryx2::prelude::ipc_threadsafe;
+use nix::sys::signal::{SigSet, Signal};
 use std::borrow::ToOwned;
 use std::boxed::Box;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -221,6 +222,13 @@ impl RobotReader {
     }
 
     fn want(&mut self, publisher: Publisher, role: Role, kind: Option<Kind>, name: &str) -> usize {
+        let is_known = |wanted: &Wanted| {
+            (wanted.publisher, wanted.role, wanted.kind) == (publisher, role, kind)
+                && wanted.name == name
+        };
+        if let Some(known) = self.wanted.iter().position(is_known) {
+            return known;
+        }
         let mut wanted = Wanted {
             publisher,
             role,
@@ -439,12 +447,27 @@ impl RobotReader {
     /// The names of the joints whose torques are estimated, in order of their numbers; empty before
     /// the estimator's description is received.
     pub fn torque_names(&self) -> impl Iterator<Item = &str> {
-        self.described(Publisher::Estimator)
-            .map(Description::entries)
-            .unwrap_or_default()
-            .iter()
-            .filter(|entry| entry.role == Role::Joint)
-            .map(|entry| entry.name.as_str())
+        let joints = self.entries(Publisher::Estimator, Role::Joint);
+        joints.map(|entry| entry.name.as_str())
+    }
+
+    /// As [`RobotReader::torque_names`], of the contacts.
+    pub fn contact_names(&self) -> impl Iterator<Item = &str> {
+        let contacts = self.entries(Publisher::Estimator, Role::Contact);
+        contacts.map(|entry| entry.name.as_str())
+    }
+
+    /// The kinds and names of the gateway's channels, in order of their numbers; empty before the
+    /// gateway's description is received.
+    pub fn channel_names(&self) -> impl Iterator<Item = (Kind, &str)> {
+        let channels = self.entries(Publisher::Gateway, Role::Channel);
+        channels.filter_map(|entry| Some((entry.kind.get()?, entry.name.as_str())))
+    }
+
+    fn entries(&self, publisher: Publisher, role: Role) -> impl Iterator<Item = &Entry> {
+        let described = self.described(publisher);
+        let entries = described.map(Description::entries).unwrap_or_default();
+        entries.iter().filter(move |entry| entry.role == role)
     }
 
     /// The newest torques as they were sent, withheld ones included.
@@ -589,6 +612,7 @@ impl Attaching {
         let thread = thread::Builder::new()
             .name("attach".into())
             .spawn(move || {
+                leave_signals_to_others();
                 let mut attacher = Attacher {
                     config: domain,
                     robot,
@@ -668,6 +692,22 @@ impl Drop for Attaching {
             let _ = thread.join();
         }
     }
+}
+
+/// The program's signals are for its own threads, but for those that say that an instruction of
+/// this thread went wrong.
+fn leave_signals_to_others() {
+    let mut signals = SigSet::all();
+    let own = [
+        Signal::SIGBUS,
+        Signal::SIGSEGV,
+        Signal::SIGILL,
+        Signal::SIGFPE,
+        Signal::SIGTRAP,
+        Signal::SIGABRT,
+    ];
+    own.into_iter().for_each(|signal| signals.remove(signal));
+    let _ = signals.thread_block();
 }
 
 /// What the thread owns.
