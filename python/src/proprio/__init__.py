@@ -1,0 +1,59 @@
+"""A robot's proprioception: joint torques, contact wrenches and measurements, live and from logs.
+
+Live, from the shared memory of a running gateway and estimator::
+
+    import proprio
+
+    with proprio.RobotReader("icub_left_arm", max_age=0.005) as robot:
+        while True:
+            robot.wait_for_estimate(timeout=0.01)
+            torque = robot.torque("l_elbow")
+            print(f"{torque.torque} +- {torque.standard_deviation} Nm" if torque else torque)
+
+From logs::
+
+    table = proprio.read_table("a.csv")
+    outcome = proprio.identify("estimator.toml", ["a.csv", "b.csv"], out="result")
+    estimates = proprio.estimate("estimator.toml", "c.csv", parameters=outcome.parameters)
+"""
+
+from .live import (
+    IMU,
+    JOINT,
+    WRENCH,
+    Contact,
+    Imu,
+    JointState,
+    Missing,
+    RobotReader,
+    Torque,
+    Torques,
+    Unavailable,
+    Wrench,
+    now,
+)
+from .logs import Failed, Identification, Table, estimate, identify, read_table
+from ._program import program
+
+__all__ = [
+    "IMU",
+    "JOINT",
+    "WRENCH",
+    "Contact",
+    "Failed",
+    "Identification",
+    "Imu",
+    "JointState",
+    "Missing",
+    "RobotReader",
+    "Table",
+    "Torque",
+    "Torques",
+    "Unavailable",
+    "Wrench",
+    "estimate",
+    "identify",
+    "now",
+    "program",
+    "read_table",
+]

@@ -1,0 +1,207 @@
+"""Recorded tables as arrays, and `identify` and `estimate` on files."""
+
+import csv
+import html
+import json
+import subprocess
+from os import PathLike
+from pathlib import Path
+from typing import Any, Dict, Iterator, List, Mapping, Optional, Sequence, Union
+
+import numpy as np
+import numpy.typing as npt
+
+from ._program import program
+
+AnyPath = Union[str, "PathLike[str]"]
+
+
+class Failed(RuntimeError):
+    """The command did not do it; the text is its own."""
+
+
+class Table(Mapping[str, npt.NDArray[Any]]):
+    """The columns of a table by name, as ``table["joint/l_elbow/position"]``.
+
+    Numbers are arrays of float64, NaN where a cell is empty; other columns (reasons) are arrays of
+    text. ``proprio`` describes the names in its README; ``t`` are seconds.
+    """
+
+    def __init__(self, columns: Dict[str, npt.NDArray[Any]]) -> None:
+        self._columns = columns
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        return self._columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+    @property
+    def t(self) -> npt.NDArray[Any]:
+        """The stamps [s]."""
+        return self._columns["t"]
+
+    def of(self, name: str) -> "Table":
+        """The rows in which this column has a value: a sensor's own samples."""
+        column = self._columns[name]
+        is_there = ~np.isnan(column) if column.dtype.kind == "f" else column != ""
+        return Table({key: values[is_there] for key, values in self._columns.items()})
+
+    def torque(self, joint: str) -> npt.NDArray[Any]:
+        """The torque of a joint in a table of estimates [Nm]; NaN where it is withheld."""
+        return self._columns[f"torque/{joint}"]
+
+    def torque_std(self, joint: str) -> npt.NDArray[Any]:
+        """Its standard deviation [Nm]; NaN where it is withheld."""
+        deviation = self._columns[f"torque_std/{joint}"]
+        return np.where(self.valid(joint), deviation, np.nan)
+
+    def valid(self, joint: str) -> npt.NDArray[np.bool_]:
+        """Where the torque of a joint may be used."""
+        valid: npt.NDArray[np.bool_] = self._columns[f"valid/{joint}"] == 1
+        return valid
+
+    def to_pandas(self) -> Any:
+        """A pandas.DataFrame."""
+        import pandas
+
+        return pandas.DataFrame(self._columns)
+
+    def __repr__(self) -> str:
+        rows = len(self._columns["t"]) if "t" in self._columns else 0
+        return f"<Table of {rows} rows: {', '.join(self._columns)}>"
+
+
+def _column(cells: List[str]) -> npt.NDArray[Any]:
+    try:
+        return np.array([float(cell) if cell else np.nan for cell in cells])
+    except ValueError:
+        return np.array(cells)
+
+
+def read_table(path: AnyPath) -> Table:
+    """Reads a table of samples or estimates (CSV).
+
+    Raises OSError, and ValueError if a row has more or fewer cells than there are columns.
+    """
+    with open(path, newline="", encoding="utf-8") as file:
+        reader = csv.reader(file)
+        names = next(reader, [])
+        if not names:
+            raise ValueError(f"{path} is empty")
+        columns: List[List[str]] = [[] for _ in names]
+        for row in reader:
+            if len(row) != len(names):
+                raise ValueError(
+                    f"{path}, line {reader.line_num}: {len(row)} cells for {len(names)} columns"
+                )
+            for column, cell in zip(columns, row):
+                column.append(cell)
+    return Table({name: _column(cells) for name, cells in zip(names, columns)})
+
+
+def _run(arguments: Sequence[str], result: Path) -> None:
+    """Runs the command, which makes the file `result`, whatever it then thinks of it."""
+    done = subprocess.run(
+        [str(program()), *arguments], stdin=subprocess.DEVNULL, capture_output=True, text=True
+    )
+    if done.returncode == 0 or result.is_file():
+        return
+    lines = done.stderr.strip().splitlines()
+    raise Failed("\n".join(lines[-20:]) or f"proprio ended with {done.returncode}")
+
+
+def _paths(paths: Union[AnyPath, Sequence[AnyPath]]) -> List[str]:
+    if isinstance(paths, (str, PathLike)):
+        return [str(paths)]
+    return [str(path) for path in paths]
+
+
+def estimate(
+    config: AnyPath,
+    samples: AnyPath,
+    out: AnyPath,
+    parameters: Optional[AnyPath] = None,
+) -> Table:
+    """Estimates joint torques and contact wrenches from a table of samples; `proprio estimate`.
+
+    ``config`` is an estimator.toml, ``parameters`` a parameters.toml to use instead of the
+    URDF's. Writes the table ``out``, and reads it. Raises Failed, with the command's own words.
+    """
+    words = ["estimate", "--config", str(config), "--samples", str(samples), "--out", str(out)]
+    if parameters is not None:
+        words += ["--parameters", str(parameters)]
+    Path(out).unlink(missing_ok=True)
+    _run(words, Path(out))
+    return read_table(out)
+
+
+class Identification:
+    """An outcome of ``identify``. In a notebook it shows its report, with all plots."""
+
+    def __init__(self, folder: AnyPath) -> None:
+        self.folder = Path(folder)
+        """where the files are"""
+        self.summary: Dict[str, Any] = json.loads((self.folder / "summary.json").read_text())
+        """summary.json: see the top of cli/src/identify/summary.rs"""
+
+    @property
+    def grade(self) -> str:
+        """``accept``, ``care`` or ``reject``: whether to use the parameters."""
+        return str(self.summary["advice"]["grade"])
+
+    @property
+    def why(self) -> List[str]:
+        """Why, in sentences."""
+        return list(self.summary["advice"]["why"])
+
+    @property
+    def next(self) -> List[str]:
+        """What to do next, in sentences."""
+        return list(self.summary["advice"]["next"])
+
+    @property
+    def parameters(self) -> Optional[Path]:
+        """parameters.toml; None if the outcome was rejected."""
+        path = self.folder / "parameters.toml"
+        return path if path.is_file() else None
+
+    @property
+    def report(self) -> Path:
+        """report.html"""
+        return self.folder / "report.html"
+
+    def _repr_html_(self) -> str:
+        page = html.escape(self.report.read_text(encoding="utf-8"), quote=True)
+        return f'<iframe srcdoc="{page}" style="width:100%;height:800px;border:0"></iframe>'
+
+    def __repr__(self) -> str:
+        return f"<Identification in {self.folder}: {self.grade}; {' '.join(self.why)}>"
+
+
+def identify(
+    config: AnyPath,
+    samples: Union[AnyPath, Sequence[AnyPath]],
+    out: AnyPath,
+    validate: Union[AnyPath, Sequence[AnyPath]] = (),
+) -> Identification:
+    """Identifies inertial parameters, F/T offsets and friction from tables of samples; `proprio
+    identify`.
+
+    ``config`` is an estimator.toml. Writes the folder ``out``. A rejected outcome is an outcome:
+    look at its ``grade``. Raises Failed, with the command's own words, if there is none.
+    """
+    folder = Path(out)
+    # What an earlier run left is no outcome of this one.
+    for name in ("summary.json", "parameters.toml"):
+        (folder / name).unlink(missing_ok=True)
+    words = ["identify", "--config", str(config), "--out", str(out)]
+    for path in _paths(samples):
+        words += ["--samples", path]
+    for path in _paths(validate):
+        words += ["--validate", path]
+    _run(words, folder / "summary.json")
+    return Identification(folder)

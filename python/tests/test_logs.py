@@ -1,0 +1,74 @@
+"""Tables as arrays, and `identify` and `estimate` on the sessions of MuJoCo."""
+
+import numpy as np
+import proprio
+import pytest
+from conftest import TREE
+
+SESSIONS = TREE / "tests" / "oracle" / "sessions"
+
+
+def test_a_table_is_columns(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("t,joint/a/position,reason/a\n0.5,1.25,\n0.75,,stale\n")
+    table = proprio.read_table(path)
+    assert list(table) == ["t", "joint/a/position", "reason/a"]
+    assert list(table.t) == [0.5, 0.75]
+    assert table["joint/a/position"][0] == 1.25 and np.isnan(table["joint/a/position"][1])
+    assert list(table["reason/a"]) == ["", "stale"]
+    assert list(table.of("joint/a/position").t) == [0.5]
+    assert table.to_pandas().shape == (2, 3)
+    path.write_text("t,a\n1,2,3\n")
+    with pytest.raises(ValueError, match="line 2: 3 cells for 2 columns"):
+        proprio.read_table(path)
+    path.write_text("")
+    with pytest.raises(ValueError, match="empty"):
+        proprio.read_table(path)
+
+
+def test_identify_and_estimate(tmp_path):
+    config = SESSIONS / "estimator.toml"
+    outcome = proprio.identify(
+        config,
+        SESSIONS / "train.csv",
+        out=tmp_path / "result",
+        validate=[SESSIONS / "validate.csv"],
+    )
+    assert outcome.grade == "accept" and outcome.why and outcome.parameters is not None
+    assert outcome.summary["verdict"] == "identified"
+    assert "<iframe" in outcome._repr_html_() and outcome.report.is_file()
+
+    # Of the same session: each begins with other offsets of the sensor.
+    measured = proprio.read_table(SESSIONS / "train.csv").of("joint/l_elbow/torque")
+    error = {}
+    for name, parameters in ("cad", None), ("identified", outcome.parameters):
+        out = tmp_path / f"{name}.csv"
+        estimates = proprio.estimate(
+            config, SESSIONS / "train.csv", out=out, parameters=parameters
+        )
+        valid, torque = estimates.valid("l_elbow"), estimates.torque("l_elbow")
+        assert np.isfinite(torque[valid]).all() and np.isnan(torque[~valid]).all()
+        assert (estimates.torque_std("l_elbow")[valid] > 0).all()
+        truth = np.interp(estimates.t, measured.t, measured["joint/l_elbow/torque"])
+        error[name] = np.abs(torque - truth)[valid]
+    assert len(error["identified"]) > 0.9 * len(estimates.t), len(error["identified"])
+    assert np.median(error["identified"]) < 0.5 * np.median(error["cad"]), error
+
+
+def test_the_commands_words_are_the_error(tmp_path):
+    with pytest.raises(proprio.Failed, match="nowhere.toml"):
+        proprio.estimate("nowhere.toml", SESSIONS / "train.csv", out=tmp_path / "out.csv")
+    with pytest.raises(proprio.Failed, match="nowhere.csv"):
+        proprio.identify(SESSIONS / "estimator.toml", "nowhere.csv", out=tmp_path / "result")
+
+
+def test_the_pages_program_on_files(tmp_path, monkeypatch):
+    program = (TREE / "docs/reading.md").read_text().split("```python\n")[2].split("```")[0]
+    for name in ("estimator.toml", "cad.urdf"):
+        (tmp_path / name).write_bytes((SESSIONS / name).read_bytes())
+    for to, of in ("a", "train"), ("b", "validate"), ("c", "validate"):
+        (tmp_path / f"{to}.csv").write_bytes((SESSIONS / f"{of}.csv").read_bytes())
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(program, names)
+    assert names["outcome"].grade == "accept" and names["estimates"].valid("l_elbow").any()

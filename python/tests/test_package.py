@@ -1,0 +1,40 @@
+"""The package as it is: types, and a notebook that runs."""
+
+import subprocess
+import sys
+
+import proprio
+from conftest import TREE
+
+PACKAGE = TREE / "python"
+
+
+def test_types_are_strict():
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--config-file", str(PACKAGE / "pyproject.toml"),
+         str(PACKAGE / "src" / "proprio")],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_command_is_in_the_package():
+    done = subprocess.run(
+        [sys.executable, "-c", "from proprio._program import main; main()", "--version"],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0 and done.stdout.startswith("proprio "), done.stderr
+
+
+def test_the_notebook_runs(tmp_path):
+    import nbclient
+    import nbformat
+
+    notebook = nbformat.read(PACKAGE / "examples" / "torques.ipynb", as_version=4)
+    client = nbclient.NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": tmp_path}}
+    )
+    client.execute()
+    text = nbformat.writes(notebook)
+    assert "image/png" in text and "<iframe" in text
+    assert proprio.__doc__
