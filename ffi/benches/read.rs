@@ -92,6 +92,7 @@ fn in_c(estimator: &mut Estimator) -> (*mut proprio_reader, Vec<proprio_torque_h
         let mut value = proprio_torque {
             torque: 0.0,
             standard_deviation: 0.0,
+            acquired: 0,
             age: 0,
         };
         while proprio_read_torque(reader, joints[0], &raw mut value, ptr::null_mut())
@@ -136,6 +137,7 @@ fn torque_in_c(bencher: Bencher<'_, '_>) {
     let mut value = proprio_torque {
         torque: 0.0,
         standard_deviation: 0.0,
+        acquired: 0,
         age: 0,
     };
     bencher.counter(CALLS).bench_local(|| {
@@ -173,6 +175,7 @@ fn seven_torques_in_c(bencher: Bencher<'_, '_>) {
                     joints.len(),
                     torques.as_mut_ptr(),
                     deviations.as_mut_ptr(),
+                    ptr::null_mut(),
                     ptr::null_mut(),
                 )
             };

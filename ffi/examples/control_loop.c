@@ -42,7 +42,7 @@ int main(int count, char **words) {
         double torques[MAX_JOINTS], deviations[MAX_JOINTS];
         proprio_status statuses[MAX_JOINTS];
         proprio_update(reader, proprio_now());
-        proprio_read_torques(reader, joints, joint_count, torques, deviations, statuses);
+        proprio_read_torques(reader, joints, joint_count, torques, deviations, statuses, NULL);
 
         if (cycle % 1000 == 0) { /* Once a second, for a person: not part of a cycle. */
             proprio_missing missing;

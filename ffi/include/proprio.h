@@ -178,7 +178,8 @@ typedef enum {
 typedef struct proprio_reader proprio_reader;
 
 /**
- * A joint's torque, in one reader. It stays good as long as the reader, whatever is restarted.
+ * A joint's torque, in one reader. It stays good as long as the reader, whatever is restarted; in
+ * another reader it may mean another joint.
  */
 typedef struct {
   /**
@@ -220,7 +221,11 @@ typedef struct {
    */
   double standard_deviation;
   /**
-   * How old it is [ns].
+   * CLOCK_MONOTONIC [ns] at which it was measured: the same for as long as nothing new comes.
+   */
+  int64_t acquired;
+  /**
+   * How old it was at the last update [ns].
    */
   int64_t age;
 } proprio_torque;
@@ -230,7 +235,7 @@ typedef struct {
  */
 typedef struct {
   /**
-   * Never PROPRIO_OK.
+   * PROPRIO_OK if there is a value.
    */
   proprio_status status;
   /**
@@ -268,7 +273,11 @@ typedef struct {
    */
   double position[3];
   /**
-   * How old it is [ns].
+   * CLOCK_MONOTONIC [ns] at which it was measured: the same for as long as nothing new comes.
+   */
+  int64_t acquired;
+  /**
+   * How old it was at the last update [ns].
    */
   int64_t age;
   /**
@@ -307,7 +316,11 @@ typedef struct {
    */
   double current;
   /**
-   * How old it is [ns].
+   * CLOCK_MONOTONIC [ns] at which it was measured: the same for as long as nothing new comes.
+   */
+  int64_t acquired;
+  /**
+   * How old it was at the last update [ns].
    */
   int64_t age;
   /**
@@ -329,7 +342,11 @@ typedef struct {
    */
   double torque[3];
   /**
-   * How old it is [ns].
+   * CLOCK_MONOTONIC [ns] at which it was measured: the same for as long as nothing new comes.
+   */
+  int64_t acquired;
+  /**
+   * How old it was at the last update [ns].
    */
   int64_t age;
   /**
@@ -363,7 +380,11 @@ typedef struct {
    */
   double orientation[4];
   /**
-   * How old it is [ns].
+   * CLOCK_MONOTONIC [ns] at which it was measured: the same for as long as nothing new comes.
+   */
+  int64_t acquired;
+  /**
+   * How old it was at the last update [ns].
    */
   int64_t age;
   /**
@@ -421,7 +442,7 @@ proprio_reader *proprio_reader_new(const char *robot,
                                    size_t message_size);
 
 /**
- * Ends a reader. NULL is allowed.
+ * Ends a reader. NULL is allowed. In a child of the process that made it, nothing happens.
  */
 void proprio_reader_free(proprio_reader *reader);
 
@@ -445,13 +466,13 @@ proprio_channel_handle proprio_find_channel(proprio_reader *reader,
 
 /**
  * Takes what has arrived by `now` (proprio_now). Once in each cycle, before values are read. No
- * system call, no lock, no allocation.
+ * system call, no lock, no allocation. If `now` is of another clock, all is stale.
  */
 void proprio_update(proprio_reader *reader, int64_t now);
 
 /**
  * Waits until an estimate may have arrived since the last update, at most until `deadline`
- * (proprio_now). Returns whether one may have. One system call.
+ * (proprio_now). Returns whether one may have. One system call. A signal does not end it.
  */
 bool proprio_wait_for_estimate(const proprio_reader *reader, int64_t deadline);
 
@@ -461,8 +482,8 @@ bool proprio_wait_for_estimate(const proprio_reader *reader, int64_t deadline);
 bool proprio_wait_for_sample(const proprio_reader *reader, int64_t deadline);
 
 /**
- * The torque of a joint, as of the last update. `torque` and `why` may be NULL; `why` is written
- * only if there is no value. For the cycle.
+ * The torque of a joint, as of the last update. `torque` and `why` may be NULL; both are
+ * always written. For the cycle.
  */
 proprio_status proprio_read_torque(const proprio_reader *reader,
                                    proprio_torque_handle joint,
@@ -471,15 +492,17 @@ proprio_status proprio_read_torque(const proprio_reader *reader,
 
 /**
  * The torques of `count` joints, as of the last update. For each joint in the order of `joints`:
- * its torque [Nm] (NaN if there is none), standard deviation [Nm] and status; each array may be
- * NULL. Returns how many have a value. For the cycle.
+ * its torque [Nm] (NaN if there is none), standard deviation [Nm] and status; and the instant that
+ * they all refer to, CLOCK_MONOTONIC [ns] (0 if no torque has a value). Each array, and
+ * `acquired`, may be NULL. Returns how many have a value. For the cycle.
  */
 size_t proprio_read_torques(const proprio_reader *reader,
                             const proprio_torque_handle *joints,
                             size_t count,
                             double *torques,
                             double *standard_deviations,
-                            proprio_status *statuses);
+                            proprio_status *statuses,
+                            int64_t *acquired);
 
 /**
  * The wrench of a contact: as proprio_read_torque.
@@ -537,9 +560,15 @@ bool proprio_channel_name(const proprio_reader *reader, size_t number, char *nam
 bool proprio_who_is_missing(const proprio_reader *reader, proprio_missing *missing);
 
 /**
- * `why` in words, as "withheld: saturated (l_arm_ft_sensor)", in `text` of `size` bytes.
+ * `why` in words, as "withheld: saturated (l_arm_ft_sensor)", in `text` of `size` bytes; "there is
+ * a value" if its status is PROPRIO_OK.
  */
 void proprio_describe(const proprio_unavailable *why, char *text, size_t size);
+
+/**
+ * The version of this library, as "0.1.0".
+ */
+const char *proprio_version(void);
 
 #ifdef __cplusplus
 }  // extern "C"

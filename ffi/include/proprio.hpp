@@ -1,5 +1,5 @@
 // proprio.h for C++17: readers that end by themselves, values or the reason why there is none,
-// durations of std::chrono. Nothing in it throws but the constructor of Reader.
+// instants and durations of std::chrono. Functions for the cycle neither throw nor allocate.
 #ifndef PROPRIO_HPP
 #define PROPRIO_HPP
 
@@ -57,6 +57,7 @@ public:
 
 private:
     friend class Reader;
+    Result() = default;
     T value_{};
     proprio_unavailable why_{};
     proprio_status status_ = PROPRIO_UNKNOWN;
@@ -117,35 +118,36 @@ public:
     }
 
     /// Takes what has arrived.
-    void update(nanoseconds now = proprio::now()) { proprio_update(reader_, now.count()); }
+    void update(nanoseconds now = proprio::now()) noexcept { proprio_update(reader_, now.count()); }
     /// Waits for an estimate, at most until `deadline`; whether one may have arrived.
-    bool wait_for_estimate(nanoseconds deadline) const {
+    bool wait_for_estimate(nanoseconds deadline) const noexcept {
         return proprio_wait_for_estimate(reader_, deadline.count());
     }
     /// The same for a sample of any channel.
-    bool wait_for_sample(nanoseconds deadline) const {
+    bool wait_for_sample(nanoseconds deadline) const noexcept {
         return proprio_wait_for_sample(reader_, deadline.count());
     }
 
-    Result<proprio_torque> torque(proprio_torque_handle joint) const {
+    Result<proprio_torque> torque(proprio_torque_handle joint) const noexcept {
         return read<proprio_torque>(proprio_read_torque, joint);
     }
     /// The torques of `count` joints into arrays, each of which may be null: how many have a value.
     std::size_t torques(const proprio_torque_handle *joints, std::size_t count, double *torques,
-                        double *standard_deviations = nullptr,
-                        proprio_status *statuses = nullptr) const {
-        return proprio_read_torques(reader_, joints, count, torques, standard_deviations, statuses);
+                        double *standard_deviations = nullptr, proprio_status *statuses = nullptr,
+                        std::int64_t *acquired = nullptr) const noexcept {
+        return proprio_read_torques(reader_, joints, count, torques, standard_deviations, statuses,
+                                    acquired);
     }
-    Result<proprio_contact> contact(proprio_contact_handle contact) const {
+    Result<proprio_contact> contact(proprio_contact_handle contact) const noexcept {
         return read<proprio_contact>(proprio_read_contact, contact);
     }
-    Result<proprio_joint_state> joint(proprio_channel_handle channel) const {
+    Result<proprio_joint_state> joint(proprio_channel_handle channel) const noexcept {
         return read<proprio_joint_state>(proprio_read_joint, channel);
     }
-    Result<proprio_wrench> wrench(proprio_channel_handle channel) const {
+    Result<proprio_wrench> wrench(proprio_channel_handle channel) const noexcept {
         return read<proprio_wrench>(proprio_read_wrench, channel);
     }
-    Result<proprio_imu> imu(proprio_channel_handle channel) const {
+    Result<proprio_imu> imu(proprio_channel_handle channel) const noexcept {
         return read<proprio_imu>(proprio_read_imu, channel);
     }
 
@@ -175,7 +177,7 @@ public:
 
 private:
     template <typename T, typename Read, typename Handle>
-    Result<T> read(Read function, Handle handle) const {
+    Result<T> read(Read function, Handle handle) const noexcept {
         Result<T> result;
         result.status_ = function(reader_, handle, &result.value_, &result.why_);
         return result;

@@ -1,4 +1,4 @@
-//! `include/proprio.h` is what cbindgen makes of `src/lib.rs`.
+//! `include/proprio.h` is what cbindgen makes of `src/`.
 //! `PROPRIO_WRITE_HEADER=1 cargo test -p proprio-ffi --test header` writes it.
 #![allow(missing_docs)]
 
@@ -11,6 +11,7 @@ fn the_header_is_that_of_the_library() {
     let configuration = cbindgen::Config::from_root_or_default(folder);
     let library = cbindgen::Builder::new()
         .with_config(configuration)
+        .with_src(folder.join("src/values.rs"))
         .with_src(folder.join("src/lib.rs"));
     let mut made = Vec::new();
     library.generate().expect("a header").write(&mut made);

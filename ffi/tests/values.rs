@@ -45,10 +45,8 @@ fn read<T, H>(
     let mut words = [0; 256];
     unsafe {
         let status = function(reader, handle, value.as_mut_ptr(), why.as_mut_ptr());
-        if status != proprio_status::PROPRIO_OK {
-            assert_eq!(why.assume_init_ref().status, status);
-            proprio_describe(why.as_ptr(), words.as_mut_ptr(), words.len());
-        }
+        assert_eq!(why.assume_init_ref().status, status);
+        proprio_describe(why.as_ptr(), words.as_mut_ptr(), words.len());
         (value.assume_init(), status, said(&words))
     }
 }
@@ -172,6 +170,15 @@ fn c_reads_what_rust_reads() {
     assert_eq!(c.orientation, r.value.orientation);
     assert_eq!((c.age, c.quality), (r.age.0, r.quality.0));
 
+    let acquired = [
+        read(reader, elbow, proprio_read_torque).0.acquired,
+        read(reader, hand, proprio_read_contact).0.acquired,
+        read(reader, encoder, proprio_read_joint).0.acquired,
+        read(reader, ft, proprio_read_wrench).0.acquired,
+        read(reader, chest, proprio_read_imu).0.acquired,
+    ];
+    assert_eq!(acquired, [t.0; 5], "whenever it is asked");
+
     // Reasons: a withheld torque, a name that nobody has, a channel read as another kind.
     let mut why = MaybeUninit::uninit();
     let status = unsafe { proprio_read_torque(reader, wrist, null_mut(), why.as_mut_ptr()) };
@@ -189,7 +196,7 @@ fn c_reads_what_rust_reads() {
     // All in one call, in the caller's order.
     let joints = [wrist, elbow, nobody];
     let (mut torques, mut deviations) = ([0.0; 3], [0.0; 3]);
-    let mut statuses = [proprio_status::PROPRIO_OK; 3];
+    let (mut statuses, mut instant) = ([proprio_status::PROPRIO_OK; 3], 0);
     let count = unsafe {
         let (torques, deviations) = (torques.as_mut_ptr(), deviations.as_mut_ptr());
         proprio_read_torques(
@@ -199,9 +206,11 @@ fn c_reads_what_rust_reads() {
             torques,
             deviations,
             statuses.as_mut_ptr(),
+            &raw mut instant,
         )
     };
     assert_eq!((count, torques[1], deviations[1]), (1, 1.5, 0.1));
+    assert_eq!(instant, t.0, "the instant that all refer to");
     assert!(torques[0].is_nan() && torques[2].is_nan() && deviations[0].is_nan());
     let expected = [
         proprio_status::PROPRIO_WITHHELD,
@@ -214,6 +223,7 @@ fn c_reads_what_rust_reads() {
             reader,
             joints.as_ptr(),
             3,
+            null_mut(),
             null_mut(),
             null_mut(),
             null_mut(),
@@ -262,6 +272,13 @@ fn c_reads_what_rust_reads() {
     );
     assert!(read(reader, ft, proprio_read_wrench).0.force[0].is_nan());
 
+    // A clock that counts something else makes nothing young.
+    unsafe { proprio_update(reader, t.0 / 1000) };
+    assert_eq!(
+        read(reader, elbow, proprio_read_torque).1,
+        proprio_status::PROPRIO_STALE
+    );
+
     // Who ends is missed.
     drop(estimator);
     let mut missing = MaybeUninit::uninit();
@@ -278,7 +295,7 @@ fn c_reads_what_rust_reads() {
 #[test]
 fn a_null_pointer_is_an_answer() {
     unsafe {
-        let mut message = [0; 12];
+        let (mut message, mut torques) = ([0; 12], [1.0; 2]);
         let reader = proprio_reader_new(
             null(),
             0,
@@ -310,14 +327,37 @@ fn a_null_pointer_is_an_answer() {
             proprio_status::PROPRIO_UNKNOWN
         );
         assert_eq!(
-            proprio_read_torques(null(), null(), 9, null_mut(), null_mut(), null_mut()),
+            proprio_read_torques(
+                null(),
+                null(),
+                2,
+                torques.as_mut_ptr(),
+                null_mut(),
+                null_mut(),
+                null_mut(),
+            ),
             0
+        );
+        assert!(
+            torques.iter().all(|torque| torque.is_nan()),
+            "none stays as it was"
         );
         proprio_update(null_mut(), 0);
         assert!(!proprio_wait_for_estimate(null(), 0) && !proprio_wait_for_sample(null(), 0));
         assert!(!proprio_torque_name(null(), 0, null_mut()));
         assert!(!proprio_who_is_missing(null(), null_mut()));
         proprio_describe(null(), null_mut(), 0);
+        // What was never written is no reason, and no end of the program.
+        let why = [0xff_u8; size_of::<proprio_unavailable>()];
+        let mut words = [0; 64];
+        proprio_describe(why.as_ptr().cast(), words.as_mut_ptr(), words.len());
+        assert_eq!(said(&words), "unknown status 4294967295");
+        let robot = text("icub");
+        let (size, at) = (message.len(), message.as_mut_ptr());
+        assert!(proprio_reader_new(robot.as_ptr(), -1, null(), null(), at, size).is_null());
+        assert_eq!(said(&message), "max_age is ");
+        let version = CStr::from_ptr(proprio_version()).to_str();
+        assert_eq!(version, Ok(env!("CARGO_PKG_VERSION")));
         proprio_reader_free(null_mut());
 
         let reader = proprio_reader_new(text("icub").as_ptr(), 0, null(), null(), null_mut(), 0);

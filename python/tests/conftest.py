@@ -10,7 +10,7 @@ from pathlib import Path
 import proprio
 import pytest
 
-PATIENCE = 120.0
+PATIENCE = 60.0
 TREE = Path(__file__).parents[2]
 ROBOT = "icub_left_arm"
 

@@ -18,6 +18,16 @@ def test_a_table_is_columns(tmp_path):
     assert list(table["reason/a"]) == ["", "stale"]
     assert list(table.of("joint/a/position").t) == [0.5]
     assert table.to_pandas().shape == (2, 3)
+    assert table == table and table != proprio.read_table(path) and len({table}) == 1
+    # Reasons are text, also where there are none.
+    path.write_text("t,residual/a/reason\n0.5,\n")
+    assert proprio.read_table(path)["residual/a/reason"].dtype.kind == "U"
+    path.write_text("t,a\n1,2\n1,x\n")
+    with pytest.raises(ValueError, match="line 3, column a: 'x' is no number"):
+        proprio.read_table(path)
+    path.write_text("t,a,a\n")
+    with pytest.raises(ValueError, match="a is there twice"):
+        proprio.read_table(path)
     path.write_text("t,a\n1,2,3\n")
     with pytest.raises(ValueError, match="line 2: 3 cells for 2 columns"):
         proprio.read_table(path)
@@ -53,6 +63,29 @@ def test_identify_and_estimate(tmp_path):
         error[name] = np.abs(torque - truth)[valid]
     assert len(error["identified"]) > 0.9 * len(estimates.t), len(error["identified"])
     assert np.median(error["identified"]) < 0.5 * np.median(error["cad"]), error
+
+
+def test_a_failure_is_one_and_costs_nothing(tmp_path, monkeypatch):
+    config, samples = SESSIONS / "estimator.toml", SESSIONS / "train.csv"
+    out, folder = tmp_path / "out.csv", tmp_path / "result"
+    good = proprio.estimate(config, samples, out)
+    assert any("estimates" in line for line in good.messages)
+    kept = out.read_bytes()
+    with pytest.raises(proprio.Failed):
+        proprio.estimate("nowhere.toml", samples, out)
+    assert out.read_bytes() == kept, "an earlier result stays"
+    folder.mkdir()
+    (folder / "summary.json").write_text("{}")
+    with pytest.raises(proprio.Failed, match="nowhere.toml"):
+        proprio.identify("nowhere.toml", samples, out=folder)
+    assert (folder / "summary.json").read_text() == "{}"
+    # A command that dies has not done it, whatever it left.
+    dies = tmp_path / "proprio"
+    dies.write_text(f"#!/bin/sh\necho 't' > {out}\necho 'No space left' >&2\nkill -9 $$\n")
+    dies.chmod(0o755)
+    monkeypatch.setenv("PROPRIO_PROGRAM", str(dies))
+    with pytest.raises(proprio.Failed, match="No space left"):
+        proprio.estimate(config, samples, out)
 
 
 def test_the_commands_words_are_the_error(tmp_path):

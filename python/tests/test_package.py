@@ -9,13 +9,25 @@ from conftest import TREE
 PACKAGE = TREE / "python"
 
 
-def test_types_are_strict():
-    done = subprocess.run(
-        [sys.executable, "-m", "mypy", "--config-file", str(PACKAGE / "pyproject.toml"),
-         str(PACKAGE / "src" / "proprio")],
-        capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout
+def test_types_are_strict(tmp_path):
+    """Those of the package, and the pages' programs that use them."""
+    programs = []
+    for page in (PACKAGE / "README.md", TREE / "docs" / "reading.md"):
+        for program in page.read_text().split("```python\n")[1:]:
+            path = tmp_path / f"program_{len(programs)}.py"
+            path.write_text(program.split("```")[0])
+            programs.append(str(path))
+    assert len(programs) >= 3
+    for paths in [[str(PACKAGE / "src" / "proprio")], *([program] for program in programs)]:
+        command = [sys.executable, "-m", "mypy", "--config-file", str(PACKAGE / "pyproject.toml")]
+        done = subprocess.run([*command, *paths], capture_output=True, text=True, cwd=tmp_path)
+        assert done.returncode == 0, done.stdout
+
+
+def test_the_version_is_the_packages():
+    import importlib.metadata
+
+    assert proprio.__version__ == importlib.metadata.version("proprio")
 
 
 def test_the_command_is_in_the_package():

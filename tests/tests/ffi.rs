@@ -252,6 +252,25 @@ fn a_cycle_in_c_makes_no_system_call_and_no_allocation() {
     }
 }
 
+#[test]
+fn a_child_that_ends_its_copy_of_a_reader_does_its_parent_no_harm() {
+    if !can_compile() {
+        return;
+    }
+    let rig = Rig::new();
+    let library = Library::install(&rig);
+    let (source, program) = (root().join("tests/tests/ffi/fork.c"), rig.path("fork"));
+    library.compile(&["gcc", "-std=gnu99"], &source, &library.shared(), &program);
+    let _robot = Robot::start(&rig);
+    let mut command = Command::new(&program);
+    command
+        .env("PROPRIO_DOMAIN", &rig.domain.name)
+        .env("PROPRIO_RUNTIME_DIR", &rig.domain.base);
+    let mut forks = rig.spawn(command, "forks");
+    forks.wait();
+    assert_eq!(forks.output(), "goes on, the child ended with 0\n");
+}
+
 /// The programs of the documentation are compiled as they stand.
 #[test]
 fn the_documents_programs_compile() {

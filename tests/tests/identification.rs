@@ -1006,7 +1006,7 @@ fn links_too_far_from_what_is_stated_are_not_believed() {
         let solution = pipeline.identification().unwrap().solution();
         // 0.141 is that of 20 %: the median of what is expected, and the 99.99 % quantile.
         let tau = solution.components[0].tau / stated;
-        assert!(!(tau > 0.141 / 0.2 * 4.53), "{tau}");
+        assert!(tau.is_nan() || tau <= 0.141 / 0.2 * 4.53, "{tau}");
     }
 }
 

@@ -17,9 +17,11 @@ From logs::
     estimates = proprio.estimate("estimator.toml", "c.csv", parameters=outcome.parameters)
 """
 
+from ._library import __version__
 from .live import (
     IMU,
     JOINT,
+    STATUS,
     WRENCH,
     Contact,
     Imu,
@@ -38,6 +40,7 @@ from ._program import program
 __all__ = [
     "IMU",
     "JOINT",
+    "STATUS",
     "WRENCH",
     "Contact",
     "Failed",
@@ -51,6 +54,7 @@ __all__ = [
     "Torques",
     "Unavailable",
     "Wrench",
+    "__version__",
     "estimate",
     "identify",
     "now",

@@ -28,3 +28,5 @@ ffi.cdef(_declarations((NATIVE / "proprio.h").read_text()))
 # Another build of the library may be named, to try it.
 _path = Path(os.environ.get("PROPRIO_LIBRARY", NATIVE / "libproprio.so"))
 lib: Any = ffi.dlopen(str(_path))
+
+__version__: str = ffi.string(lib.proprio_version()).decode()

@@ -28,5 +28,5 @@ def program() -> Path:
 
 def main() -> NoReturn:
     """Becomes the command."""
-    own = str(NATIVE / "proprio")
+    own = str(program())
     os.execv(own, ["proprio", *sys.argv[1:]])

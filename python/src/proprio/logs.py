@@ -3,10 +3,12 @@
 import csv
 import html
 import json
+import math
 import subprocess
+from array import array
 from os import PathLike
 from pathlib import Path
-from typing import Any, Dict, Iterator, List, Mapping, Optional, Sequence, Union
+from typing import Any, Dict, Iterator, List, Mapping, Optional, Sequence, Tuple, Union
 
 import numpy as np
 import numpy.typing as npt
@@ -27,8 +29,12 @@ class Table(Mapping[str, npt.NDArray[Any]]):
     text. ``proprio`` describes the names in its README; ``t`` are seconds.
     """
 
-    def __init__(self, columns: Dict[str, npt.NDArray[Any]]) -> None:
+    def __init__(
+        self, columns: Dict[str, npt.NDArray[Any]], messages: Sequence[str] = ()
+    ) -> None:
         self._columns = columns
+        self.messages = list(messages)
+        """what the command that made it said of it, line by line"""
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         return self._columns[name]
@@ -70,48 +76,63 @@ class Table(Mapping[str, npt.NDArray[Any]]):
 
         return pandas.DataFrame(self._columns)
 
+    # Columns are arrays, which have no single truth.
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
     def __repr__(self) -> str:
         rows = len(self._columns["t"]) if "t" in self._columns else 0
         return f"<Table of {rows} rows: {', '.join(self._columns)}>"
 
 
-def _column(cells: List[str]) -> npt.NDArray[Any]:
-    try:
-        return np.array([float(cell) if cell else np.nan for cell in cells])
-    except ValueError:
-        return np.array(cells)
+def _is_text(name: str) -> bool:
+    return name.startswith("reason/") or name.endswith("/reason")
 
 
 def read_table(path: AnyPath) -> Table:
     """Reads a table of samples or estimates (CSV).
 
-    Raises OSError, and ValueError if a row has more or fewer cells than there are columns.
+    Raises OSError, and ValueError with the line if a row has more or fewer cells than there are
+    columns, or a cell that is no number.
     """
     with open(path, newline="", encoding="utf-8") as file:
         reader = csv.reader(file)
         names = next(reader, [])
         if not names:
             raise ValueError(f"{path} is empty")
-        columns: List[List[str]] = [[] for _ in names]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ValueError(f"{path}: the column {twice} is there twice")
+        columns: List[Any] = [[] if _is_text(name) else array("d") for name in names]
         for row in reader:
             if len(row) != len(names):
                 raise ValueError(
                     f"{path}, line {reader.line_num}: {len(row)} cells for {len(names)} columns"
                 )
-            for column, cell in zip(columns, row):
-                column.append(cell)
-    return Table({name: _column(cells) for name, cells in zip(names, columns)})
+            for column, cell, name in zip(columns, row, names):
+                if isinstance(column, list):
+                    column.append(cell)
+                    continue
+                try:
+                    column.append(float(cell) if cell else math.nan)
+                except ValueError:
+                    raise ValueError(
+                        f"{path}, line {reader.line_num}, column {name}: {cell!r} is no number"
+                    ) from None
+    arrays = [np.array(c, dtype=str) if isinstance(c, list) else np.array(c) for c in columns]
+    return Table(dict(zip(names, arrays)))
 
 
-def _run(arguments: Sequence[str], result: Path) -> None:
-    """Runs the command, which makes the file `result`, whatever it then thinks of it."""
+def _run(arguments: Sequence[str]) -> "Tuple[int, List[str]]":
+    """Runs the command: its exit code, and what it said."""
     done = subprocess.run(
         [str(program()), *arguments], stdin=subprocess.DEVNULL, capture_output=True, text=True
     )
-    if done.returncode == 0 or result.is_file():
-        return
-    lines = done.stderr.strip().splitlines()
-    raise Failed("\n".join(lines[-20:]) or f"proprio ended with {done.returncode}")
+    return done.returncode, done.stderr.strip().splitlines()
+
+
+def _failed(code: int, said: Sequence[str]) -> Failed:
+    return Failed("\n".join(said[-20:]) or f"proprio ended with {code}")
 
 
 def _paths(paths: Union[AnyPath, Sequence[AnyPath]]) -> List[str]:
@@ -134,15 +155,20 @@ def estimate(
     words = ["estimate", "--config", str(config), "--samples", str(samples), "--out", str(out)]
     if parameters is not None:
         words += ["--parameters", str(parameters)]
-    Path(out).unlink(missing_ok=True)
-    _run(words, Path(out))
-    return read_table(out)
+    code, said = _run(words)
+    if code != 0:
+        raise _failed(code, said)
+    table = read_table(out)
+    table.messages.extend(said)
+    return table
 
 
 class Identification:
     """An outcome of ``identify``. In a notebook it shows its report, with all plots."""
 
-    def __init__(self, folder: AnyPath) -> None:
+    def __init__(self, folder: AnyPath, messages: Sequence[str] = ()) -> None:
+        self.messages = list(messages)
+        """what the command said, line by line"""
         self.folder = Path(folder)
         """where the files are"""
         self.summary: Dict[str, Any] = json.loads((self.folder / "summary.json").read_text())
@@ -194,14 +220,19 @@ def identify(
     ``config`` is an estimator.toml. Writes the folder ``out``. A rejected outcome is an outcome:
     look at its ``grade``. Raises Failed, with the command's own words, if there is none.
     """
-    folder = Path(out)
-    # What an earlier run left is no outcome of this one.
-    for name in ("summary.json", "parameters.toml"):
-        (folder / name).unlink(missing_ok=True)
     words = ["identify", "--config", str(config), "--out", str(out)]
     for path in _paths(samples):
         words += ["--samples", path]
     for path in _paths(validate):
         words += ["--validate", path]
-    _run(words, folder / "summary.json")
-    return Identification(folder)
+    summary = Path(out) / "summary.json"
+    before = summary.stat() if summary.exists() else None
+    code, said = _run(words)
+    after = summary.stat() if summary.exists() else None
+    # A rejected outcome ends the command with 1, and has a summary: a new file.
+    is_new = after is not None and (
+        before is None or (after.st_ino, after.st_mtime_ns) != (before.st_ino, before.st_mtime_ns)
+    )
+    if code not in (0, 1) or not is_new:
+        raise _failed(code, said)
+    return Identification(out, said)

@@ -1,9 +1,10 @@
-/* A control loop in which every system call but write is fatal, and every allocation is told.
+/* A control loop in which every system call but write is fatal, and every allocation and release is told.
  * Writes '+' after 20,000 cycles of which one had all values, '-' if none had, 'a' if one allocated.
  */
 #define _GNU_SOURCE
 #include <linux/seccomp.h>
 #include <proprio.h>
+#include <stdlib.h>
 #include <sys/prctl.h>
 #include <unistd.h>
 
@@ -13,6 +14,8 @@ static __thread int allocations;
 extern void *__libc_malloc(size_t size);
 extern void *__libc_realloc(void *old, size_t size);
 extern void *__libc_calloc(size_t count, size_t size);
+extern void *__libc_memalign(size_t alignment, size_t size);
+extern void __libc_free(void *memory);
 void *malloc(size_t size) {
     allocations += is_cycle;
     return __libc_malloc(size);
@@ -24,6 +27,20 @@ void *realloc(void *old, size_t size) {
 void *calloc(size_t count, size_t size) {
     allocations += is_cycle;
     return __libc_calloc(count, size);
+}
+
+int posix_memalign(void **memory, size_t alignment, size_t size) {
+    allocations += is_cycle;
+    *memory = __libc_memalign(alignment, size);
+    return *memory == NULL;
+}
+void *aligned_alloc(size_t alignment, size_t size) {
+    allocations += is_cycle;
+    return __libc_memalign(alignment, size);
+}
+void free(void *memory) {
+    allocations += is_cycle && memory != NULL;
+    __libc_free(memory);
 }
 
 int main(void) {
@@ -49,7 +66,7 @@ int main(void) {
             proprio_imu motion;
             proprio_unavailable why;
             proprio_update(reader, now++);
-            int count = (int)proprio_read_torques(reader, joints, 2, torques, NULL, NULL);
+            int count = (int)proprio_read_torques(reader, joints, 2, torques, NULL, NULL, NULL);
             (void)proprio_read_contact(reader, hand, &contact, &why);
             count += proprio_read_joint(reader, elbow, &state, &why) == PROPRIO_OK;
             count += proprio_read_wrench(reader, sensor, &wrench, &why) == PROPRIO_OK;
