@@ -497,13 +497,9 @@ impl Online {
             component.may_judge = part.failure.is_none() && !component.is_outdated;
             component.counts.failed += u64::from(part.failure.is_some());
             // A disturbance that has ended meanwhile was no change.
-            let is_change = |change| component.is_disturbed || change == Change::Incredible;
-            part.is_replaced &= (part.change.as_ref())
-                .map_or(component.is_disturbed, |(change, _)| is_change(*change));
-            if let Some((change, information)) = part
-                .change
-                .as_mut()
-                .filter(|(change, _)| is_change(*change))
+            part.is_replaced &= component.is_disturbed;
+            if let Some((change, information)) =
+                part.change.as_mut().filter(|_| component.is_disturbed)
             {
                 component.last_change = Some(*change);
                 std::mem::swap(information, &mut component.information);
@@ -520,7 +516,7 @@ impl Online {
                 match change {
                     Change::Offset => component.counts.offset_changes += 1,
                     Change::Load => component.counts.load_changes += 1,
-                    Change::Anew | Change::Incredible => {
+                    Change::Anew => {
                         (component.motion, component.rows) = (0.0, 0);
                     }
                 }

@@ -142,12 +142,6 @@ pub enum PriorError {
     /// Neither the data nor a prior determine an extra parameter.
     #[error("neither data nor prior determine the extra parameters: give each of them a precision")]
     Undetermined,
-    /// The data contradict CAD's stated quality: [`Prior::is_credible`].
-    #[error("the links would be off the CAD's by a scale of {tau}, which is not credible")]
-    Incredible {
-        /// That scale.
-        tau: f64,
-    },
 }
 
 /// CAD values of a link that no body of its size can have, and that were raised before use.
@@ -293,14 +287,6 @@ impl Prior {
     /// `tau` without data.
     pub fn expected_tau(&self) -> f64 {
         self.expected.median
-    }
-
-    /// Whether links may be so far from CAD's: below the 99.99 % quantile of what is expected of
-    /// `tau`. Data that ask for more contradict CAD's stated quality.
-    pub fn is_credible(&self, tau: f64) -> bool {
-        /// Of the normal distribution.
-        const QUANTILE: f64 = 3.72;
-        (tau / self.expected.median).ln() <= QUANTILE * self.expected.spread
     }
 
     /// Number of links.

@@ -418,7 +418,7 @@ impl Bank {
             .iter_mut()
             .filter(|unit| unit.component == component);
         own.for_each(|unit| match change {
-            Change::Anew | Change::Incredible => unit.begin_anew(),
+            Change::Anew => unit.begin_anew(),
             Change::Offset => unit.forget(&unit.offsets()),
             Change::Load => unit.forget(&unit.loads(model)),
         });

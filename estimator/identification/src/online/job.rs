@@ -194,15 +194,6 @@ impl Part {
         self.update_noise();
         self.judge_candidates();
         self.failure = weighed.and_then(|()| self.solve(prior)).err();
-        if self.failure.is_none() && !prior.is_credible(self.tau) {
-            self.failure = Some(PriorError::Incredible { tau: self.tau });
-            self.change = Some((
-                Change::Incredible,
-                Information::new(self.information.unknowns()),
-            ));
-            self.is_replaced = true;
-            self.tau = prior.expected_tau();
-        }
         match &self.failure {
             // The job's own solution is older than the one in use.
             Some(_) => solution.clone_from(&self.last_valid),

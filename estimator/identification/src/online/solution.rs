@@ -138,9 +138,6 @@ pub enum Change {
     Load,
     /// A contact since the start may have ended: everything is learnt anew.
     Anew,
-    /// The bodies that the data ask for are too far from CAD's
-    /// ([`Prior::is_credible`](crate::Prior::is_credible)): everything is learnt anew.
-    Incredible,
 }
 
 impl std::fmt::Display for Change {
@@ -151,10 +148,6 @@ impl std::fmt::Display for Change {
                 "the load has changed: the parameters of the outermost links are re-initialised"
             }
             Self::Anew => "a contact since the start may have ended: everything is identified anew",
-            Self::Incredible => {
-                "the identified links are further from the URDF's than urdf_relative_std allows: \
-                 a sensor was wrong meanwhile, or the URDF is. Everything is identified anew"
-            }
         })
     }
 }
