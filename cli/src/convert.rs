@@ -2,6 +2,7 @@
 
 use crate::identify::advice::sentence;
 use crate::identify::summary;
+use crate::samples;
 use anyhow::{Context, bail};
 use proprio_estimator::assessment::{Assessment, Assessor, Coverage};
 use proprio_estimator::config::ConfigError;
@@ -364,7 +365,7 @@ fn why_none(report: &DecodeReport) -> &'static str {
 /// Encodes a table.
 pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
     let plan = Plan::load(&args.config)?;
-    let samples = input(&args.samples)?;
+    let samples = samples::open(&args.samples)?;
     let mut out = Output::new(&args.out)?;
     let report = offline::encode(&plan, samples, out.writer())
         .map_err(|e| with_file(e, &args.samples, &args.out))?;
@@ -438,7 +439,7 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
     })?;
     warn_of_implausible(args, &setup);
     let mut assessor = args.assess.then(|| assessor(args, &setup)).transpose()?;
-    let log = input(&args.samples)?;
+    let log = samples::open(&args.samples)?;
     let mut out = Output::new(&args.out)?;
     let report = estimates::estimate(setup, log, out.writer(), assessor.as_mut());
     let report = match report {
@@ -562,7 +563,7 @@ fn warn_of_implausible(args: &Estimate, setup: &Setup) {
 
 /// Reads the log once before the estimation.
 fn assessor(args: &Estimate, setup: &Setup) -> anyhow::Result<Assessor> {
-    let log = input(&args.samples)?;
+    let log = samples::open(&args.samples)?;
     if !is_file(&args.samples) {
         bail!(
             "--assess reads the table twice: give a file with --samples, no standard input or pipe"

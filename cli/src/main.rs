@@ -15,6 +15,7 @@ mod install;
 mod record;
 mod report;
 mod running;
+mod samples;
 mod scan;
 mod setup;
 mod simulate;

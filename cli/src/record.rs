@@ -3,25 +3,126 @@
 
 use crate::running::{Described, interrupted, next, one_robot, open};
 use anyhow::{Context, bail};
+use proprio_gateway::clock::realtime_offset;
 use proprio_gateway::offline::InOrder;
+use proprio_recording::Recorder;
 use proprio_topics::csv::{Columns, Series, Value, What, Writer};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, monotonic};
 use proprio_topics::{
-    ContactDeclaration, Description, MAX_CHANNELS, Nanos, Publisher, Role, Sample,
+    ContactDeclaration, ContactEstimate, Description, MAX_CHANNELS, Nanos, Publisher, Role, Sample,
+    TorqueEstimate,
 };
 use std::fs::File;
-use std::io::{BufWriter, ErrorKind};
+use std::io::{self, BufWriter, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 use std::sync::atomic::Ordering::Relaxed;
 
 /// How late a sample is still sorted into its place in a recording: a gateway that starts publishes
 /// the frames that arrived meanwhile.
 const REORDER: Nanos = Nanos::from_millis(2000);
 
+/// The file that is written: a table, or a recording that viewers read too.
+enum Output {
+    Table(Writer<BufWriter<File>>),
+    Recording(Box<Recorder<BufWriter<File>>>),
+}
+
+/// What is recorded, in the order of time.
+enum Item {
+    Value(usize, Value),
+    Torques(Box<TorqueEstimate>, Rc<Description>),
+    Contacts(Box<ContactEstimate>, Rc<Description>),
+}
+
+impl Output {
+    fn push(&mut self, t: Nanos, item: &Item) -> io::Result<()> {
+        match (self, item) {
+            (Self::Table(table), Item::Value(series, value)) => table.push(Some(t), *series, value),
+            (Self::Table(_), _) => Ok(()),
+            (Self::Recording(recorder), item) => match item {
+                Item::Value(series, value) => recorder.push(t, *series, value),
+                Item::Torques(torques, names) => recorder.torques(names, torques),
+                Item::Contacts(contacts, names) => recorder.contacts(names, contacts),
+            }
+            .map_err(io::Error::other),
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        match self {
+            Self::Table(table) => table.flush(),
+            Self::Recording(recorder) => recorder.flush().map_err(io::Error::other),
+        }
+    }
+
+    fn finish(self) -> io::Result<()> {
+        match self {
+            Self::Table(table) => table.finish().map(drop),
+            Self::Recording(recorder) => {
+                let mut file = recorder.finish().map_err(io::Error::other)?;
+                file.flush()
+            }
+        }
+    }
+}
+
+/// What an estimator sends, for a recording.
+struct Estimates {
+    torques: Reader<TorqueEstimate>,
+    contacts: Reader<ContactEstimate>,
+    names: Described,
+    known: Option<Rc<Description>>,
+}
+
+impl Estimates {
+    /// Those of the robot's estimator; `None` if it does not run.
+    fn of(domain: &Domain, robot: &str) -> Option<Self> {
+        Some(Self {
+            torques: Reader::open(domain, robot).ok()?,
+            contacts: Reader::open(domain, robot).ok()?,
+            names: Described::by(domain, robot, Publisher::Estimator).ok()??,
+            known: None,
+        })
+    }
+
+    /// Takes what has come; returns how many torques.
+    fn take(&mut self, order: &mut InOrder<Item>, out: &mut Output) -> anyhow::Result<u64> {
+        let mut count = 0;
+        while let Some(torques) = next(&mut self.torques)? {
+            if let Some(names) = self.names_of(torques.header.epoch) {
+                let (t, item) = (
+                    torques.header.acquired,
+                    Item::Torques(Box::new(torques), names),
+                );
+                order.push(t, item, |t, item| out.push(t, item))?;
+                count += 1;
+            }
+        }
+        while let Some(contacts) = next(&mut self.contacts)? {
+            if let Some(names) = self.names_of(contacts.header.epoch) {
+                let t = contacts.header.acquired;
+                let item = Item::Contacts(Box::new(contacts), names);
+                order.push(t, item, |t, item| out.push(t, item))?;
+            }
+        }
+        Ok(count)
+    }
+
+    /// The names of this start of the estimator, if they have come.
+    fn names_of(&mut self, epoch: u64) -> Option<Rc<Description>> {
+        if (self.known.as_ref()).is_none_or(|known| known.header.epoch != epoch) {
+            self.known = self.names.of(epoch).map(|names| Rc::new(*names));
+        }
+        self.known.clone()
+    }
+}
+
 /// `proprio record`.
 #[derive(clap::Args)]
 pub(crate) struct Record {
-    /// The table of samples: a new file
+    /// The table of samples: a new file. One that ends with .mcap is a recording of samples,
+    /// torques and contacts, which Foxglove, PlotJuggler and `identify` read
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Overwrite the file if it exists
@@ -234,8 +335,26 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
     };
     let file = create(&args.out, args.force)?;
     let mut gaps = Gaps::new(&description);
-    let mut table = Writer::new(BufWriter::new(file), &series, columns)?;
-    let (mut order, mut inbox) = (InOrder::<(usize, Value)>::new(REORDER), Vec::new());
+    let file = BufWriter::new(file);
+    let is_recording = args
+        .out
+        .extension()
+        .is_some_and(|extension| extension == "mcap");
+    let mut out = match is_recording {
+        true => {
+            let program = concat!("proprio ", env!("CARGO_PKG_VERSION"));
+            Output::Recording(Box::new(Recorder::new(
+                file,
+                &robot,
+                program,
+                &series,
+                realtime_offset(),
+            )?))
+        }
+        false => Output::Table(Writer::new(file, &series, columns)?),
+    };
+    let (mut estimates, mut estimate_count) = (None, 0);
+    let (mut order, mut inbox) = (InOrder::<Item>::new(REORDER), Vec::new());
     let began = monotonic();
     let end = args
         .seconds
@@ -254,9 +373,7 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
             let value = Value::Contact(declared.state());
             // What was declared long before arrives with the next declaration.
             let t = declared.header.acquired.max(order.passed_on());
-            order.push(t, (at, value), |t, (at, value)| {
-                table.push(Some(t), *at, value)
-            })?;
+            order.push(t, Item::Value(at, value), |t, item| out.push(t, item))?;
         }
         // Shared memory delivers all samples of one bus before those of the next.
         while let Some(sample) = next(&mut samples)? {
@@ -278,15 +395,19 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
             count += 1;
             let value = Value::Reading(reading, sample.header.quality);
             let t = sample.header.acquired;
-            order.push(t, (at, value), |t, (at, value)| {
-                table.push(Some(t), *at, value)
-            })?;
+            order.push(t, Item::Value(at, value), |t, item| out.push(t, item))?;
+        }
+        if let Some(estimates) = &mut estimates {
+            estimate_count += Estimates::take(estimates, &mut order, &mut out)?;
         }
         let now = monotonic();
         if now >= next_flush {
+            if is_recording && estimates.is_none() {
+                estimates = Estimates::of(&domain, &robot);
+            }
             // If this program is killed, the rows of the last moments are lost, not the table.
             next_flush = now + Nanos::from_millis(500);
-            table.flush()?;
+            out.flush()?;
             // Gateway and estimator make a damaged domain again; until they have, nothing comes.
             if !domain.is_intact()
                 && let Ok(new) = open(config)
@@ -296,14 +417,15 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
                 lost += samples.lost();
                 (samples, gateway) = (reader, described);
                 declarations = Reader::open(&new, &robot).ok();
+                estimates = None;
                 domain = new;
             }
         }
         gaps.wait(now);
         samples.wait((now + Nanos::from_millis(100)).min(end.unwrap_or(Nanos::MAX)));
     }
-    order.finish(|t, (at, value)| table.push(Some(t), *at, value))?;
-    table.finish()?;
+    order.finish(|t, item| out.push(t, item))?;
+    out.finish()?;
     print_line!(
         "{}: {count} samples in {:.1} s, {} lost, {} out of order",
         args.out.display(),
@@ -311,6 +433,9 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
         lost + samples.lost(),
         order.out_of_order()
     );
+    if is_recording {
+        print_line!("{estimate_count} estimates of torques");
+    }
     let without = gaps.summary(monotonic());
     if !without.is_empty() {
         print_line!("{without}");

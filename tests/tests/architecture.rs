@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// The permitted direct dependencies between members of the workspace.
-const DIRECTIONS: [(&str, &[&str]); 11] = [
+const DIRECTIONS: [(&str, &[&str]); 12] = [
     ("proprio-topics", &[]),
     ("proprio-drivers", &["proprio-topics"]),
     ("proprio-gateway", &["proprio-drivers", "proprio-topics"]),
@@ -38,6 +38,7 @@ const DIRECTIONS: [(&str, &[&str]); 11] = [
         ],
     ),
     ("proprio-cli", &EVERYTHING),
+    ("proprio-recording", &["proprio-topics"]),
     ("proprio-ffi", &["proprio-topics"]),
     ("proprio-tests", &EVERYTHING),
     (
@@ -45,7 +46,7 @@ const DIRECTIONS: [(&str, &[&str]); 11] = [
         &["proprio-dynamics", "proprio-identification"],
     ),
 ];
-const EVERYTHING: [&str; 8] = [
+const EVERYTHING: [&str; 9] = [
     "proprio-topics",
     "proprio-drivers",
     "proprio-gateway",
@@ -53,12 +54,13 @@ const EVERYTHING: [&str; 8] = [
     "proprio-identification",
     "proprio-estimator",
     "proprio-simulator",
+    "proprio-recording",
     "proprio-ffi",
 ];
 
 /// Libraries that only some members may depend on directly: the name (or a prefix with a star) and
 /// these members.
-const CONFINED: [(&str, &[&str]); 5] = [
+const CONFINED: [(&str, &[&str]); 6] = [
     ("socketcan", &["proprio-gateway"]),
     ("iceoryx2*", &["proprio-topics"]),
     (
@@ -73,6 +75,8 @@ const CONFINED: [(&str, &[&str]); 5] = [
     // The estimator uses it in a test to read its own output.
     ("urdf-rs", &["proprio-estimator"]),
     ("tokio", &["proprio-gateway", "proprio-estimator"]),
+    // Not in the daemons' crates.
+    ("mcap", &["proprio-recording"]),
 ];
 
 /// The parts of iceoryx2 that topics may use without its feature `ipc`: they are no_std and open

@@ -1,0 +1,77 @@
+//! Opens tables of samples: CSV, or recordings (MCAP), which become tables while they are read.
+
+use anyhow::Context;
+use proprio_recording::{ReadError, Summary, is_mcap, to_table};
+use std::fs::File;
+use std::io::{self, BufReader, Cursor, PipeReader, Read};
+use std::path::Path;
+use std::thread::{self, JoinHandle};
+
+/// A table of samples from a file, or from standard input (`-`).
+pub(crate) fn open(path: &Path) -> anyhow::Result<Box<dyn Read + Send>> {
+    let text = || format!("{}: cannot be read", path.display());
+    if path == Path::new("-") {
+        return table(io::stdin(), path).with_context(text);
+    }
+    table(File::open(path).with_context(text)?, path).with_context(text)
+}
+
+/// The table that `input` is, or has as a recording.
+pub(crate) fn table(
+    mut input: impl Read + Send + 'static,
+    path: &Path,
+) -> io::Result<Box<dyn Read + Send>> {
+    let mut beginning = Vec::new();
+    input.by_ref().take(8).read_to_end(&mut beginning)?;
+    let is_recording = is_mcap(&beginning);
+    let whole = Cursor::new(beginning).chain(input);
+    if !is_recording {
+        return Ok(Box::new(whole));
+    }
+    let (pipe, to) = io::pipe()?;
+    let thread = thread::Builder::new()
+        .name("recording".into())
+        .spawn(move || to_table(BufReader::new(whole), to))?;
+    Ok(Box::new(Converted {
+        name: path.display().to_string(),
+        pipe,
+        thread: Some(thread),
+    }))
+}
+
+/// A recording on its way to a table, in a thread of its own.
+struct Converted {
+    name: String,
+    pipe: PipeReader,
+    thread: Option<JoinHandle<Result<Summary, ReadError>>>,
+}
+
+impl Read for Converted {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let count = self.pipe.read(buffer)?;
+        if count > 0 || buffer.is_empty() {
+            return Ok(count);
+        }
+        // The end, or the end of what could be read.
+        let Some(thread) = self.thread.take() else {
+            return Ok(0);
+        };
+        let summary = thread
+            .join()
+            .map_err(|_| io::Error::other("a defect of this program"))?
+            .map_err(io::Error::other)?;
+        if summary.is_cut {
+            eprintln!(
+                "{}: the end is missing or damaged: the recorder was killed, or the file was cut",
+                self.name
+            );
+        }
+        if summary.damaged > 0 {
+            eprintln!(
+                "{}: {} damaged messages skipped",
+                self.name, summary.damaged
+            );
+        }
+        Ok(0)
+    }
+}
