@@ -111,9 +111,9 @@ pub(crate) struct Estimate {
     json: bool,
 }
 
-fn input(path: &Path) -> anyhow::Result<Box<dyn Read>> {
+fn input(path: &Path) -> anyhow::Result<Box<dyn Read + Send>> {
     if path == Path::new("-") {
-        return Ok(Box::new(std::io::stdin().lock()));
+        return Ok(Box::new(std::io::stdin()));
     }
     let file = File::open(path).with_context(|| format!("{}: cannot be read", path.display()))?;
     let length = file.metadata().map(|m| m.len()).unwrap_or(0);
@@ -365,7 +365,7 @@ fn why_none(report: &DecodeReport) -> &'static str {
 /// Encodes a table.
 pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
     let plan = Plan::load(&args.config)?;
-    let samples = samples::open(&args.samples)?;
+    let samples = samples::table(input(&args.samples)?, &args.samples)?;
     let mut out = Output::new(&args.out)?;
     let report = offline::encode(&plan, samples, out.writer())
         .map_err(|e| with_file(e, &args.samples, &args.out))?;
@@ -439,7 +439,7 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
     })?;
     warn_of_implausible(args, &setup);
     let mut assessor = args.assess.then(|| assessor(args, &setup)).transpose()?;
-    let log = samples::open(&args.samples)?;
+    let log = samples::table(input(&args.samples)?, &args.samples)?;
     let mut out = Output::new(&args.out)?;
     let report = estimates::estimate(setup, log, out.writer(), assessor.as_mut());
     let report = match report {
@@ -563,7 +563,7 @@ fn warn_of_implausible(args: &Estimate, setup: &Setup) {
 
 /// Reads the log once before the estimation.
 fn assessor(args: &Estimate, setup: &Setup) -> anyhow::Result<Assessor> {
-    let log = samples::open(&args.samples)?;
+    let log = samples::table(input(&args.samples)?, &args.samples)?;
     if !is_file(&args.samples) {
         bail!(
             "--assess reads the table twice: give a file with --samples, no standard input or pipe"

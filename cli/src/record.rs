@@ -353,7 +353,7 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
         }
         false => Output::Table(Writer::new(file, &series, columns)?),
     };
-    let (mut estimates, mut estimate_count) = (None, 0);
+    let (mut estimates, mut estimate_count): (Option<Estimates>, u64) = (None, 0);
     let (mut order, mut inbox) = (InOrder::<Item>::new(REORDER), Vec::new());
     let began = monotonic();
     let end = args
@@ -398,7 +398,7 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
             order.push(t, Item::Value(at, value), |t, item| out.push(t, item))?;
         }
         if let Some(estimates) = &mut estimates {
-            estimate_count += Estimates::take(estimates, &mut order, &mut out)?;
+            estimate_count += estimates.take(&mut order, &mut out)?;
         }
         let now = monotonic();
         if now >= next_flush {

@@ -1,37 +1,33 @@
-//! Opens tables of samples: CSV, or recordings (MCAP), which become tables while they are read.
+//! Tables of samples: CSV, or recordings (MCAP), which become tables while they are read.
 
 use anyhow::Context;
 use proprio_recording::{ReadError, Summary, is_mcap, to_table};
-use std::fs::File;
 use std::io::{self, BufReader, Cursor, PipeReader, Read};
 use std::path::Path;
 use std::thread::{self, JoinHandle};
-
-/// A table of samples from a file, or from standard input (`-`).
-pub(crate) fn open(path: &Path) -> anyhow::Result<Box<dyn Read + Send>> {
-    let text = || format!("{}: cannot be read", path.display());
-    if path == Path::new("-") {
-        return table(io::stdin(), path).with_context(text);
-    }
-    table(File::open(path).with_context(text)?, path).with_context(text)
-}
 
 /// The table that `input` is, or has as a recording.
 pub(crate) fn table(
     mut input: impl Read + Send + 'static,
     path: &Path,
-) -> io::Result<Box<dyn Read + Send>> {
+) -> anyhow::Result<Box<dyn Read + Send>> {
+    let cannot = || format!("{}: cannot be read", path.display());
     let mut beginning = Vec::new();
-    input.by_ref().take(8).read_to_end(&mut beginning)?;
+    input
+        .by_ref()
+        .take(8)
+        .read_to_end(&mut beginning)
+        .with_context(cannot)?;
     let is_recording = is_mcap(&beginning);
     let whole = Cursor::new(beginning).chain(input);
     if !is_recording {
         return Ok(Box::new(whole));
     }
-    let (pipe, to) = io::pipe()?;
+    let (pipe, to) = io::pipe().with_context(cannot)?;
     let thread = thread::Builder::new()
         .name("recording".into())
-        .spawn(move || to_table(BufReader::new(whole), to))?;
+        .spawn(move || to_table(BufReader::new(whole), to))
+        .with_context(cannot)?;
     Ok(Box::new(Converted {
         name: path.display().to_string(),
         pipe,

@@ -137,10 +137,8 @@ unsafe fn put_at(text: &str, to: *mut c_char, size: usize) {
 /// # Safety
 /// `to` is null or may be written.
 unsafe fn give<T>(value: T, to: *mut T) {
-    if !to.is_null() {
-        // SAFETY: the caller's promise.
-        unsafe { to.write(value) };
-    }
+    // SAFETY: the caller's promise.
+    unsafe { give_at(value, to, 0) };
 }
 
 /// Writes `value` to the element `place` of an array of C, if it wants one.
@@ -205,6 +203,24 @@ fn number<H: PartialEq>(handles: &mut Vec<H>, handle: H) -> u32 {
         handles.len() - 1
     });
     u32::try_from(place).unwrap_or(u32::MAX)
+}
+
+/// The number of the handle that `handle` makes of a name of C; one that no handle has, if there is
+/// no name or no reader.
+///
+/// # Safety
+/// `reader` as for [`with`], `name` as for [`text`].
+unsafe fn find(
+    reader: *mut proprio_reader,
+    name: *const c_char,
+    handle: impl FnOnce(&mut proprio_reader, &str) -> u32,
+) -> u32 {
+    // SAFETY: the caller's promise.
+    match unsafe { text(name) } {
+        // SAFETY: the caller's promise.
+        Some(name) => unsafe { with_mut(reader, u32::MAX, |reader| handle(reader, &name)) },
+        None => u32::MAX,
+    }
 }
 
 /// CLOCK_MONOTONIC [ns], the clock of all instants here.
@@ -295,14 +311,11 @@ pub unsafe extern "C" fn proprio_find_torque(
     reader: *mut proprio_reader,
     name: *const c_char,
 ) -> proprio_torque_handle {
-    // SAFETY: the caller's promise.
-    let name = unsafe { text(name) };
-    let find = |reader: &mut proprio_reader| match &name {
-        Some(name) => number(&mut reader.torques, reader.robot.torque_handle(name)),
-        None => u32::MAX,
+    let handle = |reader: &mut proprio_reader, name: &str| {
+        number(&mut reader.torques, reader.robot.torque_handle(name))
     };
     // SAFETY: the caller's promise.
-    let number = unsafe { with_mut(reader, u32::MAX, find) };
+    let number = unsafe { find(reader, name, handle) };
     proprio_torque_handle { number }
 }
 
@@ -315,14 +328,11 @@ pub unsafe extern "C" fn proprio_find_contact(
     reader: *mut proprio_reader,
     name: *const c_char,
 ) -> proprio_contact_handle {
-    // SAFETY: the caller's promise.
-    let name = unsafe { text(name) };
-    let find = |reader: &mut proprio_reader| match &name {
-        Some(name) => number(&mut reader.contacts, reader.robot.contact_handle(name)),
-        None => u32::MAX,
+    let handle = |reader: &mut proprio_reader, name: &str| {
+        number(&mut reader.contacts, reader.robot.contact_handle(name))
     };
     // SAFETY: the caller's promise.
-    let number = unsafe { with_mut(reader, u32::MAX, find) };
+    let number = unsafe { find(reader, name, handle) };
     proprio_contact_handle { number }
 }
 
@@ -337,18 +347,16 @@ pub unsafe extern "C" fn proprio_find_channel(
     kind: u32,
     name: *const c_char,
 ) -> proprio_channel_handle {
-    // SAFETY: the caller's promise.
-    let name = unsafe { text(name) };
     let kind = Code::<Kind>::of_number(kind).get();
-    let find = |reader: &mut proprio_reader| match (&name, kind) {
-        (Some(name), Some(kind)) => number(
-            &mut reader.channels,
-            reader.robot.channel_handle(kind, name),
-        ),
-        _ => u32::MAX,
+    let handle = |reader: &mut proprio_reader, name: &str| match kind {
+        Some(kind) => {
+            let handle = reader.robot.channel_handle(kind, name);
+            number(&mut reader.channels, handle)
+        }
+        None => u32::MAX,
     };
     // SAFETY: the caller's promise.
-    let number = unsafe { with_mut(reader, u32::MAX, find) };
+    let number = unsafe { find(reader, name, handle) };
     proprio_channel_handle { number }
 }
 

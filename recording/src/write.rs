@@ -20,28 +20,65 @@ pub struct WriteError(#[from] McapError);
 /// A channel of the file.
 type Channel = u16;
 
+/// The file with its clock.
+struct File<W: Write + Seek> {
+    mcap: Writer<W>,
+    /// The wall clock minus CLOCK_MONOTONIC.
+    offset: Nanos,
+    sequence: u32,
+}
+
+impl<W: Write + Seek> File<W> {
+    /// Adds a channel; of values of a table, with the number of their series.
+    fn channel(
+        &mut self,
+        topic: &str,
+        (name, text): &Definition,
+        series: Option<usize>,
+    ) -> Result<Channel, WriteError> {
+        let schema = self.mcap.add_schema(name, SCHEMA, text.as_bytes())?;
+        let metadata = series.map(|number| ("series".to_owned(), number.to_string()));
+        let metadata = metadata.into_iter().collect();
+        Ok(self.mcap.add_channel(schema, topic, MESSAGE, &metadata)?)
+    }
+
+    /// The wall clock's time of an instant [ns since 1970, UTC], for log times and ROS's stamps.
+    fn wall(&self, t: Nanos) -> u64 {
+        u64::try_from(t.saturating_add(self.offset).0).unwrap_or(0)
+    }
+
+    fn write(&mut self, channel: Channel, t: Nanos, message: &Message) -> Result<(), WriteError> {
+        let time = self.wall(t);
+        let header = MessageHeader {
+            channel_id: channel,
+            sequence: self.sequence,
+            log_time: time,
+            publish_time: time,
+        };
+        self.sequence = self.sequence.wrapping_add(1);
+        Ok(self.mcap.write_to_known_channel(&header, message.bytes())?)
+    }
+}
+
 /// A series of the table: its own channel, and the one for viewers.
 #[derive(Debug)]
 struct Known {
+    series: Series,
     own: Channel,
     /// Of readings of other kinds than the main one, as temperatures.
     others: BTreeMap<&'static str, Channel>,
     viewers: Option<Channel>,
+    /// The newest state of a joint.
+    state: JointState,
 }
 
 /// Writes samples, declarations and estimates of one robot into one file.
 pub struct Recorder<W: Write + Seek> {
-    file: Writer<W>,
-    /// The wall clock minus CLOCK_MONOTONIC.
-    offset: Nanos,
-    series: Vec<Series>,
+    file: File<W>,
     known: Vec<Known>,
     torques: Channel,
     joint_states: Channel,
     contacts: BTreeMap<String, Channel>,
-    /// The newest state of each joint that has an encoder.
-    joints: BTreeMap<String, JointState>,
-    sequence: u32,
 }
 
 impl<W: Write + Seek> Recorder<W> {
@@ -57,7 +94,7 @@ impl<W: Write + Seek> Recorder<W> {
         series: &[Series],
         offset: Nanos,
     ) -> Result<Self, WriteError> {
-        let mut file = WriteOptions::new()
+        let mcap = WriteOptions::new()
             .profile("ros2")
             .library(program)
             .compression(Some(Compression::Zstd))
@@ -65,16 +102,19 @@ impl<W: Write + Seek> Recorder<W> {
             // A chunk is written when it is complete: a killed program leaves no half of one.
             .disable_seeking(true)
             .create(output)?;
+        let mut file = File {
+            mcap,
+            offset,
+            sequence: 0,
+        };
         let metadata = [("robot", robot), ("program", program)]
             .map(|(key, value)| (key.to_owned(), value.to_owned()));
-        file.write_metadata(&Metadata {
+        file.mcap.write_metadata(&Metadata {
             name: "proprio".to_owned(),
             metadata: metadata.into(),
         })?;
         let mut known = Vec::with_capacity(series.len());
         for (number, one) in series.iter().enumerate() {
-            // Their order is that of the table's columns.
-            let order = BTreeMap::from([("series".to_owned(), number.to_string())]);
             let name = &one.name;
             let (topic, definition, viewers) = match one.what {
                 What::Channel(kind) => (
@@ -90,32 +130,27 @@ impl<W: Write + Seek> Recorder<W> {
                 ),
                 What::Contact => (format!("/declared/{name}"), definitions::declared(), None),
             };
-            let own = channel(&mut file, &topic, &definition, &order)?;
+            // Their order is that of the table's columns.
+            let own = file.channel(&topic, &definition, Some(number))?;
             let viewers = viewers
-                .map(|(topic, definition)| {
-                    channel(&mut file, &topic, &definition, &BTreeMap::new())
-                })
+                .map(|(topic, definition)| file.channel(&topic, &definition, None))
                 .transpose()?;
             known.push(Known {
+                series: one.clone(),
                 own,
                 others: BTreeMap::new(),
                 viewers,
+                state: JointState::ABSENT,
             });
         }
-        let none = BTreeMap::new();
-        let torques = channel(&mut file, "/torques", &definitions::torques(), &none)?;
-        let joint_state = definitions::joint_state();
-        let joint_states = channel(&mut file, "/joint_states", &joint_state, &none)?;
+        let torques = file.channel("/torques", &definitions::torques(), None)?;
+        let joint_states = file.channel("/joint_states", &definitions::joint_state(), None)?;
         Ok(Self {
             file,
-            offset,
-            series: series.to_vec(),
             known,
             torques,
             joint_states,
             contacts: BTreeMap::new(),
-            joints: BTreeMap::new(),
-            sequence: 0,
         })
     }
 
@@ -124,63 +159,41 @@ impl<W: Write + Seek> Recorder<W> {
     /// # Errors
     /// The file cannot be written.
     pub fn push(&mut self, t: Nanos, series: usize, value: &Value) -> Result<(), WriteError> {
-        let Some(one) = self.series.get(series) else {
+        let (file, Some(known)) = (&mut self.file, self.known.get_mut(series)) else {
             return Ok(());
         };
-        match (one.what, value) {
+        match (known.series.what, value) {
             (What::Channel(main), Value::Reading(reading, quality)) => {
-                if let Reading::Joint(state) = reading {
-                    self.joints.insert(one.name.clone(), *state);
+                let kind = reading.kind();
+                let name = known.series.name.as_str();
+                let own = match known.others.get(kind.word()) {
+                    _ if kind == main => known.own,
+                    Some(other) => *other,
+                    None => {
+                        let topic = format!("/samples/{kind}/{name}");
+                        let other =
+                            file.channel(&topic, &definitions::sample(kind), Some(series))?;
+                        known.others.insert(kind.word(), other);
+                        other
+                    }
+                };
+                file.write(own, t, &sample(t, reading, *quality))?;
+                let wall = file.wall(t);
+                match (reading, known.viewers) {
+                    (Reading::Joint(state), _) => {
+                        known.state = *state;
+                        Ok(())
+                    }
+                    (Reading::Wrench(wrench), Some(channel)) => {
+                        file.write(channel, t, &wrench_stamped(wall, name, wrench))
+                    }
+                    (Reading::Imu(reading), Some(channel)) => {
+                        file.write(channel, t, &imu(wall, name, reading))
+                    }
+                    _ => Ok(()),
                 }
-                self.reading(t, series, main, reading, *quality)
             }
-            (What::Contact, Value::Contact(state)) => {
-                let message = declared(t, state);
-                match self.known.get(series).map(|known| known.own) {
-                    Some(own) => self.write(own, t, &message),
-                    None => Ok(()),
-                }
-            }
-            _ => Ok(()),
-        }
-    }
-
-    fn reading(
-        &mut self,
-        t: Nanos,
-        series: usize,
-        main: Kind,
-        reading: &Reading,
-        quality: Quality,
-    ) -> Result<(), WriteError> {
-        let Some((known, one)) = self.known.get_mut(series).zip(self.series.get(series)) else {
-            return Ok(());
-        };
-        let kind = reading.kind();
-        let own = match kind == main {
-            true => known.own,
-            false => match known.others.get(kind.word()) {
-                Some(other) => *other,
-                None => {
-                    let topic = format!("/samples/{kind}/{}", one.name);
-                    let order = BTreeMap::from([("series".to_owned(), series.to_string())]);
-                    let other =
-                        channel(&mut self.file, &topic, &definitions::sample(kind), &order)?;
-                    known.others.insert(kind.word(), other);
-                    other
-                }
-            },
-        };
-        let (viewers, frame) = (known.viewers, one.name.clone());
-        self.write(own, t, &sample(t, reading, quality))?;
-        let wall = self.wall(t);
-        match (viewers, reading) {
-            (Some(channel), Reading::Wrench(wrench)) => {
-                self.write(channel, t, &wrench_stamped(wall, &frame, wrench))
-            }
-            (Some(channel), Reading::Imu(reading)) => {
-                self.write(channel, t, &imu(wall, &frame, reading))
-            }
+            (What::Contact, Value::Contact(state)) => file.write(known.own, t, &declared(t, state)),
             _ => Ok(()),
         }
     }
@@ -219,19 +232,19 @@ impl<W: Write + Seek> Recorder<W> {
         }
         message.count(joints.len());
         (joints.iter()).for_each(|(_, joint)| message.text(name(Role::Channel, joint.cause)));
-        self.write(self.torques, t, &message)?;
+        self.file.write(self.torques, t, &message)?;
 
-        let mut message = stamped(self.wall(t), "");
+        let mut message = stamped(self.file.wall(t), "");
         message.count(joints.len());
         joints.iter().for_each(|(name, _)| message.text(name));
-        let states: Vec<JointState> = (joints.iter())
-            .map(|(name, _)| {
-                self.joints
-                    .get(*name)
-                    .copied()
-                    .unwrap_or(JointState::ABSENT)
-            })
-            .collect();
+        let of = |name: &str| {
+            let is_joint = |known: &&Known| {
+                known.series.what == What::Channel(Kind::Joint) && known.series.name == name
+            };
+            let known = self.known.iter().find(is_joint);
+            known.map_or(JointState::ABSENT, |known| known.state)
+        };
+        let states: Vec<JointState> = joints.iter().map(|(name, _)| of(name)).collect();
         message.count(states.len());
         (states.iter()).for_each(|state| message.f64s(&[state.position]));
         message.count(states.len());
@@ -244,7 +257,7 @@ impl<W: Write + Seek> Recorder<W> {
                 f64::NAN
             }]);
         }
-        self.write(self.joint_states, t, &message)
+        self.file.write(self.joint_states, t, &message)
     }
 
     /// The valid contact wrenches of an instant, of the estimator that sent `names`.
@@ -268,9 +281,9 @@ impl<W: Write + Seek> Recorder<W> {
             let own = match self.contacts.get(name) {
                 Some(own) => *own,
                 None => {
-                    let (topic, none) = (format!("/contact/{name}"), BTreeMap::new());
                     let definition = definitions::wrench_stamped();
-                    let own = channel(&mut self.file, &topic, &definition, &none)?;
+                    let topic = format!("/contact/{name}");
+                    let own = self.file.channel(&topic, &definition, None)?;
                     self.contacts.insert(name.to_owned(), own);
                     own
                 }
@@ -279,27 +292,10 @@ impl<W: Write + Seek> Recorder<W> {
                 force: contact.force,
                 torque: contact.torque,
             };
-            let message = wrench_stamped(self.wall(t), entry.frame.as_str(), &wrench);
-            self.write(own, t, &message)?;
+            let message = wrench_stamped(self.file.wall(t), entry.frame.as_str(), &wrench);
+            self.file.write(own, t, &message)?;
         }
         Ok(())
-    }
-
-    /// The wall clock's time of an instant [ns since 1970, UTC], for log times and ROS's stamps.
-    fn wall(&self, t: Nanos) -> u64 {
-        u64::try_from(t.saturating_add(self.offset).0).unwrap_or(0)
-    }
-
-    fn write(&mut self, channel: Channel, t: Nanos, message: &Message) -> Result<(), WriteError> {
-        let time = self.wall(t);
-        let header = MessageHeader {
-            channel_id: channel,
-            sequence: self.sequence,
-            log_time: time,
-            publish_time: time,
-        };
-        self.sequence = self.sequence.wrapping_add(1);
-        Ok(self.file.write_to_known_channel(&header, message.bytes())?)
     }
 
     /// Ends the chunk: what was recorded so far outlives a crash of this program.
@@ -307,7 +303,7 @@ impl<W: Write + Seek> Recorder<W> {
     /// # Errors
     /// The file cannot be written.
     pub fn flush(&mut self) -> Result<(), WriteError> {
-        Ok(self.file.flush()?)
+        Ok(self.file.mcap.flush()?)
     }
 
     /// Ends the recording with its index.
@@ -315,19 +311,9 @@ impl<W: Write + Seek> Recorder<W> {
     /// # Errors
     /// The file cannot be written.
     pub fn finish(mut self) -> Result<W, WriteError> {
-        self.file.finish()?;
-        Ok(self.file.into_inner())
+        self.file.mcap.finish()?;
+        Ok(self.file.mcap.into_inner())
     }
-}
-
-fn channel<W: Write + Seek>(
-    file: &mut Writer<W>,
-    topic: &str,
-    (name, text): &Definition,
-    metadata: &BTreeMap<String, String>,
-) -> Result<Channel, McapError> {
-    let schema = file.add_schema(name, SCHEMA, text.as_bytes())?;
-    file.add_channel(schema, topic, MESSAGE, metadata)
 }
 
 fn sample(t: Nanos, reading: &Reading, quality: Quality) -> Message {

@@ -47,7 +47,11 @@ struct Library {
 }
 
 impl Library {
-    fn install(rig: &Rig) -> Self {
+    /// `None` if what compiles programs is missing: the test is skipped.
+    fn install(rig: &Rig) -> Option<Self> {
+        if !can_compile() {
+            return None;
+        }
         let prefix = rig.path("prefix");
         // Built with this test, beside it.
         let test = std::env::current_exe().expect("this program's own path");
@@ -55,7 +59,7 @@ impl Library {
         run(Command::new(root().join("ffi/install"))
             .arg(&prefix)
             .env("PROPRIO_LIBRARIES", built));
-        Self { prefix }
+        Some(Self { prefix })
     }
 
     /// What pkg-config says of it.
@@ -123,17 +127,26 @@ impl<'a> Robot<'a> {
         }
     }
 
-    fn restart_gateway(&mut self) {
-        self.gateway.kill();
+    fn start_gateway(&mut self) {
         self.gateway = self.rig.start(&["gateway", "--config", &self.gateway_toml]);
     }
 
-    fn restart_estimator(&mut self) {
-        self.estimator.kill();
+    fn start_estimator(&mut self) {
         self.estimator = self
             .rig
             .start(&["estimator", "--config", &self.estimator_toml]);
     }
+}
+
+/// Starts a program in the rig's domain.
+fn spawn(rig: &Rig, program: &Path, arguments: &[&str]) -> Process {
+    let mut command = Command::new(program);
+    command
+        .args(arguments)
+        .env("PROPRIO_DOMAIN", &rig.domain.name)
+        .env("PROPRIO_RUNTIME_DIR", &rig.domain.base);
+    let name = program.file_name().expect("its name");
+    rig.spawn(command, &name.to_string_lossy())
 }
 
 /// Waits until `program` has printed one of these words since it had printed `from` bytes; then how
@@ -160,11 +173,10 @@ fn end(mut program: Process) {
 
 #[test]
 fn programs_in_c_and_cpp_outlive_every_daemon() {
-    if !can_compile() {
-        return;
-    }
     let rig = Rig::new();
-    let library = Library::install(&rig);
+    let Some(library) = Library::install(&rig) else {
+        return;
+    };
     let examples = root().join("ffi/examples");
     let sanitized = [
         "-g",
@@ -183,17 +195,10 @@ fn programs_in_c_and_cpp_outlive_every_daemon() {
     let gpp = [&["g++", "-std=c++17"], &sanitized[..]].concat();
     library.compile(&gpp, &examples.join("push.cpp"), &library.shared(), &in_cpp);
 
-    let spawn = |program: &Path, arguments: &[&str]| {
-        let mut command = Command::new(program);
-        command
-            .args(arguments)
-            .env("PROPRIO_DOMAIN", &rig.domain.name)
-            .env("PROPRIO_RUNTIME_DIR", &rig.domain.base);
-        rig.spawn(command, arguments.last().expect("a name"))
-    };
     // Before anybody is there.
-    let mut loops = spawn(&in_c, &["icub_left_arm"]);
+    let mut loops = spawn(&rig, &in_c, &["icub_left_arm"]);
     let mut waits = spawn(
+        &rig,
         &in_cpp,
         &["icub_left_arm", "hand", "l_elbow", "l_arm_ft_sensor"],
     );
@@ -208,7 +213,7 @@ fn programs_in_c_and_cpp_outlive_every_daemon() {
         robot.estimator.kill();
         of_loop = hear(&mut loops, of_loop, &["the estimator was killed"]);
         of_loop = hear(&mut loops, of_loop, &["stale: "]);
-        robot.restart_estimator();
+        robot.start_estimator();
         of_loop = hear(&mut loops, of_loop, &[" Nm  +- "]);
         robot.gateway.kill();
         hear(&mut loops, of_loop, &["the gateway was killed"]);
@@ -217,7 +222,7 @@ fn programs_in_c_and_cpp_outlive_every_daemon() {
             of_wait,
             &["no estimate: the gateway was killed"],
         );
-        robot.restart_gateway();
+        robot.start_gateway();
         let since = loops.output().len();
         of_loop = hear(&mut loops, since, &[" Nm  +- "]);
     }
@@ -228,20 +233,15 @@ fn programs_in_c_and_cpp_outlive_every_daemon() {
 /// As `gateway/topics/tests/robot.rs` shows of Rust's reader.
 #[test]
 fn a_cycle_in_c_makes_no_system_call_and_no_allocation() {
-    if !can_compile() {
-        return;
-    }
     let rig = Rig::new();
-    let library = Library::install(&rig);
+    let Some(library) = Library::install(&rig) else {
+        return;
+    };
     let source = root().join("tests/tests/ffi/cycle.c");
     for (name, flags) in [("shared", library.shared()), ("archive", library.archive())] {
         let program = rig.path(name);
         library.compile(&["gcc", "-std=gnu99", "-O2"], &source, &flags, &program);
-        let mut command = Command::new(&program);
-        command
-            .env("PROPRIO_DOMAIN", &rig.domain.name)
-            .env("PROPRIO_RUNTIME_DIR", &rig.domain.base);
-        let mut cycles = rig.spawn(command, name);
+        let mut cycles = spawn(&rig, &program, &[]);
         let heard = hear(&mut cycles, 0, &["---"]);
         let robot = Robot::start(&rig);
         let heard = hear(&mut cycles, heard, &["+++"]);
@@ -254,19 +254,14 @@ fn a_cycle_in_c_makes_no_system_call_and_no_allocation() {
 
 #[test]
 fn a_child_that_ends_its_copy_of_a_reader_does_its_parent_no_harm() {
-    if !can_compile() {
-        return;
-    }
     let rig = Rig::new();
-    let library = Library::install(&rig);
+    let Some(library) = Library::install(&rig) else {
+        return;
+    };
     let (source, program) = (root().join("tests/tests/ffi/fork.c"), rig.path("fork"));
     library.compile(&["gcc", "-std=gnu99"], &source, &library.shared(), &program);
     let _robot = Robot::start(&rig);
-    let mut command = Command::new(&program);
-    command
-        .env("PROPRIO_DOMAIN", &rig.domain.name)
-        .env("PROPRIO_RUNTIME_DIR", &rig.domain.base);
-    let mut forks = rig.spawn(command, "forks");
+    let mut forks = spawn(&rig, &program, &[]);
     forks.wait();
     assert_eq!(forks.output(), "goes on, the child ended with 0\n");
 }
@@ -274,11 +269,10 @@ fn a_child_that_ends_its_copy_of_a_reader_does_its_parent_no_harm() {
 /// The programs of the documentation are compiled as they stand.
 #[test]
 fn the_documents_programs_compile() {
-    if !can_compile() {
-        return;
-    }
     let rig = Rig::new();
-    let library = Library::install(&rig);
+    let Some(library) = Library::install(&rig) else {
+        return;
+    };
     let page = fs::read_to_string(root().join("docs/reading.md")).expect("the page");
     let mut compiled = 0;
     for (language, compiler) in [("c", ["gcc", "-std=c99"]), ("cpp", ["g++", "-std=c++17"])] {

@@ -6,6 +6,7 @@ use anyhow::Context;
 use proprio_estimator::reading;
 use proprio_estimator::setup::Setup;
 use proprio_identification::{Dataset, Role};
+use std::fs::File;
 use std::io::{BufRead, BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
 
@@ -15,7 +16,8 @@ pub(super) fn open(
     config: &Path,
     setup: &Setup,
 ) -> anyhow::Result<impl Read + Send + use<>> {
-    let mut table = BufReader::with_capacity(1 << 18, samples::open(file)?);
+    let log = File::open(file).with_context(|| format!("{}: cannot be read", file.display()))?;
+    let mut table = BufReader::with_capacity(1 << 18, samples::table(log, file)?);
     let mut header = Vec::new();
     // Skip blank lines before the header.
     while header.trim_ascii().is_empty() {
