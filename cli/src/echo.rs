@@ -1,8 +1,9 @@
 //! `proprio echo`: the samples of a channel, the torques or the contacts of a running system, as
 //! they come.
 
-use crate::running::{Described, interrupted, next, one_robot, open};
+use crate::running::interrupted;
 use anyhow::{Context, bail};
+use proprio_bridge::{Described, next, one_robot, open};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Topic, Unavailable, monotonic};
 use proprio_topics::{
     Code, ContactEstimate, Description, Name, Nanos, Publisher, Reason, Role, Sample,

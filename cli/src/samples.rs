@@ -62,6 +62,12 @@ impl Read for Converted {
                 self.name
             );
         }
+        if summary.without_column > 0 {
+            eprintln!(
+                "{}: {} samples skipped: their channels came to be known while it was recorded",
+                self.name, summary.without_column
+            );
+        }
         if summary.damaged > 0 {
             eprintln!(
                 "{}: {} damaged messages skipped",

@@ -2,8 +2,9 @@
 
 use crate::echo::{of_joints, torque_json};
 use crate::print::CLOSED;
-use crate::running::{Described, first_of, interrupted, open};
+use crate::running::interrupted;
 use anyhow::bail;
+use proprio_bridge::{Described, first_of, open};
 use proprio_topics::ipc::{
     Domain, DomainConfig, PortError, Reader, RobotPresence, Topic, Unavailable, monotonic,
 };

@@ -1,11 +1,13 @@
-//! Turns a recording back into a table of samples.
+//! Turns a recording back into a table of samples, frames, and files.
 
-use crate::cdr::Parsed;
-use mcap::records::Record;
+use crate::write::{About, PROPRIO};
+use mcap::records::{Channel, Record};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{McapError, parse_record};
+use proprio_bridge::cdr::Parsed;
+use proprio_drivers::{Format, Frame, Id};
 use proprio_topics::csv::{Columns, Series, Value, What, Writer};
-use proprio_topics::{ContactState, Kind, Nanos, Quality, Reading, VALUES};
+use proprio_topics::{ContactState, Kind, Nanos, Quality, Reading, StampKind, VALUES};
 use std::collections::BTreeMap;
 use std::io::{self, Read, Write};
 
@@ -25,14 +27,23 @@ pub enum ReadError {
          `proprio record --out FILE.mcap`"
     )]
     Foreign,
+    /// It has no raw frames.
+    #[error(
+        "it is an MCAP file without raw frames (topics /can/...): record them with `proprio \
+         record --out FILE.mcap --frames BUS`"
+    )]
+    NoFrames,
 }
 
 /// What was in a recording.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Summary {
-    /// Samples and declarations in the table.
+    /// Samples and declarations in the table; frames.
     pub values: u64,
-    /// Messages of the table's topics that could not be understood.
+    /// Samples and declarations of channels that came to be known after the first message: the
+    /// table has no column for them.
+    pub without_column: u64,
+    /// Messages of these topics that could not be understood.
     pub damaged: u64,
     /// The end of the file is missing, because its recorder was killed or the file was cut, or
     /// cannot be read.
@@ -44,10 +55,48 @@ pub fn is_mcap(beginning: &[u8]) -> bool {
     beginning.starts_with(mcap::MAGIC)
 }
 
+/// Walks through the records of a recording, and whatever of it can be read. Returns whether its
+/// end is missing. `is_known` says whether enough was found that damage is no more than that.
+fn walk<S>(
+    mut recording: impl Read,
+    state: &mut S,
+    is_known: impl Fn(&S) -> bool,
+    mut take: impl FnMut(&mut S, Record<'_>) -> Result<(), ReadError>,
+) -> Result<bool, ReadError> {
+    let options = LinearReaderOptions::default()
+        .with_skip_end_magic(true)
+        .with_validate_chunk_crcs(true)
+        .with_record_length_limit(1 << 30);
+    let mut reader = LinearReader::new_with_options(options);
+    let mut is_ended = false;
+    while let Some(event) = reader.next_event() {
+        match event {
+            Ok(LinearReadEvent::ReadRequest(wanted)) => {
+                let read = recording.read(reader.insert(wanted))?;
+                is_ended = read == 0;
+                reader.notify_read(read);
+            }
+            Ok(LinearReadEvent::Record { data, opcode }) => {
+                let record = parse_record(opcode, data)?;
+                if matches!(record, Record::DataEnd(_)) {
+                    is_ended = false;
+                }
+                take(state, record)?;
+            }
+            // A chunk that was not written to its end, or is damaged: where the next one begins is
+            // not known.
+            Err(_) if is_ended || is_known(state) => return Ok(true),
+            Err(error) => return Err(error.into()),
+        }
+    }
+    Ok(is_ended)
+}
+
 /// The table that is being made.
 struct Table<W: Write> {
-    /// Of each channel: its place among the series, and its kind.
-    channels: BTreeMap<u16, (usize, What)>,
+    /// Of each channel: the number of its series in the recording, its place among the columns once
+    /// they are known, and its kind.
+    channels: BTreeMap<u16, (usize, Option<usize>, What)>,
     /// By their number in the recording.
     series: BTreeMap<usize, Series>,
     output: Option<W>,
@@ -59,12 +108,7 @@ struct Table<W: Write> {
 ///
 /// # Errors
 /// [`ReadError`]. A file that is cut is none: see [`Summary::is_cut`].
-pub fn to_table<W: Write>(mut recording: impl Read, output: W) -> Result<Summary, ReadError> {
-    let options = LinearReaderOptions::default()
-        .with_skip_end_magic(true)
-        .with_validate_chunk_crcs(true)
-        .with_record_length_limit(1 << 30);
-    let mut reader = LinearReader::new_with_options(options);
+pub fn to_table<W: Write>(recording: impl Read, output: W) -> Result<Summary, ReadError> {
     let mut table = Table {
         channels: BTreeMap::new(),
         series: BTreeMap::new(),
@@ -72,64 +116,77 @@ pub fn to_table<W: Write>(mut recording: impl Read, output: W) -> Result<Summary
         writer: None,
         summary: Summary::default(),
     };
-    let mut is_ended = false;
-    while let Some(event) = reader.next_event() {
-        match event {
-            Ok(LinearReadEvent::ReadRequest(wanted)) => {
-                let read = recording.read(reader.insert(wanted))?;
-                is_ended = read == 0;
-                reader.notify_read(read);
-            }
-            Ok(LinearReadEvent::Record { data, opcode }) => match parse_record(opcode, data)? {
-                Record::Channel(channel) => {
-                    let number = channel.metadata.get("series");
-                    let number = number.and_then(|number| number.parse().ok());
-                    if let Some((number, series)) = number.zip(series_of(&channel.topic)) {
-                        table.channels.insert(channel.id, (number, series.what));
-                        // A channel's main reading comes first.
-                        table.series.entry(number).or_insert(series);
-                    }
+    let is_known = |table: &Table<W>| !table.series.is_empty();
+    let is_cut = walk(recording, &mut table, is_known, |table, record| {
+        match record {
+            Record::Channel(channel) => table.know(&channel),
+            Record::Message { header, data } => {
+                if let Some((_, place, what)) = table.channels.get(&header.channel_id).copied() {
+                    table.take(header.channel_id, place, what, &data)?;
                 }
-                Record::Message { header, data } => {
-                    if let Some((series, what)) = table.channels.get(&header.channel_id).copied() {
-                        table.take(series, what, &data)?;
-                    }
-                }
-                Record::DataEnd(_) => is_ended = false,
-                _ => {}
-            },
-            // A chunk that was not written to its end, or is damaged: where the next one begins is
-            // not known.
-            Err(_) if is_ended || !table.series.is_empty() => {
-                table.summary.is_cut = true;
-                break;
             }
-            Err(error) => return Err(error.into()),
+            _ => {}
         }
-    }
-    table.summary.is_cut |= is_ended;
+        Ok(())
+    })?;
+    table.summary.is_cut = is_cut;
     table.finish()
 }
 
 impl<W: Write> Table<W> {
-    /// All series are known before the first message.
-    fn writer(&mut self) -> Result<Option<&mut Writer<W>>, ReadError> {
+    fn know(&mut self, channel: &Channel) {
+        let number = channel.metadata.get("series");
+        let number = number.and_then(|number| number.parse().ok());
+        if let Some((number, series)) = number.zip(series_of(&channel.topic))
+            && !self.channels.contains_key(&channel.id)
+        {
+            let place = self.place(number);
+            self.channels
+                .insert(channel.id, (number, place, series.what));
+            if self.writer.is_none() {
+                // A channel's main reading comes first.
+                self.series.entry(number).or_insert(series);
+            }
+        }
+    }
+
+    /// The place of a series among the columns, once they are known.
+    fn place(&self, number: usize) -> Option<usize> {
+        let is_known = self.writer.is_some();
+        (self.series.keys().position(|known| *known == number)).filter(|_| is_known)
+    }
+
+    /// Begins the table: its columns are those of the series before the first message.
+    fn begin(&mut self) -> Result<(), ReadError> {
         if let Some(output) = self.output.take() {
             let series: Vec<Series> = self.series.values().cloned().collect();
             self.writer = Some(Writer::new(output, &series, Columns::All)?);
+            for (number, place, _) in self.channels.values_mut() {
+                *place = self.series.keys().position(|known| known == number);
+            }
         }
-        Ok(self.writer.as_mut())
+        Ok(())
     }
 
-    fn take(&mut self, number: usize, what: What, message: &[u8]) -> Result<(), ReadError> {
+    fn take(
+        &mut self,
+        channel: u16,
+        place: Option<usize>,
+        what: What,
+        message: &[u8],
+    ) -> Result<(), ReadError> {
         let Some((t, value)) = value(what, message) else {
             self.summary.damaged += 1;
             return Ok(());
         };
-        let place = self.series.keys().position(|known| *known == number);
-        if let Some((writer, place)) = self.writer()?.zip(place) {
-            writer.push(Some(t), place, &value)?;
-            self.summary.values += 1;
+        self.begin()?;
+        let place = place.or_else(|| self.channels.get(&channel)?.1);
+        match (&mut self.writer, place) {
+            (Some(writer), Some(place)) => {
+                writer.push(Some(t), place, &value)?;
+                self.summary.values += 1;
+            }
+            _ => self.summary.without_column += 1,
         }
         Ok(())
     }
@@ -138,12 +195,128 @@ impl<W: Write> Table<W> {
         if self.series.is_empty() {
             return Err(ReadError::Foreign);
         }
-        self.writer()?;
+        self.begin()?;
         if let Some(writer) = self.writer {
             writer.finish()?;
         }
         Ok(self.summary)
     }
+}
+
+/// Gives the raw frames of a recording, with their buses, to `take`. Their stamps are the wall
+/// clock's.
+///
+/// # Errors
+/// [`ReadError`]; [`ReadError::NoFrames`] if there are none; those of `take`.
+pub fn frames(
+    recording: impl Read,
+    mut take: impl FnMut(&str, &Frame) -> io::Result<()>,
+) -> Result<Summary, ReadError> {
+    let mut state = (BTreeMap::<u16, (String, bool)>::new(), Summary::default());
+    let is_known = |(channels, _): &(BTreeMap<u16, (String, bool)>, _)| !channels.is_empty();
+    let is_cut = walk(
+        recording,
+        &mut state,
+        is_known,
+        |(channels, summary), record| {
+            match record {
+                Record::Channel(channel) => {
+                    let classic = channel.topic.strip_prefix("/can/").map(|bus| (bus, false));
+                    let fd = channel
+                        .topic
+                        .strip_prefix("/can_fd/")
+                        .map(|bus| (bus, true));
+                    if let Some((bus, is_fd)) = classic.or(fd) {
+                        channels.insert(channel.id, (bus.to_owned(), is_fd));
+                    }
+                }
+                Record::Message { header, data } => {
+                    if let Some((bus, is_fd)) = channels.get(&header.channel_id) {
+                        match frame(*is_fd, &data) {
+                            Some(frame) => {
+                                take(bus, &frame)?;
+                                summary.values += 1;
+                            }
+                            None => summary.damaged += 1,
+                        }
+                    }
+                }
+                _ => {}
+            }
+            Ok(())
+        },
+    )?;
+    let (channels, mut summary) = state;
+    if channels.is_empty() {
+        return Err(ReadError::NoFrames);
+    }
+    summary.is_cut = is_cut;
+    Ok(summary)
+}
+
+/// What a recording says of itself, with the files that it took along.
+///
+/// # Errors
+/// [`ReadError`]; [`ReadError::Foreign`] if it is none of this program.
+pub fn about(recording: impl Read) -> Result<About, ReadError> {
+    let mut found: Option<About> = None;
+    let mut files = Vec::new();
+    walk(recording, &mut found, Option::is_some, |found, record| {
+        match record {
+            Record::Metadata(metadata) if metadata.name == PROPRIO => {
+                let get = |key: &str| metadata.metadata.get(key).cloned().unwrap_or_default();
+                let offset = get("wall_clock_minus_monotonic_ns").parse();
+                *found = Some(About {
+                    robot: get("robot"),
+                    program: get("program"),
+                    offset: Nanos(offset.unwrap_or_default()),
+                    files: Vec::new(),
+                });
+            }
+            Record::Attachment { header, data, .. } => {
+                files.push((header.name, data.into_owned()));
+            }
+            _ => {}
+        }
+        Ok(())
+    })?;
+    let found = found.ok_or(ReadError::Foreign)?;
+    Ok(About { files, ..found })
+}
+
+/// The frame in a message of `can_msgs` or `ros2_socketcan_msgs`; `None` if it has none.
+fn frame(is_fd: bool, message: &[u8]) -> Option<Frame> {
+    let mut parsed = Parsed::new(message)?;
+    let t = parsed.time()?;
+    let _frame_id = parsed.text()?;
+    let id = parsed.u32()?;
+    let is_remote = !is_fd && parsed.bool()?;
+    let is_extended = parsed.bool()?;
+    let is_error = parsed.bool()?;
+    let length = parsed.u8()?;
+    let length = usize::from(match is_fd {
+        true => u8::try_from(parsed.u32()?).ok()?,
+        false => length,
+    });
+    let id = match is_extended {
+        true => Id::extended(id),
+        false => Id::standard(u16::try_from(id).ok()?),
+    };
+    let frame = match (is_error, is_remote) {
+        (true, _) => return None,
+        (_, true) => Frame::remote(id, u8::try_from(length).ok()?),
+        _ => {
+            let format = match is_fd {
+                true => Format::Fd {
+                    bit_rate_switch: false,
+                    error_state: false,
+                },
+                false => Format::Classic,
+            };
+            Frame::with_format(id, format, parsed.bytes(length)?)?
+        }
+    };
+    Some(frame.at(t, StampKind::Log))
 }
 
 /// The series that has this topic.

@@ -2,12 +2,13 @@
 //! what is left of one that was cut.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-use proprio_recording::{ReadError, Recorder, is_mcap, to_table};
+use proprio_drivers::{Format, Frame, Id};
+use proprio_recording::{About, ReadError, Recorder, Ring, about, frames, is_mcap, to_table};
 use proprio_topics::csv::{Columns, Series, Value, What, Writer};
 use proprio_topics::{
     ContactEstimate, ContactState, ContactWrench, Description, Entry, Header, JointTorque, Kind,
     MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Nanos, Publisher, Quality, Reading, Reason,
-    Residual, Role, TorqueEstimate, VALUES,
+    Residual, Role, StampKind, TorqueEstimate, VALUES,
 };
 use proptest::prelude::*;
 use std::io::Cursor;
@@ -80,12 +81,21 @@ fn table(values: &[(Nanos, usize, Value)]) -> Vec<u8> {
     writer.finish().unwrap()
 }
 
+fn about_it() -> About {
+    About {
+        robot: "arm".into(),
+        program: "test 1".into(),
+        offset: OFFSET,
+        files: vec![("estimator.toml".into(), b"[robot]".to_vec())],
+    }
+}
+
 /// A recording of these values; each `flush` of them ends a chunk.
 fn recording(values: &[(Nanos, usize, Value)], flush: usize) -> Vec<u8> {
     let output = Cursor::new(Vec::new());
-    let mut recorder = Recorder::new(output, "arm", "test 1", &series(), OFFSET).unwrap();
+    let mut recorder = Recorder::new(output, &about_it(), &series()).unwrap();
     for (number, (t, series, value)) in values.iter().enumerate() {
-        recorder.push(*t, *series, value).unwrap();
+        recorder.value(*t, *series, value).unwrap();
         if number % flush == flush - 1 {
             recorder.flush().unwrap();
         }
@@ -227,4 +237,132 @@ proptest! {
         damaged[place] = with;
         let _ = to_table(damaged.as_slice(), Vec::new());
     }
+}
+
+#[test]
+fn a_recording_says_what_it_is_and_has_its_files() {
+    let recording = recording(&values(&[1.0], 10), 4);
+    let found = about(recording.as_slice()).unwrap();
+    assert_eq!(
+        (found.robot, found.program, found.offset, found.files),
+        ("arm".into(), "test 1".into(), OFFSET, about_it().files)
+    );
+}
+
+/// Frames of every form, with their bus and the wall clock's time to the nanosecond.
+#[test]
+fn frames_come_back() {
+    let fd = Format::Fd {
+        bit_rate_switch: false,
+        error_state: false,
+    };
+    let at = |frame: Frame, n| frame.at(BEGIN + Nanos(n), StampKind::Software);
+    let sent = [
+        ("can0", at(Frame::new(Id::standard(0x123), &[1, 2, 3]), 0)),
+        (
+            "can1",
+            at(Frame::new(Id::extended(0x1ABC_DEF0), &[9; 8]), 1),
+        ),
+        ("can0", at(Frame::remote(Id::standard(0x7FF), 5), 2)),
+        (
+            "can0",
+            at(
+                Frame::with_format(Id::standard(1), fd, &[7; 64]).unwrap(),
+                3,
+            ),
+        ),
+        ("can0", at(Frame::new(Id::standard(0), &[]), 1_234_567_891)),
+    ];
+    let output = Cursor::new(Vec::new());
+    let mut recorder = Recorder::new(output, &about_it(), &series()).unwrap();
+    assert!(matches!(
+        frames(recording(&[], 1).as_slice(), |_, _| Ok(())),
+        Err(ReadError::NoFrames)
+    ));
+    for (bus, frame) in &sent {
+        recorder.frame(bus, frame).unwrap();
+    }
+    // An error frame tells of a controller, not of a device: it is recorded, and not read.
+    let error = Frame::with_format(Id::extended(4), Format::Error, &[0; 8]).unwrap();
+    recorder.frame("can0", &at(error, 9)).unwrap();
+    let recorded = recorder.finish().unwrap().into_inner();
+    let mut found = Vec::new();
+    let summary = frames(recorded.as_slice(), |bus, frame| {
+        found.push((bus.to_owned(), *frame));
+        Ok(())
+    })
+    .unwrap();
+    assert_eq!((summary.values, summary.damaged), (5, 1));
+    for ((bus, frame), (sent_on, sent)) in found.iter().zip(&sent) {
+        let expected = sent.at(sent.t + OFFSET, StampKind::Log);
+        assert_eq!((bus.as_str(), frame), (*sent_on, &expected));
+    }
+    assert_eq!(found.len(), sent.len());
+}
+
+/// A ring has at least the time that is asked for, and not much more; it goes on after a snapshot.
+#[test]
+fn a_ring_has_the_last_seconds() {
+    let values = values(&[0.5, -3.25, 1e-3], 4000);
+    let newest = values.last().unwrap().0;
+    let duration = Nanos::from_millis(400);
+    let mut ring = Ring::new(about_it(), &series(), duration).unwrap();
+    let mut snapshots = Vec::new();
+    for (number, (t, series_number, value)) in values.iter().enumerate() {
+        let recorder = ring.at(*t, &series()).unwrap();
+        recorder.value(*t, *series_number, value).unwrap();
+        if number == 20 || number == values.len() - 1 {
+            recorder.torques(&names(), &torques()).unwrap();
+            let output = Cursor::new(Vec::new());
+            snapshots.push(ring.snapshot(output, &series()).unwrap().into_inner());
+        }
+    }
+    let rows = |snapshot: &[u8]| {
+        let mut found = Vec::new();
+        let summary = to_table(snapshot, &mut found).unwrap();
+        assert!(!summary.is_cut && summary.damaged == 0, "{summary:?}");
+        String::from_utf8(found).unwrap()
+    };
+    let whole = String::from_utf8(table(&values)).unwrap();
+    let [first, last] = [rows(&snapshots[0]), rows(&snapshots[1])];
+    assert!(whole.starts_with(first.trim_end().rsplit_once('\n').unwrap().0));
+    let (head, body) = last.split_once('\n').unwrap();
+    assert!(whole.starts_with(head) && whole.ends_with(body));
+    let t = |row: &str| row.split(',').next().unwrap().parse::<f64>().unwrap();
+    let held = newest.seconds() - t(body.lines().next().unwrap());
+    assert!(
+        held >= duration.seconds() && held < duration.seconds() * 1.3,
+        "{held}"
+    );
+    assert_eq!(
+        about(snapshots[1].as_slice()).unwrap().files,
+        about_it().files
+    );
+    assert!(ring.memory() > 0);
+}
+
+/// A channel that comes to be known late is in the recording, but has no column.
+#[test]
+fn late_channels_have_no_column() {
+    let values = values(&[2.0], 40);
+    let early = &series()[..2];
+    let mut recorder = Recorder::new(Cursor::new(Vec::new()), &about_it(), early).unwrap();
+    let (mut with, mut without) = (0, 0);
+    for (number, (t, series_number, value)) in values.iter().enumerate() {
+        if number == 5 {
+            recorder.know(&series()).unwrap();
+        }
+        recorder.value(*t, *series_number, value).unwrap();
+        let is_early = *series_number < 2;
+        with += u64::from(is_early);
+        without += u64::from(!is_early && number >= 5);
+    }
+    let recorded = recorder.finish().unwrap().into_inner();
+    let summary = to_table(recorded.as_slice(), Vec::new()).unwrap();
+    assert_eq!((summary.values, summary.without_column), (with, without));
+    let topics: Vec<String> = mcap::MessageStream::new(&recorded)
+        .unwrap()
+        .map(|message| message.unwrap().channel.topic.clone())
+        .collect();
+    assert!(topics.iter().any(|topic| topic == "/samples/imu/chest"));
 }

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// The permitted direct dependencies between members of the workspace.
-const DIRECTIONS: [(&str, &[&str]); 12] = [
+const DIRECTIONS: [(&str, &[&str]); 13] = [
     ("proprio-topics", &[]),
     ("proprio-drivers", &["proprio-topics"]),
     ("proprio-gateway", &["proprio-drivers", "proprio-topics"]),
@@ -38,7 +38,11 @@ const DIRECTIONS: [(&str, &[&str]); 12] = [
         ],
     ),
     ("proprio-cli", &EVERYTHING),
-    ("proprio-recording", &["proprio-topics"]),
+    ("proprio-bridge", &["proprio-topics"]),
+    (
+        "proprio-recording",
+        &["proprio-bridge", "proprio-drivers", "proprio-topics"],
+    ),
     ("proprio-ffi", &["proprio-topics"]),
     ("proprio-tests", &EVERYTHING),
     (
@@ -46,7 +50,7 @@ const DIRECTIONS: [(&str, &[&str]); 12] = [
         &["proprio-dynamics", "proprio-identification"],
     ),
 ];
-const EVERYTHING: [&str; 9] = [
+const EVERYTHING: [&str; 10] = [
     "proprio-topics",
     "proprio-drivers",
     "proprio-gateway",
@@ -54,6 +58,7 @@ const EVERYTHING: [&str; 9] = [
     "proprio-identification",
     "proprio-estimator",
     "proprio-simulator",
+    "proprio-bridge",
     "proprio-recording",
     "proprio-ffi",
 ];

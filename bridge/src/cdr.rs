@@ -1,24 +1,45 @@
 //! ROS 2's encoding of messages: little-endian CDR (OMG DDS-RTPS, "plain CDR version 1"). Each
 //! number is aligned to its own size, counted from the end of the four bytes that begin a message.
 
+use proprio_topics::Nanos;
+
 /// Those bytes: little-endian CDR, no options.
 const HEAD: [u8; 4] = [0, 1, 0, 0];
 
 /// A message that is being written.
-#[derive(Debug)]
-pub(crate) struct Message {
+#[derive(Debug, Clone)]
+pub struct Message {
     bytes: Vec<u8>,
 }
 
 impl Message {
-    pub(crate) fn new() -> Self {
+    /// An empty one.
+    #[must_use]
+    pub fn new() -> Self {
         let bytes = HEAD.to_vec();
         Self { bytes }
     }
 
-    /// The bytes.
-    pub(crate) fn bytes(&self) -> &[u8] {
+    /// One that begins with a `std_msgs/Header`; `wall` is in \[ns since 1970, UTC\].
+    #[must_use]
+    pub fn stamped(wall: u64, frame: &str) -> Self {
+        let mut message = Self::new();
+        message.time(wall);
+        message.text(frame);
+        message
+    }
+
+    /// The bytes, with those four.
+    #[must_use]
+    pub fn bytes(&self) -> &[u8] {
         &self.bytes
+    }
+
+    /// A `builtin_interfaces/Time`; `wall` is in \[ns since 1970, UTC\].
+    pub fn time(&mut self, wall: u64) {
+        let (seconds, nanoseconds) = (wall / 1_000_000_000, wall % 1_000_000_000);
+        self.i32(i32::try_from(seconds).unwrap_or(i32::MAX));
+        self.u32(u32::try_from(nanoseconds).unwrap_or_default());
     }
 
     fn put<const N: usize>(&mut self, number: [u8; N]) {
@@ -27,34 +48,45 @@ impl Message {
         self.bytes.extend(number);
     }
 
-    pub(crate) fn bool(&mut self, value: bool) {
+    /// A `bool`.
+    pub fn bool(&mut self, value: bool) {
         self.put([u8::from(value)]);
     }
 
-    pub(crate) fn i32(&mut self, value: i32) {
+    /// A `uint8` or `byte`.
+    pub fn u8(&mut self, value: u8) {
+        self.put([value]);
+    }
+
+    /// An `int32`.
+    pub fn i32(&mut self, value: i32) {
         self.put(value.to_le_bytes());
     }
 
-    pub(crate) fn u32(&mut self, value: u32) {
+    /// A `uint32`.
+    pub fn u32(&mut self, value: u32) {
         self.put(value.to_le_bytes());
     }
 
-    pub(crate) fn i64(&mut self, value: i64) {
+    /// An `int64`.
+    pub fn i64(&mut self, value: i64) {
         self.put(value.to_le_bytes());
     }
 
-    pub(crate) fn f64s(&mut self, values: &[f64]) {
+    /// `float64` values, one after the other.
+    pub fn f64s(&mut self, values: &[f64]) {
         for value in values {
             self.put(value.to_le_bytes());
         }
     }
 
     /// The number of elements that follow.
-    pub(crate) fn count(&mut self, count: usize) {
+    pub fn count(&mut self, count: usize) {
         self.u32(u32::try_from(count).unwrap_or(u32::MAX));
     }
 
-    pub(crate) fn text(&mut self, text: &str) {
+    /// A `string`.
+    pub fn text(&mut self, text: &str) {
         self.count(text.len() + 1);
         self.bytes.extend(text.bytes());
         self.bytes.push(0);
@@ -63,14 +95,15 @@ impl Message {
 
 /// A message that is being read.
 #[derive(Debug)]
-pub(crate) struct Parsed<'a> {
+pub struct Parsed<'a> {
     body: &'a [u8],
     place: usize,
 }
 
 impl<'a> Parsed<'a> {
     /// `None` if it is no little-endian CDR.
-    pub(crate) fn new(bytes: &'a [u8]) -> Option<Self> {
+    #[must_use]
+    pub fn new(bytes: &'a [u8]) -> Option<Self> {
         let body = bytes.strip_prefix(&HEAD)?;
         Some(Self { body, place: 0 })
     }
@@ -82,19 +115,48 @@ impl<'a> Parsed<'a> {
         number.try_into().ok()
     }
 
-    pub(crate) fn bool(&mut self) -> Option<bool> {
+    /// A `bool`. `None` where the message ends before.
+    pub fn bool(&mut self) -> Option<bool> {
         self.take::<1>().map(|[byte]| byte != 0)
     }
 
-    pub(crate) fn u32(&mut self) -> Option<u32> {
+    /// A `uint8`. `None` where the message ends before.
+    pub fn u8(&mut self) -> Option<u8> {
+        self.take::<1>().map(|[byte]| byte)
+    }
+
+    /// A `builtin_interfaces/Time` \[ns since 1970, UTC\]. `None` where the message ends before.
+    pub fn time(&mut self) -> Option<Nanos> {
+        let (seconds, nanoseconds) = (i64::from(self.u32()?.cast_signed()), self.u32()?);
+        Some(Nanos(seconds * 1_000_000_000 + i64::from(nanoseconds)))
+    }
+
+    /// A `string`. `None` where the message ends before, or it is no UTF-8.
+    pub fn text(&mut self) -> Option<&'a str> {
+        let count = usize::try_from(self.u32()?).ok()?;
+        let bytes = self.bytes(count)?.split_last()?.1;
+        std::str::from_utf8(bytes).ok()
+    }
+
+    /// So many bytes. `None` where the message ends before.
+    pub fn bytes(&mut self, count: usize) -> Option<&'a [u8]> {
+        let bytes = self.body.get(self.place..)?.get(..count)?;
+        self.place += count;
+        Some(bytes)
+    }
+
+    /// A `uint32`. `None` where the message ends before.
+    pub fn u32(&mut self) -> Option<u32> {
         self.take().map(u32::from_le_bytes)
     }
 
-    pub(crate) fn i64(&mut self) -> Option<i64> {
+    /// An `int64`. `None` where the message ends before.
+    pub fn i64(&mut self) -> Option<i64> {
         self.take().map(i64::from_le_bytes)
     }
 
-    pub(crate) fn f64(&mut self) -> Option<f64> {
+    /// A `float64`. `None` where the message ends before.
+    pub fn f64(&mut self) -> Option<f64> {
         self.take().map(f64::from_le_bytes)
     }
 }
@@ -132,19 +194,23 @@ mod tests {
             message.bool(!flag);
             message.i64(b);
             message.f64s(&[c]);
+            message.text("caf\u{e9}");
+            message.u8(a as u8);
             let mut parsed = Parsed::new(message.bytes()).unwrap();
             prop_assert_eq!(parsed.bool(), Some(flag));
             prop_assert_eq!(parsed.u32(), Some(a));
             prop_assert_eq!(parsed.bool(), Some(!flag));
             prop_assert_eq!(parsed.i64(), Some(b));
             prop_assert_eq!(parsed.f64().map(f64::to_bits), Some(c.to_bits()));
+            prop_assert_eq!(parsed.text(), Some("caf\u{e9}"));
+            prop_assert_eq!(parsed.u8(), Some(a as u8));
             prop_assert_eq!(parsed.bool(), None);
         }
 
         #[test]
         fn any_bytes_are_legal_input(bytes: Vec<u8>) {
             if let Some(mut parsed) = Parsed::new(&bytes) {
-                let _ = (parsed.bool(), parsed.i64(), parsed.u32(), parsed.f64());
+                let _ = (parsed.bool(), parsed.text(), parsed.i64(), parsed.u32(), parsed.f64());
             }
         }
     }

@@ -1,0 +1,413 @@
+//! Follows one running robot: its samples, declarations, estimates and health, by name, over
+//! restarts of its daemons and damage of its domain.
+
+use crate::described::{Described, next};
+use proprio_topics::csv::{Series, Value, What};
+use proprio_topics::ipc::{Domain, DomainConfig, DomainError, PortError, Reader, TakeError};
+use proprio_topics::{
+    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth, MAX_CHANNELS,
+    Nanos, Publisher, Role, Sample, TorqueEstimate,
+};
+use std::rc::Rc;
+
+/// How often a listener looks for an estimator, and whether the domain is intact.
+const LOOK: Nanos = Nanos::from_millis(500);
+
+/// Why a robot cannot be listened to.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ListenError {
+    /// The domain cannot be opened.
+    #[error("{error}{}", match siblings.is_empty() {
+        true => String::new(),
+        false => format!("; the domains here are {}", siblings.join(", ")),
+    })]
+    Domain {
+        /// Why.
+        error: DomainError,
+        /// The domains that there are.
+        siblings: Vec<String>,
+    },
+    /// Nobody has published anything in the domain.
+    #[error("there is no robot in the domain")]
+    NoRobot,
+    /// None was named.
+    #[error("there are several robots: name one with --robot: {}", names.join(", "))]
+    Several {
+        /// Their names.
+        names: Vec<String>,
+    },
+    /// There is none of this name.
+    #[error("there is no robot {name:?}; there is {}", names.join(", "))]
+    Unknown {
+        /// The name.
+        name: String,
+        /// Those that there are.
+        names: Vec<String>,
+    },
+    /// Its gateway does not run.
+    #[error("the robot's gateway is not running")]
+    NoGateway,
+    /// A topic cannot be read.
+    #[error(transparent)]
+    Port(#[from] PortError),
+    /// A payload cannot be taken.
+    #[error(transparent)]
+    Take(#[from] TakeError),
+}
+
+/// Opens the domain for reading; the error names the domains that there are.
+///
+/// # Errors
+/// [`ListenError::Domain`].
+pub fn open(config: &DomainConfig) -> Result<Domain, ListenError> {
+    Domain::open_existing(config).map_err(|error| ListenError::Domain {
+        error,
+        siblings: config.siblings(),
+    })
+}
+
+/// The name of the robot to read: the named one, or the only one. Whether it runs is not asked:
+/// that takes a second.
+///
+/// # Errors
+/// There is none, or not one.
+pub fn one_robot(domain: &Domain, name: Option<&str>) -> Result<String, ListenError> {
+    let names: Vec<String> = domain.robot_names().into_iter().collect();
+    match (name, names.as_slice()) {
+        (_, []) => Err(ListenError::NoRobot),
+        (None, [only]) => Ok(only.clone()),
+        (None, _) => Err(ListenError::Several { names }),
+        (Some(name), _) if names.iter().any(|known| known == name) => Ok(name.to_owned()),
+        (Some(name), _) => Err(ListenError::Unknown {
+            name: name.to_owned(),
+            names,
+        }),
+    }
+}
+
+/// What a robot sends.
+#[derive(Debug, Clone)]
+pub enum Heard {
+    /// A value of the series with this number ([`Listener::series`]).
+    Value(usize, Value),
+    /// Torques, with the names of the estimator that sent them.
+    Torques(Box<TorqueEstimate>, Rc<Description>),
+    /// Contact wrenches, likewise.
+    Contacts(Box<ContactEstimate>, Rc<Description>),
+    /// How the gateway is.
+    Gateway(Box<GatewayHealth>),
+    /// How the estimator is.
+    Estimator(Box<EstimatorHealth>),
+}
+
+/// A value at an instant.
+#[derive(Debug, Clone)]
+pub struct Event {
+    /// The instant that it is of (CLOCK_MONOTONIC).
+    pub t: Nanos,
+    /// The start of its publisher.
+    pub epoch: u64,
+    /// What it is.
+    pub heard: Heard,
+}
+
+/// What the estimator sends.
+struct Estimates {
+    torques: Reader<TorqueEstimate>,
+    contacts: Reader<ContactEstimate>,
+    health: Option<Reader<EstimatorHealth>>,
+    described: Described,
+    names: Option<Rc<Description>>,
+}
+
+impl Estimates {
+    /// Those of the robot's estimator; `None` if it does not run.
+    fn of(domain: &Domain, robot: &str) -> Option<Self> {
+        Some(Self {
+            torques: Reader::open(domain, robot).ok()?,
+            contacts: Reader::open(domain, robot).ok()?,
+            health: Reader::open(domain, robot).ok(),
+            described: Described::by(domain, robot, Publisher::Estimator).ok()??,
+            names: None,
+        })
+    }
+
+    /// The names of this start of the estimator, if they have come.
+    fn names_of(&mut self, epoch: u64) -> Option<Rc<Description>> {
+        if (self.names.as_ref()).is_none_or(|known| known.header.epoch != epoch) {
+            self.names = self.described.of(epoch).map(|names| Rc::new(*names));
+        }
+        self.names.clone()
+    }
+}
+
+/// Follows one robot.
+pub struct Listener {
+    config: DomainConfig,
+    domain: Domain,
+    robot: String,
+    gateway: Described,
+    samples: Reader<Sample>,
+    declarations: Option<Reader<ContactDeclaration>>,
+    health: Option<Reader<GatewayHealth>>,
+    estimates: Option<Estimates>,
+    series: Vec<Series>,
+    /// Of each channel number of the gateway's start `epoch`: its series.
+    numbers: Vec<Option<usize>>,
+    epoch: u64,
+    /// Samples that wait to be sorted.
+    inbox: Vec<Sample>,
+    look: Nanos,
+    lost: u64,
+    unknown: u64,
+}
+
+impl Listener {
+    /// Listens to the robot of this name, or the only one.
+    ///
+    /// # Errors
+    /// [`ListenError`]: its gateway does not run, or it cannot be read.
+    pub fn open(config: &DomainConfig, robot: Option<&str>) -> Result<Self, ListenError> {
+        let domain = open(config)?;
+        let robot = one_robot(&domain, robot)?;
+        Self::of(config, domain, robot)
+    }
+
+    fn of(config: &DomainConfig, domain: Domain, robot: String) -> Result<Self, ListenError> {
+        // The readers first: what comes meanwhile is heard, too.
+        let samples = Reader::open(&domain, &robot).map_err(|error| match error {
+            PortError::NotYet { .. } => ListenError::NoGateway,
+            error => error.into(),
+        })?;
+        let gateway = Described::by(&domain, &robot, Publisher::Gateway)?;
+        let mut listener = Self {
+            declarations: Reader::open(&domain, &robot).ok(),
+            health: Reader::open(&domain, &robot).ok(),
+            estimates: Estimates::of(&domain, &robot),
+            config: config.clone(),
+            robot,
+            gateway: gateway.ok_or(ListenError::NoGateway)?,
+            samples,
+            series: Vec::new(),
+            numbers: Vec::new(),
+            epoch: 0,
+            inbox: Vec::new(),
+            look: Nanos::MIN,
+            lost: 0,
+            unknown: 0,
+            domain,
+        };
+        let description = *listener.gateway.newest();
+        listener.name_channels(&description);
+        if let Some(estimates) = &listener.estimates {
+            let names = *estimates.described.newest();
+            listener.name_contacts(&names);
+        }
+        Ok(listener)
+    }
+
+    /// The robot's name.
+    #[must_use]
+    pub fn robot(&self) -> &str {
+        &self.robot
+    }
+
+    /// The gateway's newest description.
+    #[must_use]
+    pub const fn description(&self) -> &Description {
+        self.gateway.newest()
+    }
+
+    /// The channels and contacts that were heard of so far; only added to.
+    #[must_use]
+    pub fn series(&self) -> &[Series] {
+        &self.series
+    }
+
+    /// Samples that came too fast to be read, and are lost.
+    #[must_use]
+    pub fn lost(&self) -> u64 {
+        self.lost + self.samples.lost()
+    }
+
+    /// Samples whose channel has no name: those of a gateway that has ended meanwhile.
+    #[must_use]
+    pub const fn unknown(&self) -> u64 {
+        self.unknown
+    }
+
+    /// The number of a series, which is added if it is new.
+    fn number(&mut self, what: What, name: &str) -> usize {
+        let known = (self.series.iter()).position(|one| one.what == what && one.name == name);
+        known.unwrap_or_else(|| {
+            let name = name.to_owned();
+            self.series.push(Series { what, name });
+            self.series.len() - 1
+        })
+    }
+
+    /// The names of a start of the gateway: the same channels may have other numbers than before.
+    fn name_channels(&mut self, description: &Description) {
+        let mut numbers = vec![None; MAX_CHANNELS];
+        for entry in description.entries() {
+            if entry.role == Role::Channel
+                && let Some(kind) = entry.kind.get()
+                && let Some(number) = numbers.get_mut(entry.index as usize)
+            {
+                *number = Some(self.number(What::Channel(kind), entry.name.as_str()));
+            }
+        }
+        (self.numbers, self.epoch) = (numbers, description.header.epoch);
+    }
+
+    fn name_contacts(&mut self, description: &Description) {
+        for entry in description.entries() {
+            if entry.role == Role::Contact {
+                self.number(What::Contact, entry.name.as_str());
+            }
+        }
+    }
+
+    /// Gives what has come to `take`: samples in the order of time, then estimates and health.
+    /// `now` is CLOCK_MONOTONIC.
+    ///
+    /// # Errors
+    /// [`ListenError`], as its first variants; those of `take`.
+    pub fn poll<E: From<ListenError>>(
+        &mut self,
+        now: Nanos,
+        mut take: impl FnMut(&Self, Event) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let failed = |error: TakeError| E::from(error.into());
+        while let Some(reader) = &mut self.declarations
+            && let Some(declared) = next(reader).map_err(failed)?
+        {
+            let number = self.number(What::Contact, declared.contact.as_str());
+            let event = Event {
+                t: declared.header.acquired,
+                epoch: declared.header.epoch,
+                heard: Heard::Value(number, Value::Contact(declared.state())),
+            };
+            take(self, event)?;
+        }
+        // Shared memory delivers all samples of one bus before those of the next.
+        let mut inbox = std::mem::take(&mut self.inbox);
+        while let Some(sample) = next(&mut self.samples).map_err(failed)? {
+            inbox.push(sample);
+        }
+        inbox.sort_by_key(|sample| sample.header.acquired);
+        for sample in inbox.drain(..) {
+            let epoch = sample.header.epoch;
+            if epoch != self.epoch
+                && let Some(description) = self.gateway.of(epoch).copied()
+            {
+                self.name_channels(&description);
+            }
+            let number = self.numbers.get(sample.channel as usize).copied().flatten();
+            let number = number.filter(|_| epoch == self.epoch);
+            let Some((number, reading)) = number.zip(sample.reading()) else {
+                self.unknown += 1;
+                continue;
+            };
+            let value = Value::Reading(reading, sample.header.quality);
+            let event = Event {
+                t: sample.header.acquired,
+                epoch,
+                heard: Heard::Value(number, value),
+            };
+            take(self, event)?;
+        }
+        self.inbox = inbox;
+        while let Some(reader) = &mut self.health
+            && let Some(health) = next(reader).map_err(failed)?
+        {
+            let event = Event {
+                t: health.header.published,
+                epoch: health.header.epoch,
+                heard: Heard::Gateway(Box::new(health)),
+            };
+            take(self, event)?;
+        }
+        self.poll_estimator(&mut take)?;
+        if now >= self.look {
+            self.look = now + LOOK;
+            self.look_again();
+        }
+        Ok(())
+    }
+
+    fn poll_estimator<E: From<ListenError>>(
+        &mut self,
+        take: &mut impl FnMut(&Self, Event) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let failed = |error: TakeError| E::from(error.into());
+        let Some(mut estimates) = self.estimates.take() else {
+            return Ok(());
+        };
+        while let Some(torques) = next(&mut estimates.torques).map_err(failed)? {
+            let epoch = torques.header.epoch;
+            if let Some(names) = estimates.names_of(epoch) {
+                let t = torques.header.acquired;
+                let heard = Heard::Torques(Box::new(torques), names);
+                take(self, Event { t, epoch, heard })?;
+            }
+        }
+        while let Some(contacts) = next(&mut estimates.contacts).map_err(failed)? {
+            let epoch = contacts.header.epoch;
+            if let Some(names) = estimates.names_of(epoch) {
+                let t = contacts.header.acquired;
+                let heard = Heard::Contacts(Box::new(contacts), names);
+                take(self, Event { t, epoch, heard })?;
+            }
+        }
+        while let Some(reader) = &mut estimates.health
+            && let Some(health) = next(reader).map_err(failed)?
+        {
+            let (t, epoch) = (health.header.published, health.header.epoch);
+            let heard = Heard::Estimator(Box::new(health));
+            take(self, Event { t, epoch, heard })?;
+        }
+        self.estimates = Some(estimates);
+        Ok(())
+    }
+
+    /// Looks for what may have come or gone.
+    fn look_again(&mut self) {
+        // Gateway and estimator make a damaged domain again; until they have, nothing comes.
+        if !self.domain.is_intact()
+            && let Ok(domain) = open(&self.config)
+            && let Ok(new) = Self::of(&self.config, domain, self.robot.clone())
+        {
+            let lost = self.lost();
+            let (series, unknown) = (std::mem::take(&mut self.series), self.unknown);
+            *self = Self {
+                series,
+                lost,
+                unknown,
+                look: self.look,
+                ..new
+            };
+            let description = *self.gateway.newest();
+            self.name_channels(&description);
+        }
+        if self.estimates.is_none() {
+            self.estimates = Estimates::of(&self.domain, &self.robot);
+            if let Some(estimates) = &self.estimates {
+                let names = *estimates.described.newest();
+                self.name_contacts(&names);
+            }
+        }
+        if self.declarations.is_none() {
+            self.declarations = Reader::open(&self.domain, &self.robot).ok();
+        }
+        if self.health.is_none() {
+            self.health = Reader::open(&self.domain, &self.robot).ok();
+        }
+    }
+
+    /// Waits until samples come, at the latest until `deadline` (CLOCK_MONOTONIC).
+    pub fn wait(&mut self, deadline: Nanos) {
+        self.samples.wait(deadline);
+    }
+}

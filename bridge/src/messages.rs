@@ -1,0 +1,443 @@
+//! What a robot sends, as messages for a [`Sink`].
+
+use crate::cdr::Message;
+use crate::definitions::{self, Definition};
+use crate::diagnostics;
+use crate::listener::Heard;
+use proprio_topics::csv::{Series, Value, What};
+use proprio_topics::{
+    ContactEstimate, ContactState, Description, EstimatorHealth, GatewayHealth, Imu, JointState,
+    JointTorque, Kind, Nanos, Quality, Reading, Role, TorqueEstimate, Wrench,
+};
+use std::collections::BTreeMap;
+
+/// Where messages go: a file, a viewer, a network.
+pub trait Sink {
+    /// A topic of it.
+    type Channel: Clone;
+    /// Why it cannot take a message.
+    type Error;
+
+    /// Adds a topic. `series` is the number of the table's series whose values it has. `None`: this
+    /// sink does not carry such messages.
+    ///
+    /// # Errors
+    /// It cannot be added.
+    fn add(
+        &mut self,
+        topic: &str,
+        definition: &Definition,
+        series: Option<usize>,
+    ) -> Result<Option<Self::Channel>, Self::Error>;
+
+    /// Sends a message that is of the instant `wall` \[ns since 1970, UTC\].
+    ///
+    /// # Errors
+    /// It cannot be sent.
+    fn send(
+        &mut self,
+        channel: &Self::Channel,
+        wall: u64,
+        message: &Message,
+    ) -> Result<(), Self::Error>;
+}
+
+/// A series of the table: its own topic, and the one of a standard message.
+struct Known<C> {
+    series: Series,
+    own: Option<C>,
+    /// Of readings of other kinds than the main one, as temperatures.
+    others: BTreeMap<&'static str, Option<C>>,
+    standard: Option<C>,
+    /// The newest state of a joint.
+    state: JointState,
+}
+
+/// The topics of everything that is not a series, as they come to be needed.
+struct Topics<C> {
+    known: BTreeMap<String, Option<C>>,
+}
+
+impl<C: Clone> Topics<C> {
+    fn get<S: Sink<Channel = C>>(
+        &mut self,
+        sink: &mut S,
+        topic: String,
+        definition: fn() -> Definition,
+    ) -> Result<Option<C>, S::Error> {
+        if let Some(known) = self.known.get(&topic) {
+            return Ok(known.clone());
+        }
+        let added = sink.add(&topic, &definition(), None)?;
+        self.known.insert(topic, added.clone());
+        Ok(added)
+    }
+}
+
+/// Says what a robot sends.
+pub struct Messages<S: Sink> {
+    sink: S,
+    robot: String,
+    /// The wall clock minus CLOCK_MONOTONIC.
+    offset: Nanos,
+    known: Vec<Known<S::Channel>>,
+    topics: Topics<S::Channel>,
+    gateway: Option<Box<GatewayHealth>>,
+    estimator: Option<Box<EstimatorHealth>>,
+}
+
+impl<S: Sink> Messages<S> {
+    /// For this robot; `offset` is the wall clock minus CLOCK_MONOTONIC.
+    pub fn new(sink: S, robot: &str, offset: Nanos) -> Self {
+        Self {
+            sink,
+            robot: robot.to_owned(),
+            offset,
+            known: Vec::new(),
+            topics: Topics {
+                known: BTreeMap::new(),
+            },
+            gateway: None,
+            estimator: None,
+        }
+    }
+
+    /// Where they go.
+    pub const fn sink(&mut self) -> &mut S {
+        &mut self.sink
+    }
+
+    /// Where they went.
+    pub fn into_sink(self) -> S {
+        self.sink
+    }
+
+    /// Follows the wall clock when it is set.
+    pub const fn set_offset(&mut self, offset: Nanos) {
+        self.offset = offset;
+    }
+
+    /// The wall clock's time of an instant \[ns since 1970, UTC\].
+    #[must_use]
+    pub fn wall(&self, t: Nanos) -> u64 {
+        u64::try_from(t.saturating_add(self.offset).0).unwrap_or(0)
+    }
+
+    /// Adds the topics of the series that are new in `series`; the others are as before.
+    ///
+    /// # Errors
+    /// Those of the sink.
+    pub fn know(&mut self, series: &[Series]) -> Result<(), S::Error> {
+        for (number, one) in series.iter().enumerate().skip(self.known.len()) {
+            let name = &one.name;
+            let (topic, definition, standard) = match one.what {
+                What::Channel(kind) => (
+                    format!("/samples/{kind}/{name}"),
+                    definitions::sample(kind),
+                    match kind {
+                        Kind::Wrench => {
+                            Some((format!("/ft/{name}"), definitions::wrench_stamped()))
+                        }
+                        Kind::Imu => Some((format!("/imu/{name}"), definitions::imu())),
+                        _ => None,
+                    },
+                ),
+                What::Contact => (format!("/declared/{name}"), definitions::declared(), None),
+            };
+            let own = self.sink.add(&topic, &definition, Some(number))?;
+            let standard = match standard {
+                Some((topic, definition)) => self.sink.add(&topic, &definition, None)?,
+                None => None,
+            };
+            self.known.push(Known {
+                series: one.clone(),
+                own,
+                others: BTreeMap::new(),
+                standard,
+                state: JointState::ABSENT,
+            });
+        }
+        Ok(())
+    }
+
+    /// Adds the topics of torques, joint states and contacts, which else come to be with the first
+    /// message: for those who look what there is.
+    ///
+    /// # Errors
+    /// Those of the sink.
+    pub fn announce(&mut self) -> Result<(), S::Error> {
+        self.topic("/torques", definitions::torques)?;
+        self.topic("/joint_states", definitions::joint_state)?;
+        self.topic("/contacts", definitions::contacts)?;
+        self.topic("/diagnostics", definitions::diagnostics)?;
+        Ok(())
+    }
+
+    fn topic(
+        &mut self,
+        topic: &str,
+        definition: fn() -> Definition,
+    ) -> Result<Option<S::Channel>, S::Error> {
+        self.topics
+            .get(&mut self.sink, topic.to_owned(), definition)
+    }
+
+    /// A message of a standard or own type on any topic, at `t`; `message` is given the wall
+    /// clock's time.
+    ///
+    /// # Errors
+    /// Those of the sink.
+    pub fn send(
+        &mut self,
+        topic: &str,
+        definition: fn() -> Definition,
+        t: Nanos,
+        message: impl FnOnce(u64) -> Message,
+    ) -> Result<(), S::Error> {
+        let wall = self.wall(t);
+        match self.topic(topic, definition)? {
+            Some(channel) => self.sink.send(&channel, wall, &message(wall)),
+            None => Ok(()),
+        }
+    }
+
+    /// What was heard, at `t`.
+    ///
+    /// # Errors
+    /// Those of the sink.
+    pub fn say(&mut self, t: Nanos, heard: &Heard) -> Result<(), S::Error> {
+        match heard {
+            Heard::Value(series, value) => self.value(t, *series, value),
+            Heard::Torques(torques, names) => self.torques(names, torques),
+            Heard::Contacts(contacts, names) => self.contacts(names, contacts),
+            Heard::Gateway(health) => {
+                self.gateway = Some(health.clone());
+                Ok(())
+            }
+            Heard::Estimator(health) => {
+                self.estimator = Some(health.clone());
+                Ok(())
+            }
+        }
+    }
+
+    /// A value of the series with this number, at `t`.
+    ///
+    /// # Errors
+    /// Those of the sink.
+    pub fn value(&mut self, t: Nanos, series: usize, value: &Value) -> Result<(), S::Error> {
+        let wall = self.wall(t);
+        let (sink, Some(known)) = (&mut self.sink, self.known.get_mut(series)) else {
+            return Ok(());
+        };
+        match (known.series.what, value) {
+            (What::Channel(main), Value::Reading(reading, quality)) => {
+                let kind = reading.kind();
+                let name = known.series.name.as_str();
+                let own = match known.others.get(kind.word()) {
+                    _ if kind == main => known.own.clone(),
+                    Some(other) => other.clone(),
+                    None => {
+                        let topic = format!("/samples/{kind}/{name}");
+                        let other = sink.add(&topic, &definitions::sample(kind), Some(series))?;
+                        known.others.insert(kind.word(), other.clone());
+                        other
+                    }
+                };
+                if let Some(own) = own {
+                    sink.send(&own, wall, &sample(t, reading, *quality))?;
+                }
+                match (reading, &known.standard) {
+                    (Reading::Joint(state), _) => {
+                        known.state = *state;
+                        Ok(())
+                    }
+                    (Reading::Wrench(wrench), Some(channel)) => {
+                        sink.send(channel, wall, &wrench_stamped(wall, name, wrench))
+                    }
+                    (Reading::Imu(reading), Some(channel)) => {
+                        sink.send(channel, wall, &imu(wall, name, reading))
+                    }
+                    _ => Ok(()),
+                }
+            }
+            (What::Contact, Value::Contact(state)) => match &known.own {
+                Some(own) => sink.send(own, wall, &declared(t, state)),
+                None => Ok(()),
+            },
+            _ => Ok(()),
+        }
+    }
+
+    /// The torques of an instant, of the estimator that sent `names`.
+    ///
+    /// # Errors
+    /// Those of the sink.
+    pub fn torques(
+        &mut self,
+        names: &Description,
+        estimate: &TorqueEstimate,
+    ) -> Result<(), S::Error> {
+        let t = estimate.header.acquired;
+        let name =
+            |role, number| (names.find(role, number)).map_or("", |entry| entry.name.as_str());
+        let joints: Vec<(&str, &JointTorque)> = (estimate.joints().iter().zip(0..))
+            .map(|(joint, number)| (name(Role::Joint, number), joint))
+            .collect();
+        self.send("/torques", definitions::torques, t, |_| {
+            let mut message = Message::new();
+            message.i64(t.0);
+            message.count(joints.len());
+            joints.iter().for_each(|(name, _)| message.text(name));
+            message.count(joints.len());
+            (joints.iter()).for_each(|(_, joint)| message.f64s(&[joint.torque]));
+            message.count(joints.len());
+            (joints.iter()).for_each(|(_, joint)| message.f64s(&[joint.standard_deviation]));
+            message.count(joints.len());
+            (joints.iter()).for_each(|(_, joint)| message.bool(joint.valid == 1));
+            message.count(joints.len());
+            for (_, joint) in &joints {
+                message.text(joint.reason.get().map_or("?", |reason| reason.word()));
+            }
+            message.count(joints.len());
+            (joints.iter()).for_each(|(_, joint)| message.text(name(Role::Channel, joint.cause)));
+            message
+        })?;
+        let states: Vec<JointState> = joints.iter().map(|(name, _)| self.state(name)).collect();
+        self.send("/joint_states", definitions::joint_state, t, |wall| {
+            let mut message = Message::stamped(wall, "");
+            message.count(joints.len());
+            joints.iter().for_each(|(name, _)| message.text(name));
+            message.count(states.len());
+            (states.iter()).for_each(|state| message.f64s(&[state.position]));
+            message.count(states.len());
+            (states.iter()).for_each(|state| message.f64s(&[state.velocity]));
+            message.count(joints.len());
+            for (_, joint) in &joints {
+                let is_valid = joint.valid == 1;
+                message.f64s(&[if is_valid { joint.torque } else { f64::NAN }]);
+            }
+            message
+        })
+    }
+
+    /// The newest state of a joint; NaN before the first.
+    #[must_use]
+    pub fn state(&self, joint: &str) -> JointState {
+        let is_joint = |known: &&Known<S::Channel>| {
+            known.series.what == What::Channel(Kind::Joint) && known.series.name == joint
+        };
+        let known = self.known.iter().find(is_joint);
+        known.map_or(JointState::ABSENT, |known| known.state)
+    }
+
+    /// The contact wrenches of an instant, of the estimator that sent `names`.
+    ///
+    /// # Errors
+    /// Those of the sink.
+    pub fn contacts(
+        &mut self,
+        names: &Description,
+        estimate: &ContactEstimate,
+    ) -> Result<(), S::Error> {
+        let t = estimate.header.acquired;
+        let entry = |number| names.find(Role::Contact, number);
+        self.send("/contacts", definitions::contacts, t, |_| {
+            let mut message = Message::new();
+            message.i64(t.0);
+            message.count(estimate.contacts().len());
+            for (contact, number) in estimate.contacts().iter().zip(0..) {
+                message.text(entry(number).map_or("", |entry| entry.name.as_str()));
+                message.text(entry(number).map_or("", |entry| entry.frame.as_str()));
+                message.f64s(&contact.force);
+                message.f64s(&contact.torque);
+                message.f64s(&contact.standard_deviation);
+                message.bool(contact.valid == 1);
+                message.text(contact.reason.get().map_or("?", |reason| reason.word()));
+                let cause = names.find(Role::Channel, contact.cause);
+                message.text(cause.map_or("", |entry| entry.name.as_str()));
+                message.bool(contact.detected == 1);
+                message.bool(contact.located == 1);
+                message.f64s(&contact.position);
+            }
+            message
+        })?;
+        for (contact, number) in estimate.contacts().iter().zip(0..) {
+            let Some(entry) = entry(number).filter(|_| contact.valid == 1) else {
+                continue;
+            };
+            let wrench = Wrench {
+                force: contact.force,
+                torque: contact.torque,
+            };
+            let topic = format!("/contact/{}", entry.name.as_str());
+            self.send(&topic, definitions::wrench_stamped, t, |wall| {
+                wrench_stamped(wall, entry.frame.as_str(), &wrench)
+            })?;
+        }
+        Ok(())
+    }
+
+    /// How gateway and estimator are at `now`, of what was heard of them last.
+    ///
+    /// # Errors
+    /// Those of the sink.
+    pub fn diagnostics(&mut self, now: Nanos) -> Result<(), S::Error> {
+        let all = diagnostics::of(
+            &self.robot,
+            self.gateway.as_deref(),
+            self.estimator.as_deref(),
+            now,
+        );
+        let robot = self.robot.clone();
+        self.send("/diagnostics", definitions::diagnostics, now, |wall| {
+            diagnostics::message(wall, &robot, &all)
+        })
+    }
+}
+
+fn sample(t: Nanos, reading: &Reading, quality: Quality) -> Message {
+    let mut message = Message::new();
+    message.i64(t.0);
+    message.u32(quality.0);
+    let count = reading.kind().fields().len();
+    message.f64s(reading.values().get(..count).unwrap_or_default());
+    message
+}
+
+fn declared(t: Nanos, state: &ContactState) -> Message {
+    let mut message = Message::new();
+    message.i64(t.0);
+    message.bool(state.active);
+    message.f64s(&state.position);
+    message.f64s(&[state.position_std]);
+    message.f64s(&state.direction);
+    message
+}
+
+fn wrench_stamped(wall: u64, frame: &str, wrench: &Wrench) -> Message {
+    let mut message = Message::stamped(wall, frame);
+    message.f64s(&wrench.force);
+    message.f64s(&wrench.torque);
+    message
+}
+
+fn imu(wall: u64, frame: &str, imu: &Imu) -> Message {
+    let mut message = Message::stamped(wall, frame);
+    let [w, x, y, z] = imu.orientation;
+    // Of a covariance, -1 first says that there is no value, 0 that the covariance is not known.
+    let is_known = !w.is_nan();
+    message.f64s(&if is_known {
+        [x, y, z, w]
+    } else {
+        [0.0, 0.0, 0.0, 1.0]
+    });
+    let first = if is_known { 0.0 } else { -1.0 };
+    let covariance = [first, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+    message.f64s(&covariance);
+    message.f64s(&imu.angular_velocity);
+    message.f64s(&[0.0; 9]);
+    message.f64s(&imu.proper_acceleration);
+    message.f64s(&[0.0; 9]);
+    message
+}

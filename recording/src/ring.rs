@@ -1,0 +1,111 @@
+//! The last seconds of a recording, in memory: a black box.
+//!
+//! The memory holds compressed parts, each a whole recording of an eighth of the time. A snapshot
+//! copies their messages into one file.
+
+use crate::write::{About, Recorder, WriteError};
+use mcap::MessageStream;
+use proprio_topics::Nanos;
+use proprio_topics::csv::Series;
+use std::collections::VecDeque;
+use std::io::{Cursor, Seek, Write};
+
+/// So many parts make up the time.
+const PARTS: i64 = 8;
+
+/// The last seconds.
+pub struct Ring {
+    about: About,
+    duration: Nanos,
+    /// Each with its end.
+    parts: VecDeque<(Nanos, Vec<u8>)>,
+    newest: Recorder<Cursor<Vec<u8>>>,
+    /// When the newest part began, and the newest instant in it.
+    began: Option<Nanos>,
+    last: Nanos,
+}
+
+impl Ring {
+    /// Holds at least the last `duration`. `series` as in [`Recorder::new`].
+    ///
+    /// # Errors
+    /// A part cannot be begun.
+    pub fn new(about: About, series: &[Series], duration: Nanos) -> Result<Self, WriteError> {
+        let newest = Self::begin(&about, series)?;
+        Ok(Self {
+            about,
+            duration,
+            parts: VecDeque::new(),
+            newest,
+            began: None,
+            last: Nanos::MIN,
+        })
+    }
+
+    fn begin(about: &About, series: &[Series]) -> Result<Recorder<Cursor<Vec<u8>>>, WriteError> {
+        // The files are needed in a snapshot alone.
+        let about = About {
+            files: Vec::new(),
+            ..about.clone()
+        };
+        Recorder::new(Cursor::new(Vec::new()), &about, series)
+    }
+
+    /// The recorder of the present part, for something of the instant `t`; `series` are all that
+    /// are known.
+    ///
+    /// # Errors
+    /// A part cannot be ended or begun.
+    pub fn at(
+        &mut self,
+        t: Nanos,
+        series: &[Series],
+    ) -> Result<&mut Recorder<Cursor<Vec<u8>>>, WriteError> {
+        let began = *self.began.get_or_insert(t);
+        if t.saturating_sub(began).0 >= self.duration.0 / PARTS {
+            self.turn(series)?;
+            self.began = Some(t);
+        }
+        self.last = self.last.max(t);
+        Ok(&mut self.newest)
+    }
+
+    /// Ends the newest part, and forgets those that are too old.
+    fn turn(&mut self, series: &[Series]) -> Result<(), WriteError> {
+        let ended = std::mem::replace(&mut self.newest, Self::begin(&self.about, series)?);
+        let ended = ended.finish()?.into_inner();
+        self.parts.push_back((self.last, ended));
+        self.began = None;
+        let from = self.last.saturating_sub(self.duration);
+        while self.parts.front().is_some_and(|(end, _)| *end < from) {
+            self.parts.pop_front();
+        }
+        Ok(())
+    }
+
+    /// The memory that the parts take \[bytes\], without the newest.
+    #[must_use]
+    pub fn memory(&self) -> usize {
+        self.parts.iter().map(|(_, part)| part.len()).sum()
+    }
+
+    /// Writes what is held as one recording, with its files.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn snapshot<W: Write + Seek>(
+        &mut self,
+        output: W,
+        series: &[Series],
+    ) -> Result<W, WriteError> {
+        self.turn(series)?;
+        // All channels come first: a table's columns are known before its first row.
+        let mut recorder = Recorder::new(output, &self.about, series)?;
+        for (_, part) in &self.parts {
+            for message in MessageStream::new(part).map_err(WriteError::from)? {
+                recorder.copy(&message.map_err(WriteError::from)?)?;
+            }
+        }
+        recorder.finish()
+    }
+}
