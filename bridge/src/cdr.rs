@@ -138,6 +138,11 @@ impl<'a> Parsed<'a> {
         std::str::from_utf8(bytes).ok()
     }
 
+    /// A sequence, of elements that `element` reads. `None` where the message ends before.
+    pub fn list<T>(&mut self, element: impl Fn(&mut Self) -> Option<T>) -> Option<Vec<T>> {
+        (0..self.u32()?).map(|_| element(self)).collect()
+    }
+
     /// So many bytes. `None` where the message ends before.
     pub fn bytes(&mut self, count: usize) -> Option<&'a [u8]> {
         let bytes = self.body.get(self.place..)?.get(..count)?;

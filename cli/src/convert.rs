@@ -4,6 +4,7 @@ use crate::identify::advice::sentence;
 use crate::identify::summary;
 use crate::samples;
 use anyhow::{Context, bail};
+use clap::error::ErrorKind;
 use proprio_estimator::assessment::{Assessment, Assessor, Coverage};
 use proprio_estimator::config::ConfigError;
 use proprio_estimator::reading::{self, ReadingError};
@@ -89,9 +90,9 @@ pub(crate) struct Encode {
 /// `proprio estimate`.
 #[derive(clap::Args)]
 pub(crate) struct Estimate {
-    /// estimator.toml
+    /// estimator.toml; default: the one that a recording has taken along
     #[arg(long, value_name = "FILE")]
-    config: PathBuf,
+    config: Option<PathBuf>,
     /// Identified parameters and offsets (parameters.toml) to use instead of those of the URDF, of
     /// estimator.toml, and of the file that it names
     #[arg(long, value_name = "FILE")]
@@ -111,7 +112,7 @@ pub(crate) struct Estimate {
     json: bool,
 }
 
-fn input(path: &Path) -> anyhow::Result<Box<dyn Read + Send>> {
+pub(crate) fn input(path: &Path) -> anyhow::Result<Box<dyn Read + Send>> {
     if path == Path::new("-") {
         return Ok(Box::new(std::io::stdin()));
     }
@@ -130,7 +131,7 @@ fn input(path: &Path) -> anyhow::Result<Box<dyn Read + Send>> {
 
 /// The output file of a conversion. It is renamed to its final name when complete: an error leaves
 /// no partial table, and a file that is both input and output is not destroyed before it is read.
-struct Output {
+pub(crate) struct Output {
     writer: Option<BufWriter<Marked>>,
     new: Option<(tempfile::NamedTempFile, PathBuf)>,
 }
@@ -148,7 +149,7 @@ impl std::fmt::Display for Unwritable {
 impl std::error::Error for Unwritable {}
 
 /// Records errors of the output.
-struct Marked(Box<dyn Write>);
+pub(crate) struct Marked(Box<dyn Write>);
 
 impl Write for Marked {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
@@ -179,7 +180,7 @@ fn with_file(error: offline::OfflineError, input: &Path, output: &Path) -> anyho
 }
 
 impl Output {
-    fn new(path: &Path) -> anyhow::Result<Self> {
+    pub(crate) fn new(path: &Path) -> anyhow::Result<Self> {
         let special = std::fs::metadata(path).is_ok_and(|m| !m.is_file());
         let unwritable = || format!("{}: cannot be written", path.display());
         let (writer, new): (Box<dyn Write>, _) = if path == Path::new("-") {
@@ -198,7 +199,7 @@ impl Output {
         })
     }
 
-    fn writer(&mut self) -> &mut BufWriter<Marked> {
+    pub(crate) fn writer(&mut self) -> &mut BufWriter<Marked> {
         #[allow(
             clippy::expect_used,
             reason = "taken only by finish, which consumes self"
@@ -208,7 +209,7 @@ impl Output {
             .expect("an output that is not finished has a writer")
     }
 
-    fn finish(mut self) -> anyhow::Result<()> {
+    pub(crate) fn finish(mut self) -> anyhow::Result<()> {
         if let Some(mut writer) = self.writer.take() {
             writer.flush().context("cannot be written")?;
         }
@@ -245,7 +246,9 @@ fn report_table(log: &Path, report: &Report) {
 /// Decodes a log.
 pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
     let plan = Plan::load(&args.config)?;
-    let log = BufReader::with_capacity(1 << 18, input(&args.log)?);
+    let log = samples::log(input(&args.log)?, &args.log)
+        .with_context(|| args.log.display().to_string())?;
+    let log = BufReader::with_capacity(1 << 18, log);
     let mut out = Output::new(&args.out)?;
     let columns = if args.all {
         Columns::All
@@ -431,21 +434,37 @@ fn unfit(config: &Path, log: &Path, error: &dyn std::error::Error) -> ConfigErro
 
 /// Estimates from a table.
 pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
-    let (_, setup) = proprio_estimator::daemon::load(&args.config, |config| {
+    let folder = match args.config.is_none() && is_file(&args.samples) {
+        true => samples::files_in(&args.samples)?,
+        false => None,
+    };
+    let taken_along = folder
+        .as_ref()
+        .map(|folder| folder.path().join("estimator.toml"));
+    let taken_along = taken_along.filter(|config| config.is_file());
+    let Some(config) = args.config.as_ref().or(taken_along.as_ref()) else {
+        let text = "give --config estimator.toml: only a recording made with `record --config` \
+                    has its own\n";
+        clap::Error::raw(ErrorKind::MissingRequiredArgument, text).exit();
+    };
+    let (_, setup) = proprio_estimator::daemon::load(config, |config| {
         // The command line overrides the configuration.
         if let Some(parameters) = &args.parameters {
             config.parameters = Some(parameters.clone());
         }
     })?;
     warn_of_implausible(args, &setup);
-    let mut assessor = args.assess.then(|| assessor(args, &setup)).transpose()?;
+    let mut assessor = args
+        .assess
+        .then(|| assessor(args, config, &setup))
+        .transpose()?;
     let log = samples::table(input(&args.samples)?, &args.samples)?;
     let mut out = Output::new(&args.out)?;
     let report = estimates::estimate(setup, log, out.writer(), assessor.as_mut());
     let report = match report {
         Ok(report) => report,
         Err(error @ estimates::OfflineError::MissingChannels(_)) => {
-            return Err(unfit(&args.config, &args.samples, &error).into());
+            return Err(unfit(config, &args.samples, &error).into());
         }
         Err(estimates::OfflineError::Write(error)) => {
             bail!("{}: cannot be written: {error}", args.out.display())
@@ -461,7 +480,7 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
         eprintln!(
             "{}: not in {}: {}",
             args.samples.display(),
-            args.config.display(),
+            config.display(),
             report.unused_channels.join(", ")
         );
     }
@@ -489,7 +508,7 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
             "{}: from {t} s on the readings contradict {}: more likely, {likelier}; torques that \
              depend on it are withheld",
             args.samples.display(),
-            args.config.display()
+            config.display()
         );
     }
     let withheld: u64 = report.withheld.values().sum();
@@ -562,7 +581,7 @@ fn warn_of_implausible(args: &Estimate, setup: &Setup) {
 }
 
 /// Reads the log once before the estimation.
-fn assessor(args: &Estimate, setup: &Setup) -> anyhow::Result<Assessor> {
+fn assessor(args: &Estimate, config: &Path, setup: &Setup) -> anyhow::Result<Assessor> {
     let log = samples::table(input(&args.samples)?, &args.samples)?;
     if !is_file(&args.samples) {
         bail!(
@@ -570,7 +589,7 @@ fn assessor(args: &Estimate, setup: &Setup) -> anyhow::Result<Assessor> {
         );
     }
     Assessor::new(setup, log).map_err(|error| match error {
-        ReadingError::MissingChannels(_) => unfit(&args.config, &args.samples, &error).into(),
+        ReadingError::MissingChannels(_) => unfit(config, &args.samples, &error).into(),
         error => anyhow::Error::from(error).context(args.samples.display().to_string()),
     })
 }

@@ -2,7 +2,7 @@
 
 use crate::status::load;
 use anyhow::{Context, anyhow, bail};
-use proprio_gateway::control::{ask, gateways};
+use proprio_gateway::control::{Server, ask, running};
 use proprio_gateway::plan::ConfigError;
 use proprio_topics::ipc::DomainConfig;
 use serde_json::{Value as Json, json};
@@ -50,19 +50,32 @@ enum Verb {
     /// joints; the other devices do not notice. If anything else has changed, nothing is taken
     /// over, and the message names what needs a restart of the gateway.
     Reload,
+    /// Have a black box (`proprio record --ring`) write the last seconds to a file
+    Snapshot,
 }
 
-/// Asks the gateway.
+impl Verb {
+    const fn server(&self) -> Server {
+        match self {
+            Self::Snapshot => Server::Recorder,
+            _ => Server::Gateway,
+        }
+    }
+}
+
+/// Asks the gateway, or a recorder.
 pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
-    let robot = robot(args.robot.as_deref(), domain)?;
+    let server = args.verb.server();
+    let robot = robot(args.robot.as_deref(), domain, server)?;
     let line = match &args.verb {
         Verb::Status => json!({ "do": "status" }),
         Verb::Devices => json!({ "do": "devices" }),
         Verb::Tare { device } => json!({ "do": "tare", "device": device }),
         Verb::Calibration { device } => json!({ "do": "calibration", "device": device }),
         Verb::Reload => json!({ "do": "reload" }),
+        Verb::Snapshot => json!({ "do": "snapshot" }),
     };
-    let text = ask(domain, &robot, &line.to_string())
+    let text = ask(domain, server, &robot, &line.to_string())
         .map_err(|error| match error.kind() {
             io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut => {
                 anyhow!("no answer within 5 s: `proprio status` shows whether it is stuck")
@@ -70,7 +83,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
             io::ErrorKind::UnexpectedEof => anyhow!("it has ended meanwhile"),
             _ => anyhow!(error),
         })
-        .with_context(|| format!("the gateway of {robot} does not answer"))?;
+        .with_context(|| format!("the {} of {robot} does not answer", server.word()))?;
     let answer: Json = serde_json::from_str(&text).context("the answer is not JSON")?;
     if args.json {
         print_line!("{text}");
@@ -93,6 +106,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
             Verb::Tare { .. } => tared(&answer),
             Verb::Calibration { .. } => calibration(&answer),
             Verb::Reload => reloaded(&answer),
+            Verb::Snapshot => print_line!("{} is written", word(&answer, "file")),
         }
     }
     let problems: Vec<_> = list(&answer, "problems")
@@ -109,12 +123,19 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The robot to ask: the named one, or the only one whose gateway runs.
-fn robot(name: Option<&str>, domain: &DomainConfig) -> anyhow::Result<String> {
+/// The robot to ask: the named one, or the only one whose server runs.
+fn robot(name: Option<&str>, domain: &DomainConfig, server: Server) -> anyhow::Result<String> {
     let which = format!("domain {} in {}", domain.name, domain.base.display());
-    let running = gateways(domain).map_err(|error| match error.kind() {
+    let (what, start) = match server {
+        Server::Gateway => ("gateway", "proprio gateway --config FILE"),
+        Server::Recorder => (
+            "recorder with --ring",
+            "proprio record --ring SECONDS --out FOLDER",
+        ),
+    };
+    let running = running(domain, server).map_err(|error| match error.kind() {
         io::ErrorKind::PermissionDenied => anyhow!(
-            "the {which} belongs to another user: run this as the user of the gateway, for example \
+            "the {which} belongs to another user: run this as the user of the {what}, for example \
              `sudo -u proprio proprio ctl ...`"
         ),
         _ => anyhow!(error).context(format!("the {which} cannot be read")),
@@ -128,17 +149,14 @@ fn robot(name: Option<&str>, domain: &DomainConfig) -> anyhow::Result<String> {
                 true => format!("; the domains here are {}", others.join(", ")),
                 false => String::new(),
             };
-            bail!(
-                "no gateway runs in the {which}; start one with `proprio gateway --config \
-                 FILE`{others}"
-            )
+            bail!("no {what} runs in the {which}; start one with `{start}`{others}")
         }
         (Some(name), _) => bail!(
-            "no gateway of robot {name:?} runs in the {which}; there is {}",
+            "no {what} of robot {name:?} runs in the {which}; there is {}",
             running.join(", ")
         ),
         (None, _) => bail!(
-            "several gateways run: name a robot with --robot: {}",
+            "several run: name a robot with --robot: {}",
             running.join(", ")
         ),
     }

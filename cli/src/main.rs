@@ -20,6 +20,7 @@ mod scan;
 mod setup;
 mod simulate;
 mod status;
+mod table;
 
 use clap::{Parser, Subcommand};
 use proprio_topics::ipc::DomainConfig;
@@ -59,6 +60,8 @@ enum Verb {
     Decode(convert::Decode),
     /// Convert a table of samples to a CAN log: the inverse of decode
     Encode(convert::Encode),
+    /// Convert a recording (MCAP) to a table of its samples or estimates
+    Table(table::Args),
     /// Estimate joint torques and contact wrenches from a table of samples
     Estimate(convert::Estimate),
     /// Identify inertial parameters from recorded tables of samples and write a report
@@ -67,7 +70,7 @@ enum Verb {
     Status(status::Status),
     /// Print the samples of a channel, the torques or the contacts as they come
     Echo(echo::Echo),
-    /// Record samples and declared contacts into the table that `identify` reads
+    /// Record what a robot measures and feels: a table, a recording for viewers, or a black box
     Record(record::Record),
     /// Ask a running gateway: its state, its devices, a tare, a changed configuration
     Ctl(ctl::Args),
@@ -90,6 +93,8 @@ struct Daemon {
 fn main() -> ExitCode {
     let args = Args::parse();
     let is_journal = proprio_gateway::daemon::start_logging();
+    // Recordings: what reads logs reads their frames.
+    proprio_gateway::log::convert_with(samples::log_of_file);
     let mut domain = DomainConfig::from_env();
     if let Some(name) = args.domain {
         domain.name = name;
@@ -103,6 +108,7 @@ fn main() -> ExitCode {
         Verb::Setup(args) => setup::run(&args, &domain),
         Verb::Decode(args) => convert::decode(&args),
         Verb::Encode(args) => convert::encode(&args),
+        Verb::Table(args) => table::run(&args),
         Verb::Estimate(args) => convert::estimate(&args),
         Verb::Identify(args) => identify::run(&args),
         Verb::Status(args) => status::run(&args, &domain),

@@ -1,23 +1,31 @@
 //! `proprio record`: what a running robot measures and feels, as the table that `identify` reads or
 //! as a recording (MCAP) that viewers read, too.
 
+mod black_box;
+mod files;
+mod frames;
 mod gaps;
 mod output;
 
 use crate::running::interrupted;
-use anyhow::{Context, bail};
+use anyhow::bail;
+use black_box::BlackBox;
+use frames::Frames;
 use gaps::Gaps;
-use output::Output;
+use output::{Output, Split, create};
 use proprio_bridge::{Event, Heard, Listener};
+use proprio_drivers::Frame;
+use proprio_gateway::clock::realtime_offset;
 use proprio_gateway::offline::InOrder;
+use proprio_recording::About;
 use proprio_topics::Nanos;
-use proprio_topics::csv::{Columns, Value};
+use proprio_topics::csv::{Columns, Series, Value};
 use proprio_topics::ipc::{DomainConfig, monotonic};
-use std::fs::File;
-use std::io::ErrorKind;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
 
+/// This program, with its version.
+const PROGRAM: &str = concat!("proprio ", env!("CARGO_PKG_VERSION"));
 /// How late a sample is still sorted into its place in a recording: a gateway that starts publishes
 /// the frames that arrived meanwhile.
 const REORDER: Nanos = Nanos::from_millis(2000);
@@ -28,7 +36,8 @@ const FLUSH: Nanos = Nanos::from_millis(500);
 #[derive(clap::Args)]
 pub(crate) struct Record {
     /// The table of samples: a new file. One that ends with .mcap is a recording of samples,
-    /// torques, contacts and health, which Foxglove, PlotJuggler and `identify` read
+    /// torques, contacts and health, which Foxglove, PlotJuggler and `identify` read. With --ring,
+    /// a folder
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Overwrite the file if it exists
@@ -44,23 +53,76 @@ pub(crate) struct Record {
     /// estimator reads
     #[arg(long)]
     all: bool,
+    /// Record the raw frames of this bus, too: can0 or virtual:NAME. Can be given several times
+    #[arg(long, value_name = "BUS")]
+    frames: Vec<String>,
+    /// Take along this configuration (estimator.toml, gateway.toml) with the files that it names.
+    /// Can be given several times. `estimate` then needs the recording alone
+    #[arg(long, value_name = "FILE")]
+    config: Vec<PathBuf>,
+    /// Begin a new file after so many seconds: FILE_0001.mcap, FILE_0002.mcap, ...
+    #[arg(long, value_name = "SECONDS", conflicts_with = "ring")]
+    split: Option<f64>,
+    /// Be a black box: hold the last seconds in memory, and write them to a new file in the folder
+    /// --out when a torque that was valid is withheld, a device or sensor reports a fault, a bus is
+    /// lost, or `proprio ctl snapshot` asks for it
+    #[arg(long, value_name = "SECONDS", conflicts_with_all = ["all", "force"])]
+    ring: Option<f64>,
 }
 
-/// Creates the file of a recording. An existing one is overwritten only if that is asked for; what
-/// is no file, such as a pipe, has nothing to lose.
-fn create(path: &Path, force: bool) -> anyhow::Result<File> {
-    let special = std::fs::metadata(path).is_ok_and(|m| !m.is_file());
-    let created = match force || special {
-        true => File::create(path),
-        false => File::create_new(path),
-    };
-    match created {
-        Err(error) if error.kind() == ErrorKind::AlreadyExists => bail!(
-            "{} exists: name another file, or overwrite it with --force",
-            path.display()
-        ),
-        created => created.with_context(|| path.display().to_string()),
+impl Record {
+    /// What is written; `series` are the channels and contacts that are there.
+    fn output(
+        &self,
+        robot: &str,
+        series: &[Series],
+        config: &DomainConfig,
+        now: Nanos,
+    ) -> anyhow::Result<Output> {
+        let is_table = self.out.extension().is_none_or(|it| it != "mcap");
+        if self.ring.is_none() && is_table {
+            if !self.frames.is_empty() || !self.config.is_empty() || self.split.is_some() {
+                bail!("--frames, --config and --split need a recording: --out FILE.mcap");
+            }
+            let columns = match self.all {
+                true => Columns::All,
+                false => Columns::Main,
+            };
+            let file = create(&self.out, self.force)?;
+            return Ok(Output::table(file, series, columns)?);
+        }
+        let about = About {
+            robot: robot.to_owned(),
+            program: PROGRAM.to_owned(),
+            offset: realtime_offset(),
+            files: files::of(&self.config)?,
+        };
+        let span = |seconds: f64| match seconds > 0.0 && seconds < 1e6 {
+            true => Ok(Nanos::from_seconds(seconds)),
+            false => bail!("{seconds} s: more than 0 and less than 1e6 s are possible"),
+        };
+        match (self.ring, self.split) {
+            (Some(seconds), _) => Ok(Output::BlackBox(Box::new(BlackBox::new(
+                about,
+                series,
+                span(seconds)?,
+                &self.out,
+                config,
+            )?))),
+            (None, Some(seconds)) => {
+                let split = Split::new(&self.out, self.force, span(seconds)?);
+                Output::split(split, about, series, now)
+            }
+            (None, None) => Output::recording(create(&self.out, self.force)?, about, series),
+        }
     }
+}
+
+/// What is recorded, in the order of time.
+enum Item {
+    Heard(Heard),
+    /// On the bus with this number.
+    Frame(usize, Frame),
 }
 
 /// What was recorded.
@@ -68,35 +130,43 @@ fn create(path: &Path, force: bool) -> anyhow::Result<File> {
 struct Counts {
     samples: u64,
     torques: u64,
+    frames: u64,
 }
 
 /// Records what a robot sends.
 pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
     let stop = interrupted()?;
+    // Before the listener's: they come first, and wait.
+    let frames = match args.frames.is_empty() {
+        true => None,
+        false => Some(Frames::open(&args.frames, config)?),
+    };
     let mut listener = Listener::open(config, args.robot.as_deref())?;
-    let columns = match args.all {
-        true => Columns::All,
-        false => Columns::Main,
-    };
-    let file = create(&args.out, args.force)?;
-    let mut gaps = Gaps::new(listener.description());
-    let is_recording = args.out.extension().is_some_and(|it| it == "mcap");
-    let series = listener.series().to_vec();
-    let mut out = match is_recording {
-        true => Output::recording(file, listener.robot(), &series)?,
-        false => Output::table(file, &series, columns)?,
-    };
-    let mut order = InOrder::<Heard>::new(REORDER);
-    let mut counts = Counts::default();
     let began = monotonic();
-    let end = args
-        .seconds
-        .map(|seconds| began + Nanos::from_seconds(seconds));
+    let mut out = args.output(listener.robot(), listener.series(), config, began)?;
+    let mut gaps = Gaps::new(listener.description());
+    let mut order = InOrder::<Item>::new(REORDER);
+    let mut counts = Counts::default();
+    let end = (args.seconds).map(|seconds| began + Nanos::from_seconds(seconds));
     let mut next_flush = began;
+    let buses = frames.as_ref().map_or(&[][..], |frames| &frames.buses);
+    let write = |t, item: &Item, series: &[Series], out: &mut Output| match item {
+        Item::Heard(heard) => out.push(t, heard, series),
+        Item::Frame(bus, frame) => {
+            let bus = buses.get(*bus).map_or("", String::as_str);
+            out.frame(bus, frame, series)
+        }
+    };
     while !stop.load(Relaxed) && end.is_none_or(|end| monotonic() < end) {
         let now = monotonic();
+        while let Some((bus, frame)) = frames.as_ref().and_then(Frames::next) {
+            counts.frames += 1;
+            let item = Item::Frame(bus, frame);
+            order.push(frame.t, item, |t, it| {
+                write(t, it, listener.series(), &mut out)
+            })?;
+        }
         listener.poll(now, |listener, event| -> anyhow::Result<()> {
-            out.know(listener.series())?;
             let Event {
                 mut t,
                 epoch,
@@ -112,17 +182,32 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
                 Heard::Torques(..) => counts.torques += 1,
                 _ => {}
             }
-            Ok(order.push(t, heard, |t, heard| out.push(t, heard))?)
+            let item = Item::Heard(heard);
+            Ok(order.push(t, item, |t, it| write(t, it, listener.series(), &mut out))?)
         })?;
+        let is_silent = gaps.wait(now);
+        if let Output::BlackBox(black_box) = &mut out {
+            if is_silent {
+                black_box.happened(now, "no_samples".to_owned());
+            }
+            if black_box.is_asked() {
+                order.finish(|t, it| write(t, it, listener.series(), &mut out))?;
+                next_flush = now;
+            }
+        }
         if now >= next_flush {
             next_flush = now + FLUSH;
-            out.flush(now)?;
+            out.flush(now, listener.series())?;
         }
-        gaps.wait(now);
         listener.wait((now + Nanos::from_millis(100)).min(end.unwrap_or(Nanos::MAX)));
     }
-    order.finish(|t, heard| out.push(t, heard))?;
+    order.finish(|t, it| write(t, it, listener.series(), &mut out))?;
     let without_column = out.without_column();
+    let is_table = matches!(out, Output::Table(_));
+    let black_box = match &out {
+        Output::BlackBox(it) => Some((it.written(), it.memory())),
+        _ => None,
+    };
     out.finish()?;
     print_line!(
         "{}: {} samples in {:.1} s, {} lost, {} out of order",
@@ -132,8 +217,15 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
         listener.lost(),
         order.out_of_order()
     );
-    if is_recording {
+    if !is_table {
         print_line!("{} estimates of torques", counts.torques);
+    }
+    if let Some(frames) = &frames {
+        print_line!("{} frames, {} lost", counts.frames, frames.lost());
+    }
+    if let Some((written, memory)) = black_box {
+        let memory = memory as f64 / 1e6;
+        print_line!("{written} files were written; the last seconds took {memory:.1} MB");
     }
     let without = gaps.summary(monotonic());
     if !without.is_empty() {

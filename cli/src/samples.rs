@@ -1,33 +1,80 @@
-//! Tables of samples: CSV, or recordings (MCAP), which become tables while they are read.
+//! Tables of samples and logs of frames, of which a recording (MCAP) has both: it becomes one or
+//! the other while it is read.
 
 use anyhow::Context;
-use proprio_recording::{ReadError, Summary, is_mcap, to_table};
-use std::io::{self, BufReader, Cursor, PipeReader, Read};
+use proprio_gateway::log::{Bytes, candump};
+use proprio_recording::{ReadError, Summary, about, frames, is_mcap, to_estimates, to_table};
+use std::fs::{self, File};
+use std::io::{self, BufReader, BufWriter, Cursor, PipeReader, PipeWriter, Read, Write as _};
 use std::path::Path;
 use std::thread::{self, JoinHandle};
+use tempfile::TempDir;
+
+/// What becomes of a recording.
+#[derive(Clone, Copy)]
+enum Into {
+    /// A table; `from_table`: what is one already stays as it is.
+    Table {
+        from_table: bool,
+    },
+    Estimates,
+    /// A log; what is no recording stays as it is.
+    Frames,
+}
+
+/// The table of a recording's samples, or of its estimates.
+pub(crate) fn of_recording(
+    input: impl Read + Send + 'static,
+    path: &Path,
+    estimates: bool,
+) -> anyhow::Result<Bytes> {
+    let what = match estimates {
+        true => Into::Estimates,
+        false => Into::Table { from_table: false },
+    };
+    convert(input, path, what).with_context(|| format!("{}: cannot be read", path.display()))
+}
 
 /// The table that `input` is, or has as a recording.
 pub(crate) fn table(
-    mut input: impl Read + Send + 'static,
+    input: impl Read + Send + 'static,
     path: &Path,
 ) -> anyhow::Result<Box<dyn Read + Send>> {
-    let cannot = || format!("{}: cannot be read", path.display());
+    convert(input, path, Into::Table { from_table: true })
+        .with_context(|| format!("{}: cannot be read", path.display()))
+}
+
+/// The log that `input` is, or has as a recording with raw frames.
+pub(crate) fn log(input: impl Read + Send + 'static, path: &Path) -> io::Result<Bytes> {
+    convert(input, path, Into::Frames)
+}
+
+/// The log in this file.
+pub(crate) fn log_of_file(file: File, path: &Path) -> io::Result<Bytes> {
+    log(file, path)
+}
+
+fn convert(mut input: impl Read + Send + 'static, path: &Path, what: Into) -> io::Result<Bytes> {
     let mut beginning = Vec::new();
-    input
-        .by_ref()
-        .take(8)
-        .read_to_end(&mut beginning)
-        .with_context(cannot)?;
+    input.by_ref().take(8).read_to_end(&mut beginning)?;
     let is_recording = is_mcap(&beginning);
     let whole = Cursor::new(beginning).chain(input);
-    if !is_recording {
-        return Ok(Box::new(whole));
+    match (is_recording, what) {
+        (true, _) => {}
+        (false, Into::Table { from_table: true } | Into::Frames) => return Ok(Box::new(whole)),
+        (false, _) => return Err(io::Error::other("it is no recording (MCAP)")),
     }
-    let (pipe, to) = io::pipe().with_context(cannot)?;
+    let (pipe, to) = io::pipe()?;
     let thread = thread::Builder::new()
         .name("recording".into())
-        .spawn(move || to_table(BufReader::new(whole), to))
-        .with_context(cannot)?;
+        .spawn(move || {
+            let whole = BufReader::new(whole);
+            match what {
+                Into::Table { .. } => to_table(whole, to),
+                Into::Estimates => to_estimates(whole, to),
+                Into::Frames => to_log(whole, to),
+            }
+        })?;
     Ok(Box::new(Converted {
         name: path.display().to_string(),
         pipe,
@@ -35,7 +82,14 @@ pub(crate) fn table(
     }))
 }
 
-/// A recording on its way to a table, in a thread of its own.
+fn to_log(recording: impl Read, to: PipeWriter) -> Result<Summary, ReadError> {
+    let mut log = candump::Writer::new(BufWriter::new(to));
+    let summary = frames(recording, |bus, frame| log.write(bus, frame))?;
+    log.finish()?.flush()?;
+    Ok(summary)
+}
+
+/// A recording on its way to a table or a log, in a thread of its own.
 struct Converted {
     name: String,
     pipe: PipeReader,
@@ -76,4 +130,40 @@ impl Read for Converted {
         }
         Ok(0)
     }
+}
+
+/// The files that a recording took along, in a folder of their own; `None` if it has none, or
+/// `path` is no recording.
+pub(crate) fn files_in(path: &Path) -> anyhow::Result<Option<TempDir>> {
+    let cannot = || format!("{}: cannot be read", path.display());
+    let mut beginning = Vec::new();
+    let file = File::open(path).with_context(cannot)?;
+    (&file)
+        .take(8)
+        .read_to_end(&mut beginning)
+        .with_context(cannot)?;
+    if !is_mcap(&beginning) {
+        return Ok(None);
+    }
+    let whole = Cursor::new(beginning).chain(BufReader::new(file));
+    let about = about(whole).with_context(cannot)?;
+    if about.files.is_empty() {
+        return Ok(None);
+    }
+    let folder = TempDir::with_prefix("proprio-")?;
+    for (name, bytes) in &about.files {
+        // A file of another program could name a place outside.
+        let name: &Path = name.as_ref();
+        if name
+            .components()
+            .all(|part| matches!(part, std::path::Component::Normal(_)))
+        {
+            let place = folder.path().join(name);
+            if let Some(parent) = place.parent() {
+                fs::create_dir_all(parent)?;
+            }
+            fs::write(&place, bytes).with_context(|| place.display().to_string())?;
+        }
+    }
+    Ok(Some(folder))
 }

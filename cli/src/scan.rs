@@ -17,8 +17,6 @@ use proprio_topics::Nanos;
 use proprio_topics::ipc::DomainConfig;
 use serde_json::{Value, json};
 use std::fmt::Write as _;
-use std::fs::File;
-use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 /// What a person must know before a scan.
@@ -140,7 +138,10 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
         }
         (None, Some(log)) => {
             let open = || -> std::io::Result<_> {
-                scan::log(BufReader::new(File::open(log)?), args.stamps.meaning())
+                scan::log(
+                    std::io::BufReader::new(proprio_gateway::log::open(log)?),
+                    args.stamps.meaning(),
+                )
             };
             let (found, told) = open().with_context(|| log.display().to_string())?;
             notes = told;

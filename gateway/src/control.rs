@@ -1,7 +1,8 @@
 //! The control socket: what an operator asks of a running gateway, and the answers.
 //!
 //! It is `<robot>.gateway.sock` in the folder of the domain, for the user of the gateway alone
-//! (mode 0600). A client sends one JSON object per line and gets one line for each:
+//! (mode 0600). A recorder has one likewise, `<robot>.recorder.sock`, for [`Recorder`]'s order. A
+//! client sends one JSON object per line and gets one line for each:
 //!
 //! | line | answer |
 //! |---|---|
@@ -38,12 +39,13 @@ use proprio_topics::ipc::DomainConfig;
 use serde::Deserialize;
 use serde_json::{Value as Json, json};
 use std::fs::{self, DirBuilder, File, Permissions};
-use std::io::{self, BufRead as _, BufReader, Write as _};
+use std::io::{self, BufRead as _, BufReader, Read as _, Write as _};
 use std::os::fd::AsRawFd as _;
 use std::os::unix::fs::{DirBuilderExt as _, PermissionsExt as _};
 use std::os::unix::net;
-use std::path::PathBuf;
-use std::sync::Arc;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, mpsc as std_mpsc};
+use std::thread;
 use std::time::Duration;
 use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::{Semaphore, mpsc, oneshot};
@@ -57,8 +59,25 @@ pub const MAX_LINE: usize = 4096;
 /// How long the gateway waits for a line, or for a client to take its answer.
 pub const PATIENCE: Duration = Duration::from_secs(10);
 
-/// The end of a socket's name, after the robot's.
-const SUFFIX: &str = ".gateway.sock";
+/// Who can be asked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Server {
+    /// The gateway of a robot.
+    Gateway,
+    /// A recorder that holds the last seconds in memory.
+    Recorder,
+}
+
+impl Server {
+    /// In the name of its socket, after the robot's.
+    #[must_use]
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Gateway => "gateway",
+            Self::Recorder => "recorder",
+        }
+    }
+}
 
 /// What is asked.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -133,23 +152,9 @@ impl Socket {
         robot: &str,
         orders: mpsc::Sender<Asked>,
     ) -> io::Result<Self> {
-        let folder = Folder::open(domain)?;
-        let (home, place) = (
-            folder.path(&format!("{robot}.gateway.new")),
-            folder.socket(robot),
-        );
-        match fs::remove_dir_all(&home) {
-            // A gateway that was killed while it did the same.
-            Ok(()) => {}
-            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-            Err(error) => return Err(error),
-        }
-        DirBuilder::new().mode(0o700).create(&home)?;
-        let new = home.join("socket");
-        let listener = UnixListener::bind(&new)?;
-        fs::set_permissions(&new, Permissions::from_mode(0o600))?;
-        fs::rename(&new, place)?;
-        fs::remove_dir(&home)?;
+        let (folder, listener) = bind(domain, Server::Gateway, robot)?;
+        listener.set_nonblocking(true)?;
+        let listener = UnixListener::from_std(listener)?;
         Ok(Self {
             folder,
             robot: robot.to_owned(),
@@ -161,7 +166,115 @@ impl Socket {
 impl Drop for Socket {
     fn drop(&mut self) {
         self.server.abort();
-        let _ = fs::remove_file(self.folder.socket(&self.robot));
+        let _ = fs::remove_file(self.folder.socket(Server::Gateway, &self.robot));
+    }
+}
+
+/// Makes a socket in the folder of the domain.
+fn bind(
+    domain: &DomainConfig,
+    server: Server,
+    robot: &str,
+) -> io::Result<(Folder, net::UnixListener)> {
+    let folder = Folder::open(domain)?;
+    let home = folder.path(&format!("{robot}.{}.new", server.word()));
+    match fs::remove_dir_all(&home) {
+        // A process that was killed while it did the same.
+        Ok(()) => {}
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+        Err(error) => return Err(error),
+    }
+    DirBuilder::new().mode(0o700).create(&home)?;
+    let new = home.join("socket");
+    let listener = net::UnixListener::bind(&new)?;
+    fs::set_permissions(&new, Permissions::from_mode(0o600))?;
+    fs::rename(&new, folder.socket(server, robot))?;
+    fs::remove_dir(&home)?;
+    Ok((folder, listener))
+}
+
+/// The socket of a recorder: hands on `{"do": "snapshot"}`, one client after the other.
+pub struct Recorder {
+    asked: std_mpsc::Receiver<Asking>,
+    folder: Folder,
+    robot: String,
+}
+
+/// A client that waits for a snapshot.
+pub struct Asking(net::UnixStream);
+
+impl Asking {
+    /// Tells the client the file that was written, or why none was. One that has left misses it.
+    pub fn answer(mut self, file: Result<&Path, &str>) {
+        let answer = match file {
+            Ok(file) => json!({ "ok": true, "file": file.display().to_string() }),
+            Err(error) => refusal(&error),
+        };
+        let _ = self.0.write_all(format!("{answer}\n").as_bytes());
+    }
+}
+
+impl Recorder {
+    /// Makes the socket and listens, in a thread of its own. One that another recorder of this
+    /// robot has made is replaced.
+    ///
+    /// # Errors
+    /// The socket cannot be made.
+    pub fn open(domain: &DomainConfig, robot: &str) -> io::Result<Self> {
+        let (folder, listener) = bind(domain, Server::Recorder, robot)?;
+        let (orders, asked) = std_mpsc::channel();
+        thread::Builder::new()
+            .name("control".into())
+            .spawn(move || {
+                while let Ok((client, _)) = listener.accept() {
+                    let order = Self::order(&client);
+                    let is_ended = match order {
+                        Some(Ok(())) => orders.send(Asking(client)).is_err(),
+                        Some(Err(error)) => {
+                            Asking(client).answer(Err(&error));
+                            false
+                        }
+                        None => false,
+                    };
+                    if is_ended {
+                        return;
+                    }
+                }
+            })?;
+        Ok(Self {
+            asked,
+            folder,
+            robot: robot.to_owned(),
+        })
+    }
+
+    /// The order of a client; `None` if it has left, or is too slow.
+    fn order(client: &net::UnixStream) -> Option<Result<(), String>> {
+        client.set_read_timeout(Some(Duration::from_secs(1))).ok()?;
+        client
+            .set_write_timeout(Some(Duration::from_secs(1)))
+            .ok()?;
+        let mut line = String::new();
+        let mut reader = BufReader::new(client).take(MAX_LINE as u64);
+        reader.read_line(&mut line).ok()?;
+        let order = serde_json::from_str::<Json>(&line).ok();
+        Some(
+            match order.is_some_and(|order| order == json!({ "do": "snapshot" })) {
+                true => Ok(()),
+                false => Err("a recorder knows {\"do\": \"snapshot\"} alone".to_owned()),
+            },
+        )
+    }
+
+    /// The next client that waits.
+    pub fn asked(&mut self) -> Option<Asking> {
+        self.asked.try_recv().ok()
+    }
+}
+
+impl Drop for Recorder {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(self.folder.socket(Server::Recorder, &self.robot));
     }
 }
 
@@ -178,8 +291,8 @@ impl Folder {
         PathBuf::from(format!("/proc/self/fd/{}", self.0.as_raw_fd())).join(name)
     }
 
-    fn socket(&self, robot: &str) -> PathBuf {
-        self.path(&format!("{robot}{SUFFIX}"))
+    fn socket(&self, server: Server, robot: &str) -> PathBuf {
+        self.path(&format!("{robot}.{}.sock", server.word()))
     }
 }
 
@@ -284,12 +397,12 @@ impl Lines {
 /// How long a client waits for an answer: longer than the gateway for its devices.
 const ANSWER: Duration = Duration::from_secs(5);
 
-/// The robots whose gateways can be asked, by name.
+/// The robots whose gateways, or recorders, can be asked, by name.
 ///
 /// # Errors
 /// [`io::Error`]: the domain's folder or a socket is another user's
 /// ([`io::ErrorKind::PermissionDenied`]), or cannot be read.
-pub fn gateways(domain: &DomainConfig) -> io::Result<Vec<String>> {
+pub fn running(domain: &DomainConfig, server: Server) -> io::Result<Vec<String>> {
     let none = |error: io::Error| match error.kind() {
         // Nobody has been here, or nobody listens on what a killed gateway has left.
         io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused => Ok(false),
@@ -300,12 +413,13 @@ pub fn gateways(domain: &DomainConfig) -> io::Result<Vec<String>> {
         Err(error) => return none(error).map(|_| Vec::new()),
     };
     let mut robots = Vec::new();
+    let suffix = format!(".{}.sock", server.word());
     for entry in fs::read_dir(folder.path(""))? {
         let name = entry?.file_name();
-        let Some(robot) = name.to_str().and_then(|name| name.strip_suffix(SUFFIX)) else {
+        let Some(robot) = name.to_str().and_then(|name| name.strip_suffix(&suffix)) else {
             continue;
         };
-        let connected = net::UnixStream::connect(folder.socket(robot));
+        let connected = net::UnixStream::connect(folder.socket(server, robot));
         if connected.map(|_| true).or_else(none)? {
             robots.push(robot.to_owned());
         }
@@ -314,13 +428,14 @@ pub fn gateways(domain: &DomainConfig) -> io::Result<Vec<String>> {
     Ok(robots)
 }
 
-/// Asks the gateway of `robot` with one line of JSON, and waits for its answer, a line too.
+/// Asks the gateway, or the recorder, of `robot` with one line of JSON, and waits for its answer, a
+/// line too.
 ///
 /// # Errors
-/// [`io::Error`]: no gateway of this robot is there ([`io::ErrorKind::NotFound`],
+/// [`io::Error`]: none of this robot is there ([`io::ErrorKind::NotFound`],
 /// [`io::ErrorKind::ConnectionRefused`]), or it does not answer.
-pub fn ask(domain: &DomainConfig, robot: &str, line: &str) -> io::Result<String> {
-    let mut stream = net::UnixStream::connect(Folder::open(domain)?.socket(robot))?;
+pub fn ask(domain: &DomainConfig, server: Server, robot: &str, line: &str) -> io::Result<String> {
+    let mut stream = net::UnixStream::connect(Folder::open(domain)?.socket(server, robot))?;
     stream.set_read_timeout(Some(ANSWER))?;
     stream.set_write_timeout(Some(ANSWER))?;
     stream.write_all(format!("{line}\n").as_bytes())?;
@@ -356,7 +471,10 @@ mod tests {
             let socket = Socket::open(&domain, &robot, orders).unwrap();
             let (there, who) = (domain.clone(), robot.clone());
             let client = tokio::task::spawn_blocking(move || {
-                (gateways(&there), ask(&there, &who, "{\"do\": \"status\"}"))
+                (
+                    running(&there, Server::Gateway),
+                    ask(&there, Server::Gateway, &who, "{\"do\": \"status\"}"),
+                )
             });
             let Asked { order, answer } = asked.recv().await.unwrap();
             assert_eq!(order, Order::Status);

@@ -4,6 +4,7 @@ import subprocess
 
 import numpy as np
 import proprio
+import pytest
 from conftest import until
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -50,3 +51,16 @@ def test_others_read_a_recording(arm, tmp_path):
         (i.linear_acceleration.x, i.angular_velocity.z) for i in shown
     ]
     assert shown[0].orientation_covariance[0] == (-1 if np.isnan(raw[0].qw) else 0)
+
+    # As tables: the samples, and the estimates, to the last bit.
+    samples, estimates = proprio.read_recording(out), proprio.read_recording(out, estimates=True)
+    own = samples.of("wrench/l_arm_ft_sensor/fx")["wrench/l_arm_ft_sensor/fx"]
+    raw = [sample.fx for _, _, sample in seen["/samples/wrench/l_arm_ft_sensor"]]
+    assert own.tolist() == raw
+    live = np.array([torque.torque[3] for _, _, torque in torques])
+    assert np.array_equal(estimates.torque("l_elbow"), live, equal_nan=True)
+    assert estimates.valid("l_elbow").tolist() == [t.valid[3] for _, _, t in torques]
+    again = proprio.estimate(arm.config / "estimator.toml", out)
+    assert set(again) >= set(name for name in estimates if "/" in name)
+    with pytest.raises(proprio.Failed, match="cannot be read"):
+        proprio.read_recording(arm.config / "model.urdf")

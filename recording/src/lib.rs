@@ -6,6 +6,7 @@
 //!   tell the bit rate switch).
 //! - [`to_table`] turns its samples and declarations back into the table of
 //!   [`proprio_topics::csv`], the same to the last bit as if the table itself had been recorded;
+//!   [`to_estimates`] makes a table of its estimates,
 //!   [`frames`] gives its frames, [`about`] what it says of itself.
 //! - [`Ring`] holds the last seconds in memory, for a black box.
 //!
@@ -17,10 +18,12 @@
 //! A file is written in compressed chunks. What a killed recorder has not flushed is missing; the
 //! rest can be read, and the readers say that the end is missing.
 
+mod estimates;
 mod read;
 mod ring;
 mod write;
 
+pub use estimates::to_estimates;
 pub use read::{ReadError, Summary, about, frames, is_mcap, to_table};
-pub use ring::Ring;
+pub use ring::{Ring, Snapshot};
 pub use write::{About, File, Recorder, WriteError};

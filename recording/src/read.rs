@@ -33,6 +33,9 @@ pub enum ReadError {
          record --out FILE.mcap --frames BUS`"
     )]
     NoFrames,
+    /// It has no estimates.
+    #[error("it is an MCAP file without estimates (topic /torques): no estimator ran")]
+    NoEstimates,
 }
 
 /// What was in a recording.
@@ -57,7 +60,7 @@ pub fn is_mcap(beginning: &[u8]) -> bool {
 
 /// Walks through the records of a recording, and whatever of it can be read. Returns whether its
 /// end is missing. `is_known` says whether enough was found that damage is no more than that.
-fn walk<S>(
+pub(crate) fn walk<S>(
     mut recording: impl Read,
     state: &mut S,
     is_known: impl Fn(&S) -> bool,

@@ -9,6 +9,7 @@ use proprio_topics::Nanos;
 use proprio_topics::csv::Series;
 use std::collections::VecDeque;
 use std::io::{Cursor, Seek, Write};
+use std::sync::Arc;
 
 /// So many parts make up the time.
 const PARTS: i64 = 8;
@@ -18,7 +19,7 @@ pub struct Ring {
     about: About,
     duration: Nanos,
     /// Each with its end.
-    parts: VecDeque<(Nanos, Vec<u8>)>,
+    parts: VecDeque<(Nanos, Arc<[u8]>)>,
     newest: Recorder<Cursor<Vec<u8>>>,
     /// When the newest part began, and the newest instant in it.
     began: Option<Nanos>,
@@ -74,7 +75,7 @@ impl Ring {
     fn turn(&mut self, series: &[Series]) -> Result<(), WriteError> {
         let ended = std::mem::replace(&mut self.newest, Self::begin(&self.about, series)?);
         let ended = ended.finish()?.into_inner();
-        self.parts.push_back((self.last, ended));
+        self.parts.push_back((self.last, ended.into()));
         self.began = None;
         let from = self.last.saturating_sub(self.duration);
         while self.parts.front().is_some_and(|(end, _)| *end < from) {
@@ -89,19 +90,40 @@ impl Ring {
         self.parts.iter().map(|(_, part)| part.len()).sum()
     }
 
-    /// Writes what is held as one recording, with its files.
+    /// What is held. `series` are all that are known.
+    ///
+    /// # Errors
+    /// A part cannot be ended or begun.
+    pub fn snapshot(&mut self, series: &[Series]) -> Result<Snapshot, WriteError> {
+        self.turn(series)?;
+        Ok(Snapshot {
+            about: self.about.clone(),
+            series: series.to_vec(),
+            parts: self
+                .parts
+                .iter()
+                .map(|(_, part)| Arc::clone(part))
+                .collect(),
+        })
+    }
+}
+
+/// What a ring held at an instant. To write it takes a while: another thread can do that.
+pub struct Snapshot {
+    about: About,
+    series: Vec<Series>,
+    parts: Vec<Arc<[u8]>>,
+}
+
+impl Snapshot {
+    /// Writes it as one recording, with its files.
     ///
     /// # Errors
     /// The file cannot be written.
-    pub fn snapshot<W: Write + Seek>(
-        &mut self,
-        output: W,
-        series: &[Series],
-    ) -> Result<W, WriteError> {
-        self.turn(series)?;
+    pub fn write<W: Write + Seek>(&self, output: W) -> Result<W, WriteError> {
         // All channels come first: a table's columns are known before its first row.
-        let mut recorder = Recorder::new(output, &self.about, series)?;
-        for (_, part) in &self.parts {
+        let mut recorder = Recorder::new(output, &self.about, &self.series)?;
+        for part in &self.parts {
             for message in MessageStream::new(part).map_err(WriteError::from)? {
                 recorder.copy(&message.map_err(WriteError::from)?)?;
             }

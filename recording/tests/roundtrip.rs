@@ -314,7 +314,8 @@ fn a_ring_has_the_last_seconds() {
         if number == 20 || number == values.len() - 1 {
             recorder.torques(&names(), &torques()).unwrap();
             let output = Cursor::new(Vec::new());
-            snapshots.push(ring.snapshot(output, &series()).unwrap().into_inner());
+            let snapshot = ring.snapshot(&series()).unwrap();
+            snapshots.push(snapshot.write(output).unwrap().into_inner());
         }
     }
     let rows = |snapshot: &[u8]| {

@@ -2,7 +2,7 @@
 //! nobody.
 
 use proprio_drivers::{Frame, Id};
-use proprio_gateway::control::{MAX_CLIENTS, MAX_LINE, ask};
+use proprio_gateway::control::{MAX_CLIENTS, MAX_LINE, Server, ask};
 use proprio_gateway::link::send_by;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_tests::watch::{Newest, Recorder, count};
@@ -85,7 +85,7 @@ impl Running {
     }
 
     fn send(&self, line: &str) -> Json {
-        let answer = ask(&self.rig.domain, ROBOT, line);
+        let answer = ask(&self.rig.domain, Server::Gateway, ROBOT, line);
         let answer =
             answer.unwrap_or_else(|error| panic!("{line}: {error}\n{}", self.gateway.log()));
         serde_json::from_str(&answer).expect("JSON")
@@ -121,7 +121,7 @@ impl Running {
     /// The answer to a line, while samples are recorded: a reader that pauses loses some.
     fn ask_recording(&self, line: &Json, recorder: &mut Recorder) -> Json {
         let (domain, line) = (self.rig.domain.clone(), line.to_string());
-        let asking = std::thread::spawn(move || ask(&domain, ROBOT, &line));
+        let asking = std::thread::spawn(move || ask(&domain, Server::Gateway, ROBOT, &line));
         while !asking.is_finished() {
             recorder.take();
             std::thread::sleep(std::time::Duration::from_millis(1));
@@ -524,7 +524,13 @@ fn nobody_disturbs_it() {
     running.all_stream();
     let served = until(PATIENCE, || {
         std::thread::sleep(std::time::Duration::from_millis(200));
-        let answer = ask(&running.rig.domain, ROBOT, "{\"do\": \"status\"}").ok()?;
+        let answer = ask(
+            &running.rig.domain,
+            Server::Gateway,
+            ROBOT,
+            "{\"do\": \"status\"}",
+        )
+        .ok()?;
         answer.contains("\"buses\"").then_some(())
     });
     served.expect("places are free again");
@@ -541,7 +547,12 @@ fn nobody_disturbs_it() {
     // A gateway that is killed leaves its socket; the next one replaces it.
     running.gateway.kill();
     assert!(running.socket().exists());
-    let gone = ask(&running.rig.domain, ROBOT, "{\"do\": \"status\"}");
+    let gone = ask(
+        &running.rig.domain,
+        Server::Gateway,
+        ROBOT,
+        "{\"do\": \"status\"}",
+    );
     assert_eq!(
         gone.map_err(|e| e.kind()),
         Err(std::io::ErrorKind::ConnectionRefused)
@@ -550,7 +561,13 @@ fn nobody_disturbs_it() {
         .rig
         .start(&["gateway", "--config", &running.arm.gateway]);
     let answered = until(PATIENCE, || {
-        ask(&running.rig.domain, ROBOT, "{\"do\": \"status\"}").ok()
+        ask(
+            &running.rig.domain,
+            Server::Gateway,
+            ROBOT,
+            "{\"do\": \"status\"}",
+        )
+        .ok()
     });
     let status: Json = serde_json::from_str(&answered.expect("an answer")).expect("JSON");
     assert_eq!(status["process"], running.gateway.id());

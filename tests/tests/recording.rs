@@ -1,12 +1,14 @@
-//! `proprio record --out FILE.mcap` beside a running robot, and verbs that read the file.
+//! `proprio record --out FILE.mcap` beside a running robot, verbs that read the file, and black
+//! boxes.
 #![allow(missing_docs)]
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use proprio_tests::watch::{open, valid_since};
 use proprio_tests::{Arm, PATIENCE, Rig, until};
-use proprio_topics::{Nanos, TorqueEstimate};
-use std::collections::BTreeSet;
+use proprio_topics::ipc::monotonic;
+use proprio_topics::{Nanos, Sample, TorqueEstimate};
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 
 /// The rows of a table, without its header.
@@ -113,5 +115,260 @@ fn a_recording_has_what_a_table_has_and_is_read_as_one() {
     assert!(
         output.status.success() && said.contains("the end is missing or damaged"),
         "{said}"
+    );
+}
+
+/// The values of a column that are there, by the text of their instant.
+fn column(table: &str, name: &str) -> BTreeMap<String, String> {
+    let mut lines = table
+        .lines()
+        .map(|line| line.split(',').collect::<Vec<_>>());
+    let header = lines.next().expect("a header");
+    let place = header.iter().position(|column| *column == name);
+    let place = place.unwrap_or_else(|| panic!("no column {name} in {header:?}"));
+    lines
+        .filter(|row| !row[place].is_empty())
+        .map(|row| (row[0].to_owned(), row[place].to_owned()))
+        .collect()
+}
+
+/// A recording with frames and configuration stands for itself: what is estimated, decoded and
+/// replayed from it is what was live.
+#[test]
+fn a_recording_with_frames_and_configuration_is_enough() {
+    let rig = Rig::new();
+    let arm = Arm::new()
+        .periods(4, 10, 4)
+        .on_virtual(["a", "b"])
+        .aligned(20.0)
+        .write(&rig.path("robot"));
+    let _simulator = rig.start(&["simulate", "--robot", &arm.folder]);
+    let mut gateway = rig.start(&["gateway", "--config", &arm.gateway]);
+    let _estimator = rig.start(&["estimator", "--config", &arm.estimator]);
+    let mut torques = open::<TorqueEstimate>(&rig.open(), "icub_left_arm");
+    assert!(valid_since(&mut torques, Nanos::ZERO, PATIENCE).is_some());
+
+    let path = |name: &str| rig.path(name).display().to_string();
+    let mut recorder = rig.start(&[
+        "record",
+        "--out",
+        &path("run.mcap"),
+        "--seconds",
+        "5",
+        "--frames",
+        "virtual:a",
+        "--frames",
+        "virtual:b",
+        "--config",
+        &arm.estimator,
+        "--config",
+        &arm.gateway,
+    ]);
+    let mut split = rig.start(&[
+        "record",
+        "--out",
+        &path("part.mcap"),
+        "--seconds",
+        "5",
+        "--split",
+        "2",
+    ]);
+    recorder.wait();
+    split.wait();
+    let told = recorder.output();
+    assert!(told.contains(" frames, 0 lost"), "{told}");
+
+    // The whole time is in the parts, each of which can be read alone.
+    let table = |recording: &str, more: &[&str]| {
+        let out = path("table.csv");
+        let mut arguments = vec!["table", "--recording", recording, "--out", &out];
+        arguments.extend(more);
+        rig.run(&arguments);
+        fs::read_to_string(&out).expect("the table")
+    };
+    let parts = ["part_0001.mcap", "part_0002.mcap", "part_0003.mcap"].map(&path);
+    let count: usize = parts
+        .iter()
+        .map(|part| table(part, &[]).lines().count() - 1)
+        .sum();
+    let told = split.output();
+    assert!(
+        count > 1000 && told.contains("estimates of torques"),
+        "{count} {told}"
+    );
+
+    // The robot's configuration is in it, and what is estimated with it is what was estimated live,
+    // to the last digit wherever all samples had come in time. The differentiation of the first
+    // samples is of a window that began before.
+    let [run, estimates] = [path("run.mcap"), path("estimates.csv")];
+    rig.run(&["estimate", "--samples", &run, "--out", &estimates]);
+    let again = fs::read_to_string(&estimates).expect("the estimates");
+    let live = table(&run, &["--estimates"]);
+    let (again, live) = (
+        column(&again, "torque/l_elbow"),
+        column(&live, "torque/l_elbow"),
+    );
+    let common: Vec<_> = live
+        .iter()
+        .filter(|(t, _)| again.contains_key(*t))
+        .collect();
+    let same = common
+        .iter()
+        .filter(|(t, torque)| again.get(*t) == Some(torque))
+        .count();
+    assert!(
+        common.len() > 200 && common.len() > live.len() * 3 / 4,
+        "{}",
+        common.len()
+    );
+    assert!(same > common.len() / 2, "{same} of {}", common.len());
+
+    // Its frames are decoded to the samples that the gateway published.
+    let [decoded, log] = [path("decoded.csv"), path("run.mcap")];
+    rig.run(&[
+        "decode",
+        "--config",
+        &arm.gateway,
+        "--log",
+        &log,
+        "--out",
+        &decoded,
+    ]);
+    let decoded = fs::read_to_string(&decoded).expect("the table");
+    let values = |table: &str| -> Vec<String> {
+        let name = "wrench/l_arm_ft_sensor/fx";
+        let header = table.lines().next().expect("a header").split(',');
+        let place = header
+            .into_iter()
+            .position(|column| column == name)
+            .expect(name);
+        let rows = table
+            .lines()
+            .skip(1)
+            .map(|row| row.split(',').nth(place).expect("a cell"));
+        rows.filter(|cell| !cell.is_empty())
+            .map(str::to_owned)
+            .collect()
+    };
+    let (of_frames, published) = (values(&decoded), values(&table(&run, &[])));
+    let longest = (0..40.min(published.len()))
+        .map(|skip| {
+            let begin = of_frames.iter().position(|value| *value == published[skip]);
+            let rest = begin.map_or(&[][..], |begin| &of_frames[begin..]);
+            rest.iter()
+                .zip(&published[skip..])
+                .take_while(|(a, b)| a == b)
+                .count()
+        })
+        .max();
+    assert!(
+        longest > Some(published.len() / 2),
+        "{longest:?} of {}",
+        published.len()
+    );
+
+    // A replay bus reads it as any log.
+    gateway.kill();
+    let replayed = fs::read_to_string(&arm.gateway).expect("a configuration");
+    // A replayed bus takes the frames of an interface with its own name.
+    let mut replayed = replayed
+        .replace("name = \"left_arm\"\n", "name = \"a\"\n")
+        .replace("name = \"left_arm_motors\"\n", "name = \"b\"\n");
+    for bus in ["a", "b"] {
+        let source = format!("kind = \"replay\"\nlog = {log:?}\npace = \"recorded\"");
+        replayed = replayed.replace(&format!("kind = \"virtual\"\nname = \"{bus}\""), &source);
+    }
+    assert!(replayed.matches("replay").count() == 2, "{replayed}");
+    let config = path("replay.toml");
+    fs::write(&config, replayed).expect("a file of this test");
+    let since = monotonic();
+    let _replay = rig.start(&["gateway", "--config", &config]);
+    let mut samples = open::<Sample>(&rig.open(), "icub_left_arm");
+    let seen = until(PATIENCE, || {
+        let sample = samples.try_take().ok()??;
+        (sample.header.acquired > since).then_some(())
+    });
+    assert!(seen.is_some(), "the replayed log has no samples");
+}
+
+/// A black box writes what happened: a gateway that is killed, a torque that is withheld, and what
+/// is asked for; and none of its samples is lost meanwhile.
+#[test]
+fn a_black_box_writes_when_something_happens() {
+    let rig = Rig::new();
+    let arm = Arm::new()
+        .periods(4, 10, 4)
+        .on_virtual(["a", "b"])
+        .aligned(20.0)
+        .write(&rig.path("robot"));
+    let _simulator = rig.start(&["simulate", "--robot", &arm.folder]);
+    let mut gateway = rig.start(&["gateway", "--config", &arm.gateway]);
+    let _estimator = rig.start(&["estimator", "--config", &arm.estimator]);
+    let mut torques = open::<TorqueEstimate>(&rig.open(), "icub_left_arm");
+    assert!(valid_since(&mut torques, Nanos::ZERO, PATIENCE).is_some());
+
+    let folder = rig.path("box");
+    let out = folder.display().to_string();
+    let arguments = [
+        "record",
+        "--ring",
+        "4",
+        "--out",
+        &out,
+        "--config",
+        &arm.estimator,
+    ];
+    let mut recorder = rig.start(&arguments);
+    let files = |why: &str| -> Vec<String> {
+        let entries = fs::read_dir(&folder).into_iter().flatten().flatten();
+        let names = entries.map(|entry| entry.path().display().to_string());
+        names
+            .filter(|name| name.ends_with(&format!("_{why}.mcap")))
+            .collect()
+    };
+    // It refuses a second one.
+    let ask = || rig.command(&["ctl", "snapshot"]).output().expect("it runs");
+    let asked = until(PATIENCE, || {
+        Some(ask()).filter(|output| output.status.success())
+    });
+    let asked = String::from_utf8_lossy(&asked.expect("a snapshot").stdout).into_owned();
+    let second = rig.command(&arguments).output().expect("it runs");
+    let second = String::from_utf8_lossy(&second.stderr).into_owned();
+    assert!(second.contains("another recorder with --ring"), "{second}");
+    let file = files("asked").pop().expect("the file");
+    assert_eq!(asked.trim(), format!("{file} is written"));
+    std::thread::sleep(std::time::Duration::from_secs(6));
+    rig.run(&["ctl", "snapshot"]);
+    let file = files("asked").into_iter().max().expect("the file");
+    rig.run(&[
+        "estimate",
+        "--samples",
+        &file,
+        "--out",
+        &rig.path("e.csv").display().to_string(),
+    ]);
+    let estimates = fs::read_to_string(rig.path("e.csv")).expect("the estimates");
+    let valid = column(&estimates, "torque/l_elbow");
+    let at = |t: Option<&String>| t.expect("an instant").parse::<f64>().expect("a number");
+    let span = at(valid.keys().next_back()) - at(valid.keys().next());
+    assert!(
+        valid.len() > 100 && span > 3.0 && span < 5.5,
+        "{span} {}",
+        valid.len()
+    );
+
+    gateway.kill();
+    assert!(until(PATIENCE, || files("no_samples").pop()).is_some());
+    let id = Pid::from_raw(i32::try_from(recorder.id()).expect("a process number"));
+    kill(id, Signal::SIGTERM).expect("the signal is sent");
+    recorder.wait();
+    let told = recorder.output();
+    assert!(
+        told.contains(" 0 lost") && told.contains("3 files were written"),
+        "{told}"
+    );
+    assert!(
+        fs::read_dir(&folder).expect("the folder").count() == 3,
+        "no half of a file is left"
     );
 }

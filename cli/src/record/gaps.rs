@@ -62,8 +62,8 @@ impl Gaps {
         (self.last, self.told) = (Some((epoch, newest)), false);
     }
 
-    /// Nothing came until `now`: tells it, once.
-    pub(super) fn wait(&mut self, now: Nanos) {
+    /// Nothing came until `now`: tells it, once, and returns true then.
+    pub(super) fn wait(&mut self, now: Nanos) -> bool {
         if let Some((_, last)) = self.last
             && now - last > self.silence
             && !std::mem::replace(&mut self.told, true)
@@ -71,7 +71,9 @@ impl Gaps {
             tracing::warn!(
                 "no samples since {last} s; recording goes on when they come (`proprio status`)"
             );
+            return true;
         }
+        false
     }
 
     /// What to say of them when the recording ends at `end`; empty if there are none.

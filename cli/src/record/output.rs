@@ -1,100 +1,210 @@
-//! Where a recording goes: a table, or a recording that viewers read too.
+//! Where a recording goes: a table, a recording (MCAP), a series of them, or a black box.
 
+use super::black_box::BlackBox;
+use anyhow::{Context, bail};
 use proprio_bridge::Heard;
-use proprio_gateway::clock::realtime_offset;
-use proprio_recording::{About, Recorder, WriteError};
+use proprio_drivers::Frame;
+use proprio_recording::{About, Recorder};
 use proprio_topics::Nanos;
 use proprio_topics::csv::{Columns, Series, Writer};
 use std::fs::File;
-use std::io::{self, BufWriter, Write as _};
+use std::io::{self, BufWriter, ErrorKind, Write as _};
+use std::path::{Path, PathBuf};
 
-/// This program, with its version.
-const PROGRAM: &str = concat!("proprio ", env!("CARGO_PKG_VERSION"));
 /// How often it is recorded how gateway, buses, devices and estimator are.
 const DIAGNOSTICS: Nanos = Nanos::from_millis(1000);
 
-/// The file that is written.
+/// Creates the file of a recording. An existing one is overwritten only if that is asked for; what
+/// is no file, such as a pipe, has nothing to lose.
+pub(super) fn create(path: &Path, force: bool) -> anyhow::Result<File> {
+    let special = std::fs::metadata(path).is_ok_and(|m| !m.is_file());
+    let created = match force || special {
+        true => File::create(path),
+        false => File::create_new(path),
+    };
+    match created {
+        Err(error) if error.kind() == ErrorKind::AlreadyExists => bail!(
+            "{} exists: name another file, or overwrite it with --force",
+            path.display()
+        ),
+        created => created.with_context(|| path.display().to_string()),
+    }
+}
+
+/// What is written.
 pub(super) enum Output {
-    /// A table of so many series; and the values of others, which are not in it.
-    Table(Writer<BufWriter<File>>, usize, u64),
-    /// A recording, and when it is next recorded how everything is.
-    Recording(Box<Recorder<BufWriter<File>>>, Nanos),
+    Table(Table),
+    Recording(Box<Recording>),
+    BlackBox(Box<BlackBox>),
+}
+
+/// A table of so many series.
+pub(super) struct Table {
+    writer: Writer<BufWriter<File>>,
+    series: usize,
+    /// Values of other series, which are not in it.
+    others: u64,
+}
+
+/// A recording, in one file or several.
+pub(super) struct Recording {
+    recorder: Recorder<BufWriter<File>>,
+    about: About,
+    series: Vec<Series>,
+    /// Where the next file is begun, and after what time.
+    split: Option<(Split, Nanos)>,
+    next_diagnostics: Nanos,
+}
+
+/// The names of the files of one recording.
+pub(super) struct Split {
+    path: PathBuf,
+    force: bool,
+    number: u32,
+    every: Nanos,
+}
+
+impl Split {
+    /// `path` without a number.
+    pub(super) fn new(path: &Path, force: bool, every: Nanos) -> Self {
+        Self {
+            path: path.to_owned(),
+            force,
+            number: 0,
+            every,
+        }
+    }
+
+    /// The next file, as `run_0001.mcap`. During a recording (`is_begun`) an existing one is
+    /// skipped: the recording goes on.
+    fn next(&mut self, is_begun: bool) -> anyhow::Result<File> {
+        loop {
+            self.number += 1;
+            let stem = self.path.file_stem().unwrap_or_default().to_string_lossy();
+            let name = format!("{stem}_{:04}.mcap", self.number);
+            let path = self.path.with_file_name(name);
+            if !is_begun || self.force || !path.exists() {
+                return create(&path, self.force);
+            }
+        }
+    }
 }
 
 impl Output {
     pub(super) fn table(file: File, series: &[Series], columns: Columns) -> io::Result<Self> {
-        let writer = Writer::new(BufWriter::new(file), series, columns)?;
-        Ok(Self::Table(writer, series.len(), 0))
+        Ok(Self::Table(Table {
+            writer: Writer::new(BufWriter::new(file), series, columns)?,
+            series: series.len(),
+            others: 0,
+        }))
     }
 
-    pub(super) fn recording(
-        file: File,
-        robot: &str,
+    pub(super) fn recording(file: File, about: About, series: &[Series]) -> anyhow::Result<Self> {
+        Ok(Self::Recording(Box::new(Recording {
+            recorder: Recorder::new(BufWriter::new(file), &about, series)?,
+            about,
+            series: series.to_vec(),
+            split: None,
+            next_diagnostics: Nanos::MIN,
+        })))
+    }
+
+    /// One that begins a new file again and again, from `now` on.
+    pub(super) fn split(
+        mut split: Split,
+        about: About,
         series: &[Series],
-    ) -> Result<Self, WriteError> {
-        let about = About {
-            robot: robot.to_owned(),
-            program: PROGRAM.to_owned(),
-            offset: realtime_offset(),
-            files: Vec::new(),
-        };
-        let recorder = Recorder::new(BufWriter::new(file), &about, series)?;
-        Ok(Self::Recording(Box::new(recorder), Nanos::MIN))
+        now: Nanos,
+    ) -> anyhow::Result<Self> {
+        let file = split.next(false)?;
+        let mut output = Self::recording(file, about, series)?;
+        if let Self::Recording(recording) = &mut output {
+            let next = now + split.every;
+            recording.split = Some((split, next));
+        }
+        Ok(output)
     }
 
-    /// The series that are known by now.
-    pub(super) fn know(&mut self, series: &[Series]) -> Result<(), WriteError> {
+    /// Something heard; `series` are all that are known by now.
+    pub(super) fn push(&mut self, t: Nanos, heard: &Heard, series: &[Series]) -> io::Result<()> {
         match self {
-            Self::Table(..) => Ok(()),
-            Self::Recording(recorder, _) => recorder.know(series),
+            Self::Table(table) => match heard {
+                Heard::Value(number, _) if *number >= table.series => {
+                    table.others += 1;
+                    Ok(())
+                }
+                Heard::Value(number, value) => table.writer.push(Some(t), *number, value),
+                _ => Ok(()),
+            },
+            Self::Recording(recording) => recording.push(t, heard, series),
+            Self::BlackBox(black_box) => {
+                (black_box.push(t, heard, series)).map_err(io::Error::other)
+            }
         }
     }
 
-    pub(super) fn push(&mut self, t: Nanos, heard: &Heard) -> io::Result<()> {
-        match (self, heard) {
-            (Self::Table(table, count, others), Heard::Value(series, value)) => {
-                if series >= count {
-                    *others += 1;
-                    return Ok(());
-                }
-                table.push(Some(t), *series, value)
-            }
-            (Self::Table(..), _) => Ok(()),
-            (Self::Recording(recorder, _), heard) => {
-                recorder.say(t, heard).map_err(io::Error::other)
-            }
+    /// A raw frame on `bus`.
+    pub(super) fn frame(&mut self, bus: &str, frame: &Frame, series: &[Series]) -> io::Result<()> {
+        match self {
+            Self::Table(_) => Ok(()),
+            Self::Recording(recording) => recording.recorder.frame(bus, frame),
+            Self::BlackBox(black_box) => black_box.frame(bus, frame, series),
         }
+        .map_err(io::Error::other)
     }
 
     /// Values that are not in the file, because it has no column for them.
     pub(super) const fn without_column(&self) -> u64 {
         match self {
-            Self::Table(.., others) => *others,
-            Self::Recording(..) => 0,
+            Self::Table(table) => table.others,
+            _ => 0,
         }
     }
 
     /// Writes what was recorded until `now` to the file.
-    pub(super) fn flush(&mut self, now: Nanos) -> io::Result<()> {
+    pub(super) fn flush(&mut self, now: Nanos, series: &[Series]) -> anyhow::Result<()> {
         match self {
-            Self::Table(table, ..) => table.flush(),
-            Self::Recording(recorder, next) => {
-                if now >= *next {
-                    *next = now + DIAGNOSTICS;
-                    recorder.diagnostics(now).map_err(io::Error::other)?;
-                }
-                recorder.flush().map_err(io::Error::other)
-            }
+            Self::Table(table) => table.writer.flush()?,
+            Self::Recording(recording) => recording.flush(now)?,
+            Self::BlackBox(black_box) => black_box.turn(now, series)?,
         }
+        Ok(())
     }
 
-    pub(super) fn finish(self) -> io::Result<()> {
+    pub(super) fn finish(self) -> anyhow::Result<()> {
         match self {
-            Self::Table(table, ..) => table.finish().map(drop),
-            Self::Recording(recorder, _) => {
-                let mut file = recorder.finish().map_err(io::Error::other)?;
-                file.flush()
-            }
+            Self::Table(table) => table.writer.finish()?.flush()?,
+            Self::Recording(recording) => recording.recorder.finish()?.flush()?,
+            Self::BlackBox(black_box) => black_box.finish(),
         }
+        Ok(())
+    }
+}
+
+impl Recording {
+    fn push(&mut self, t: Nanos, heard: &Heard, series: &[Series]) -> io::Result<()> {
+        if series.len() > self.series.len() {
+            self.series = series.to_vec();
+            self.recorder.know(series).map_err(io::Error::other)?;
+        }
+        self.recorder.say(t, heard).map_err(io::Error::other)
+    }
+
+    fn flush(&mut self, now: Nanos) -> anyhow::Result<()> {
+        if now >= self.next_diagnostics {
+            self.next_diagnostics = now + DIAGNOSTICS;
+            self.recorder.diagnostics(now)?;
+        }
+        if let Some((split, next)) = &mut self.split
+            && now >= *next
+        {
+            *next = now + split.every;
+            let file = BufWriter::new(split.next(true)?);
+            let new = Recorder::new(file, &self.about, &self.series)?;
+            std::mem::replace(&mut self.recorder, new)
+                .finish()?
+                .flush()?;
+        }
+        Ok(self.recorder.flush()?)
     }
 }

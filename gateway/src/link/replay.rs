@@ -14,11 +14,9 @@
 use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
 use crate::clock::{Clock, Monotonic, sleep_until};
 pub use crate::config::Pace;
-use crate::log::{LogFormat, Reader, Report, Stamps};
+use crate::log::{self, Bytes, LogFormat, Reader, Report, Stamps};
 use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos, StampKind};
-use std::fmt::Debug;
-use std::fs::File;
 use std::io::{self, BufRead, BufReader};
 use std::path::Path;
 
@@ -83,7 +81,7 @@ pub(crate) fn several(interfaces: &[String]) -> Option<String> {
 
 /// A log that is being replayed.
 #[derive(Debug)]
-pub struct Replay<R = BufReader<File>> {
+pub struct Replay<R = BufReader<Bytes>> {
     log: Reader<R>,
     pace: Pace,
     matching: Option<Matching>,
@@ -134,7 +132,7 @@ impl Replay {
             path: path.to_owned(),
             cause,
         };
-        let file = File::open(path).map_err(fail)?;
+        let file = log::open(path).map_err(fail)?;
         let log = Reader::with_stamps(BufReader::with_capacity(BUFFER, file), stamps);
         Self::of(log, pace, interface, claims).map_err(fail)
     }
@@ -259,7 +257,7 @@ impl<R: BufRead> Replay<R> {
     }
 }
 
-impl<R: BufRead + Debug + Send> Link for Replay<R> {
+impl<R: BufRead + Send> Link for Replay<R> {
     fn note(&self) -> Option<String> {
         let report = self.log.report();
         let mut notes = Vec::new();

@@ -16,7 +16,8 @@
 //! | PEAK TRC 1.0 to 2.1 | PCAN-View, PCAN-Explorer, python-can | `trc` |
 //! | CSV with python-can's columns | python-can | `csv` |
 //!
-//! The first bytes or lines tell the format, not the file's name.
+//! The first bytes or lines tell the format, not the file's name. A program can add formats that
+//! need libraries which the gateway does not depend on ([`convert_with`]).
 //!
 //! **Interfaces.** ASC, BLF and TRC number their channels from 1. Channel 1 is read as interface
 //! `can0`, channel 2 as `can1` and so on: python-can and log2asc number them this way, too. A CSV
@@ -48,3 +49,32 @@ mod trc;
 pub use reader::{REORDER, Reader, Report, StepBack};
 pub use record::{Direction, LineError, LogFormat, Record};
 pub use stamps::{STAMPS_OPTION, Stamps};
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::Path;
+use std::sync::OnceLock;
+
+/// A log, as bytes of one of these formats.
+pub type Bytes = Box<dyn Read + Send>;
+/// Makes of a file what can be read: the file itself, or what it is as a log of these formats.
+pub type Convert = fn(File, &Path) -> io::Result<Bytes>;
+
+static CONVERT: OnceLock<Convert> = OnceLock::new();
+
+/// Has every log that is opened from now on converted by `convert`. Only the first call counts.
+pub fn convert_with(convert: Convert) {
+    let _ = CONVERT.set(convert);
+}
+
+/// Opens the log at `path`.
+///
+/// # Errors
+/// It cannot be opened, or not be converted.
+pub fn open(path: &Path) -> io::Result<Bytes> {
+    let file = File::open(path)?;
+    match CONVERT.get() {
+        Some(convert) => convert(file, path),
+        None => Ok(Box::new(file)),
+    }
+}

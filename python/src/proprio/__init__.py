@@ -12,7 +12,7 @@ Live, from the shared memory of a running gateway and estimator::
 
 From logs::
 
-    table = proprio.read_table("a.csv")
+    table = proprio.read_table("a.csv")             # or proprio.read_recording("a.mcap")
     outcome = proprio.identify("estimator.toml", ["a.csv", "b.csv"], out="result")
     estimates = proprio.estimate("estimator.toml", "c.csv", parameters=outcome.parameters)
 """
@@ -34,7 +34,7 @@ from .live import (
     Wrench,
     now,
 )
-from .logs import Failed, Identification, Table, estimate, identify, read_table
+from .logs import Failed, Identification, Table, estimate, identify, read_recording, read_table
 from ._program import program
 
 __all__ = [
@@ -59,5 +59,6 @@ __all__ = [
     "identify",
     "now",
     "program",
+    "read_recording",
     "read_table",
 ]

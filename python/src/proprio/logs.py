@@ -1,10 +1,11 @@
-"""Recorded tables as arrays, and `identify` and `estimate` on files."""
+"""Recorded tables and recordings as arrays, and `identify` and `estimate` on files."""
 
 import csv
 import html
 import json
 import math
 import subprocess
+import tempfile
 from array import array
 from os import PathLike
 from pathlib import Path
@@ -89,6 +90,23 @@ def _is_text(name: str) -> bool:
     return name.startswith("reason/") or name.endswith("/reason")
 
 
+def read_recording(path: AnyPath, estimates: bool = False) -> Table:
+    """The samples of a recording (MCAP), or its estimates, as a table.
+
+    Raises Failed if it has none, or cannot be read. What ``messages`` says of a recording whose end
+    is missing: its recorder was killed.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        out = str(Path(folder) / "table.csv")
+        arguments = ["table", "--recording", str(path), "--out", out]
+        code, said = _run(arguments + (["--estimates"] if estimates else []))
+        if code != 0:
+            raise _failed(code, said)
+        table = read_table(out)
+        table.messages = said
+        return table
+
+
 def read_table(path: AnyPath) -> Table:
     """Reads a table of samples or estimates (CSV).
 
@@ -142,25 +160,30 @@ def _paths(paths: Union[AnyPath, Sequence[AnyPath]]) -> List[str]:
 
 
 def estimate(
-    config: AnyPath,
+    config: Optional[AnyPath],
     samples: AnyPath,
-    out: AnyPath,
+    out: Optional[AnyPath] = None,
     parameters: Optional[AnyPath] = None,
 ) -> Table:
-    """Estimates joint torques and contact wrenches from a table of samples; `proprio estimate`.
+    """Estimates joint torques and contact wrenches from a table or recording; `proprio estimate`.
 
-    ``config`` is an estimator.toml, ``parameters`` a parameters.toml to use instead of the
-    URDF's. Writes the table ``out``, and reads it. Raises Failed, with the command's own words.
+    ``config`` is an estimator.toml (None: the one that a recording has), ``parameters`` a
+    parameters.toml to use instead of the URDF's. Writes the table ``out``, if it is given. Raises
+    Failed, with the command's own words.
     """
-    words = ["estimate", "--config", str(config), "--samples", str(samples), "--out", str(out)]
-    if parameters is not None:
-        words += ["--parameters", str(parameters)]
-    code, said = _run(words)
-    if code != 0:
-        raise _failed(code, said)
-    table = read_table(out)
-    table.messages.extend(said)
-    return table
+    with tempfile.TemporaryDirectory() as folder:
+        file = str(Path(folder) / "estimates.csv" if out is None else out)
+        words = ["estimate", "--samples", str(samples), "--out", file]
+        if config is not None:
+            words += ["--config", str(config)]
+        if parameters is not None:
+            words += ["--parameters", str(parameters)]
+        code, said = _run(words)
+        if code != 0:
+            raise _failed(code, said)
+        table = read_table(file)
+        table.messages.extend(said)
+        return table
 
 
 class Identification:

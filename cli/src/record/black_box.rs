@@ -1,0 +1,357 @@
+//! A black box: the last seconds in memory, written to a file when something happens.
+//!
+//! A torque that was valid and is withheld, a sensor or device that reports a fault, a bus that is
+//! lost: the file is written a while later, so that it has what followed. Then nothing but
+//! `proprio ctl snapshot` writes another until the memory is full of new seconds.
+
+use anyhow::Context;
+use proprio_bridge::Heard;
+use proprio_drivers::Frame;
+use proprio_gateway::control;
+use proprio_recording::{About, Ring, Snapshot, WriteError};
+use proprio_topics::csv::{Series, Value};
+use proprio_topics::ipc::DomainConfig;
+use proprio_topics::{DeviceState, LinkState, Nanos, Quality};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::fs;
+use std::io::{self, BufWriter, Write as _};
+use std::path::{Path, PathBuf};
+use std::thread::{self, JoinHandle};
+
+/// How long after its cause a file is written, at most: it has what followed.
+const AFTER: Nanos = Nanos::from_millis(5000);
+/// If nothing comes any more, it is written so long after that.
+const LATEST: Nanos = Nanos::from_millis(4000);
+/// So many files are kept: the oldest of this run are deleted.
+const KEPT: usize = 20;
+/// The flags of a reading that are a fault.
+const FAULTS: Quality = Quality(
+    Quality::FROZEN.0
+        | Quality::DEVICE_FAULT.0
+        | Quality::DRIVE_FAULT.0
+        | Quality::ZERO_CHANGED.0
+        | Quality::IMPLAUSIBLE.0,
+);
+
+/// What happened, for the name of a file.
+type Why = String;
+
+/// The last seconds, and what they are watched for.
+pub(super) struct BlackBox {
+    ring: Ring,
+    folder: PathBuf,
+    robot: String,
+    duration: Nanos,
+    /// The wall clock minus CLOCK_MONOTONIC.
+    offset: Nanos,
+    control: control::Recorder,
+    asking: Option<control::Asking>,
+    faults: Faults,
+    /// When a file is due, and why.
+    due: Option<(Nanos, Why)>,
+    /// The newest instant that is held.
+    newest: Nanos,
+    /// Until then nothing that happens makes another.
+    quiet: Nanos,
+    written: VecDeque<PathBuf>,
+    writing: Vec<JoinHandle<()>>,
+    next_diagnostics: Nanos,
+}
+
+impl BlackBox {
+    pub(super) fn new(
+        about: About,
+        series: &[Series],
+        duration: Nanos,
+        folder: &Path,
+        domain: &DomainConfig,
+    ) -> anyhow::Result<Self> {
+        let robot = about.robot.clone();
+        let others = control::running(domain, control::Server::Recorder)?;
+        if others.contains(&robot) {
+            anyhow::bail!("another recorder with --ring runs for {robot}: one is enough");
+        }
+        fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+        Ok(Self {
+            offset: about.offset,
+            ring: Ring::new(about, series, duration)?,
+            folder: folder.to_owned(),
+            control: control::Recorder::open(domain, &robot)
+                .context("the socket for `proprio ctl snapshot` cannot be made")?,
+            asking: None,
+            robot,
+            duration,
+            faults: Faults::default(),
+            due: None,
+            newest: Nanos::MIN,
+            quiet: Nanos::MIN,
+            written: VecDeque::new(),
+            writing: Vec::new(),
+            next_diagnostics: Nanos::MIN,
+        })
+    }
+
+    pub(super) fn push(
+        &mut self,
+        t: Nanos,
+        heard: &Heard,
+        series: &[Series],
+    ) -> Result<(), WriteError> {
+        let recorder = self.ring.at(t, series)?;
+        recorder.know(series)?;
+        recorder.say(t, heard)?;
+        self.newest = self.newest.max(t);
+        if let Some(why) = self.faults.new_in(heard, series) {
+            self.happened(t, why);
+        }
+        Ok(())
+    }
+
+    /// Something happened at `t`: a file is written when what followed is held, too.
+    pub(super) fn happened(&mut self, t: Nanos, why: Why) {
+        if self.due.is_none() && t >= self.quiet {
+            tracing::warn!("{why}: the last seconds are written soon");
+            self.due = Some((t + AFTER.min(Nanos(self.duration.0 / 4)), why));
+        }
+    }
+
+    pub(super) fn frame(
+        &mut self,
+        bus: &str,
+        frame: &Frame,
+        series: &[Series],
+    ) -> Result<(), WriteError> {
+        self.ring.at(frame.t, series)?.frame(bus, frame)
+    }
+
+    /// Whether a client asks for a file: what waits to be sorted should be pushed before
+    /// [`BlackBox::turn`] writes it.
+    pub(super) fn is_asked(&mut self) -> bool {
+        if self.asking.is_none() {
+            self.asking = self.control.asked();
+        }
+        self.asking.is_some()
+    }
+
+    /// Writes what is due at `now`, and what is asked for.
+    pub(super) fn turn(&mut self, now: Nanos, series: &[Series]) -> io::Result<()> {
+        if now >= self.next_diagnostics {
+            self.next_diagnostics = now + Nanos::from_millis(1000);
+            let recorder = self.ring.at(now, series).map_err(io::Error::other)?;
+            recorder.diagnostics(now).map_err(io::Error::other)?;
+        }
+        let newest = self.newest;
+        let is_due = |at: Nanos| newest >= at || now >= at + LATEST;
+        if let Some((at, why)) = self.due.take_if(|(at, _)| is_due(*at)) {
+            self.quiet = at + self.duration;
+            self.write(now, &why, series, None)?;
+        }
+        if let Some(client) = self.asking.take() {
+            self.write(now, "asked", series, Some(client))?;
+        }
+        Ok(())
+    }
+
+    /// Has a thread write a file, which tells `client` its name: samples go on to be read here.
+    fn write(
+        &mut self,
+        now: Nanos,
+        why: &str,
+        series: &[Series],
+        client: Option<control::Asking>,
+    ) -> io::Result<()> {
+        let wall = now.saturating_add(self.offset).0;
+        let time = jiff::Timestamp::from_nanosecond(wall.into()).map_err(io::Error::other)?;
+        let time = time.strftime("%Y%m%dT%H%M%S%.3fZ");
+        let is_word = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
+        let why: String = (why.chars().map(|c| if is_word(c) { c } else { '_' })).collect();
+        let place = self
+            .folder
+            .join(format!("{}_{time}_{why}.mcap", self.robot));
+        self.written.push_back(place.clone());
+        let oldest = match self.written.len() > KEPT {
+            true => self.written.pop_front(),
+            false => None,
+        };
+        let snapshot = self.ring.snapshot(series).map_err(io::Error::other)?;
+        let writing = thread::Builder::new()
+            .name("snapshot".into())
+            .spawn(move || {
+                let written = write(&snapshot, &place);
+                let text = |error| format!("{}: cannot be written: {error}", place.display());
+                let written = written.map_err(text);
+                match &written {
+                    Ok(()) => tracing::info!("{} is written", place.display()),
+                    Err(error) => tracing::error!("{error}"),
+                }
+                if let Some(client) = client {
+                    client.answer(
+                        written
+                            .as_ref()
+                            .map(|()| place.as_path())
+                            .map_err(String::as_str),
+                    );
+                }
+                if let Some(oldest) = oldest {
+                    let _ = fs::remove_file(oldest);
+                }
+            })?;
+        self.writing.retain(|thread| !thread.is_finished());
+        self.writing.push(writing);
+        Ok(())
+    }
+
+    /// Waits for the files that are being written.
+    pub(super) fn finish(self) {
+        for thread in self.writing {
+            let _ = thread.join();
+        }
+    }
+
+    /// The files of this run that are there.
+    pub(super) fn written(&self) -> usize {
+        self.written.len()
+    }
+
+    /// The memory that the last seconds take \[bytes\].
+    pub(super) fn memory(&self) -> usize {
+        self.ring.memory()
+    }
+}
+
+/// Writes a file: it has its name when it is complete.
+fn write(snapshot: &Snapshot, place: &Path) -> io::Result<()> {
+    let part = place.with_extension("part");
+    let file = BufWriter::new(fs::File::create(&part)?);
+    let mut file = snapshot.write(file).map_err(io::Error::other)?;
+    file.flush()?;
+    file.get_ref().sync_all()?;
+    fs::rename(&part, place)
+}
+
+/// What is wrong at present.
+#[derive(Default)]
+struct Faults {
+    valid: BTreeMap<usize, bool>,
+    readings: BTreeMap<usize, Quality>,
+    health: BTreeSet<String>,
+}
+
+impl Faults {
+    /// What has become wrong with this.
+    fn new_in(&mut self, heard: &Heard, series: &[Series]) -> Option<Why> {
+        match heard {
+            Heard::Value(number, Value::Reading(_, quality)) => {
+                let now = Quality(quality.0 & FAULTS.0);
+                let before = self.readings.insert(*number, now).unwrap_or(Quality::GOOD);
+                let is_new = now.0 & !before.0 != 0;
+                let name = series.get(*number).map_or("?", |one| one.name.as_str());
+                is_new.then(|| format!("{name}-{now}"))
+            }
+            Heard::Torques(torques, names) => {
+                let mut why = None;
+                for (number, joint) in torques.joints().iter().enumerate() {
+                    let is_valid = joint.valid == 1;
+                    if self.valid.insert(number, is_valid) == Some(true) && !is_valid {
+                        let index = u32::try_from(number).unwrap_or(u32::MAX);
+                        let entry = names.find(proprio_topics::Role::Joint, index);
+                        let name = entry.map_or("?", |entry| entry.name.as_str());
+                        let reason = joint.reason.get().map_or("?", |reason| reason.word());
+                        why.get_or_insert_with(|| format!("{name}-{reason}"));
+                    }
+                }
+                why
+            }
+            Heard::Gateway(health) => {
+                let buses = health.buses().iter().filter_map(|bus| {
+                    let state = bus.link.get().unwrap_or_default();
+                    let is_lost = !matches!(state, LinkState::Up | LinkState::Ended);
+                    is_lost.then(|| format!("{}-{}", bus.name.as_str(), state.word()))
+                });
+                let devices = health.devices().iter().filter_map(|device| {
+                    let state = device.state.get().unwrap_or_default();
+                    let is_lost = matches!(state, DeviceState::Silent | DeviceState::Refused);
+                    is_lost.then(|| format!("{}-{}", device.name.as_str(), state.word()))
+                });
+                let now: BTreeSet<String> = buses.chain(devices).collect();
+                let new = now.difference(&self.health).next().cloned();
+                self.health = now;
+                new
+            }
+            _ => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proprio_topics::csv::What;
+    use proprio_topics::{
+        BusHealth, Description, Entry, GatewayHealth, Header, JointState, JointTorque, Kind,
+        MAX_JOINTS, Name, Publisher, Reading, Reason, Role, TorqueEstimate,
+    };
+    use std::rc::Rc;
+
+    /// Each thing that becomes wrong is told once, until it is right again.
+    #[test]
+    fn what_becomes_wrong_is_told_once() {
+        let series = [Series {
+            what: What::Channel(Kind::Joint),
+            name: "elbow".to_owned(),
+        }];
+        let name = |text: &str| Name::new(text).unwrap();
+        let reading = |quality| {
+            let reading = Reading::Joint(JointState::ABSENT);
+            Heard::Value(0, Value::Reading(reading, quality))
+        };
+        let torque = |reason: Reason| {
+            let mut joints = [JointTorque::ABSENT; MAX_JOINTS];
+            joints[0].valid = u32::from(reason == Reason::None);
+            joints[0].reason = reason.in_memory();
+            let entry = Entry {
+                name: name("elbow"),
+                role: Role::Joint.in_memory(),
+                ..Entry::NONE
+            };
+            let estimate = TorqueEstimate {
+                header: Header::default(),
+                count: 1,
+                reserved: 0,
+                joints,
+            };
+            let names = Description::new(Publisher::Estimator, [entry]);
+            Heard::Torques(Box::new(estimate), Rc::new(names))
+        };
+        let bus = |state: LinkState| {
+            let mut health = GatewayHealth::new(Nanos::ZERO);
+            health.bus_count = 1;
+            health.buses[0] = BusHealth {
+                name: name("can0"),
+                link: state.in_memory(),
+                ..BusHealth::EMPTY
+            };
+            Heard::Gateway(Box::new(health))
+        };
+        let mut faults = Faults::default();
+        for (heard, expected) in [
+            (reading(Quality::GOOD), None),
+            (reading(Quality::SATURATED), None),
+            (reading(Quality::FROZEN), Some("elbow-frozen")),
+            (reading(Quality::FROZEN), None),
+            (reading(Quality::GOOD), None),
+            (reading(Quality::FROZEN), Some("elbow-frozen")),
+            (torque(Reason::NeverSeen), None),
+            (torque(Reason::None), None),
+            (torque(Reason::Stale), Some("elbow-stale")),
+            (torque(Reason::Frozen), None),
+            (bus(LinkState::Up), None),
+            (bus(LinkState::Down), Some("can0-down")),
+            (bus(LinkState::Down), None),
+            (bus(LinkState::BusOff), Some("can0-bus_off")),
+        ] {
+            let found = faults.new_in(&heard, &series);
+            assert_eq!(found.as_deref(), expected, "{heard:?}");
+        }
+    }
+}
