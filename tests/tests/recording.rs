@@ -357,18 +357,20 @@ fn a_black_box_writes_when_something_happens() {
         valid.len()
     );
 
+    let before = fs::read_dir(&folder).expect("the folder").count();
     gateway.kill();
-    assert!(until(PATIENCE, || files("no_samples").pop()).is_some());
+    // On a busy machine something else may have happened before, and have the name of the file.
+    let all = || fs::read_dir(&folder).expect("the folder").count();
+    assert!(until(PATIENCE, || (all() > before).then_some(())).is_some());
     let id = Pid::from_raw(i32::try_from(recorder.id()).expect("a process number"));
     kill(id, Signal::SIGTERM).expect("the signal is sent");
     recorder.wait();
     let told = recorder.output();
+    assert!(told.contains(" 0 lost"), "{told}");
+    let ends = |entry: &fs::DirEntry| entry.path().extension().is_some_and(|it| it == "mcap");
+    let entries = fs::read_dir(&folder).expect("the folder").flatten();
     assert!(
-        told.contains(" 0 lost") && told.contains("3 files were written"),
-        "{told}"
-    );
-    assert!(
-        fs::read_dir(&folder).expect("the folder").count() == 3,
-        "no half of a file is left"
+        entries.into_iter().all(|entry| ends(&entry)),
+        "half of a file is left"
     );
 }

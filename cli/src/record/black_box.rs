@@ -1,8 +1,8 @@
 //! A black box: the last seconds in memory, written to a file when something happens.
 //!
 //! A torque that was valid and is withheld, a sensor or device that reports a fault, a bus that is
-//! lost: the file is written a while later, so that it has what followed. Then nothing but
-//! `proprio ctl snapshot` writes another until the memory is full of new seconds.
+//! lost: the file is written a while later, so that it has what followed. The next one is written
+//! when the memory is full of new seconds, or when `proprio ctl snapshot` asks for it.
 
 use anyhow::Context;
 use proprio_bridge::Heard;
@@ -51,8 +51,8 @@ pub(super) struct BlackBox {
     due: Option<(Nanos, Why)>,
     /// The newest instant that is held.
     newest: Nanos,
-    /// Until then nothing that happens makes another.
-    quiet: Nanos,
+    /// The next file is written no sooner, so that it has new seconds alone.
+    next: Nanos,
     written: VecDeque<PathBuf>,
     writing: Vec<JoinHandle<()>>,
     next_diagnostics: Nanos,
@@ -84,7 +84,7 @@ impl BlackBox {
             faults: Faults::default(),
             due: None,
             newest: Nanos::MIN,
-            quiet: Nanos::MIN,
+            next: Nanos::MIN,
             written: VecDeque::new(),
             writing: Vec::new(),
             next_diagnostics: Nanos::MIN,
@@ -109,9 +109,11 @@ impl BlackBox {
 
     /// Something happened at `t`: a file is written when what followed is held, too.
     pub(super) fn happened(&mut self, t: Nanos, why: Why) {
-        if self.due.is_none() && t >= self.quiet {
+        if self.due.is_none() {
             tracing::warn!("{why}: the last seconds are written soon");
-            self.due = Some((t + AFTER.min(Nanos(self.duration.0 / 4)), why));
+            let after = t + AFTER.min(Nanos(self.duration.0 / 4));
+            // What happened just after a file was written is still held when the next is.
+            self.due = Some((after.max(self.next), why));
         }
     }
 
@@ -143,7 +145,7 @@ impl BlackBox {
         let newest = self.newest;
         let is_due = |at: Nanos| newest >= at || now >= at + LATEST;
         if let Some((at, why)) = self.due.take_if(|(at, _)| is_due(*at)) {
-            self.quiet = at + self.duration;
+            self.next = at + self.duration;
             self.write(now, &why, series, None)?;
         }
         if let Some(client) = self.asking.take() {
