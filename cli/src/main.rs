@@ -12,6 +12,7 @@ mod estimator;
 mod folder;
 mod identify;
 mod install;
+mod programs;
 mod record;
 mod report;
 mod running;
@@ -74,6 +75,10 @@ enum Verb {
     Record(record::Record),
     /// Ask a running gateway: its state, its devices, a tare, a changed configuration
     Ctl(ctl::Args),
+    /// Let Foxglove look at a running robot (the program proprio-view)
+    View(programs::Args),
+    /// Publish a running robot to ROS 2 (the program proprio-ros2)
+    Ros2(programs::Args),
     /// Check this machine: CAN, permissions, shared memory, buffers, real-time limits
     Doctor(doctor::Args),
     /// Install this program, its systemd units and a robot's configuration
@@ -115,6 +120,8 @@ fn main() -> ExitCode {
         Verb::Echo(args) => echo::run(&args, &domain),
         Verb::Record(args) => record::run(&args, &domain),
         Verb::Ctl(args) => ctl::run(&args, &domain),
+        Verb::View(args) => programs::run("view", &args, &domain),
+        Verb::Ros2(args) => programs::run("ros2", &args, &domain),
         Verb::Doctor(args) => doctor::run(&args, &domain),
         Verb::Install(args) => install::run(&args),
     };
