@@ -64,8 +64,8 @@ struct Args {
     /// The robot's URDF; default: that of --config. Without either there is no model
     #[arg(long, value_name = "FILE")]
     urdf: Option<PathBuf>,
-    /// A folder that holds the packages of the URDF's meshes: clients may read what is in it. May be
-    /// repeated
+    /// A folder that holds the packages of the URDF's meshes: clients may read what is in it. May
+    /// be repeated
     #[arg(long, value_name = "FOLDER")]
     meshes: Vec<PathBuf>,
     /// The address to serve. Any other than the default lets other machines look

@@ -101,7 +101,7 @@ mod tests {
     use proprio_dynamics::{FrameMotion, JointState, Kinematics};
     use std::collections::BTreeMap;
 
-    /// A joint below a fixed one, a sliding joint, a follower, a joint that is held, an oblique axis.
+    /// A joint below a fixed one, a sliding joint, a follower, a held joint, an oblique axis.
     const ODD: &str = r#"<robot name="odd">
         <link name="base"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0"
           ixz="0" iyz="0"/></inertial></link>

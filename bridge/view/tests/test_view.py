@@ -380,7 +380,7 @@ def test_the_layout_shows_topics_and_fields_that_there_are(client):
         shown |= {panel[key] for key in ("topicToRender", "topicPath") if key in panel}
         for path in panel.get("paths", []):
             topic, *fields = path["value"].split(".")
-            value = client.wait(topic, 10.0).message
+            value = client.wait(topic, 30.0).message  # the hand's: only while it is pushed
             for field in fields:
                 value = getattr(value, field)
             assert isinstance(value, float), (name, path)
