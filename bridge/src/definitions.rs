@@ -83,8 +83,8 @@ pub fn torques() -> Definition {
 /// The torque of one joint, with a band for plots.
 #[must_use]
 pub fn joint_torque() -> Definition {
-    let text = "# The torque of a joint, as in Torques, with a band of two standard deviations: about\n\
-                # 95 % of the errors are smaller.\n\
+    let text = "# The torque of a joint, as in Torques, with a band of two standard deviations:\n\
+                # about 95 % of the errors are smaller.\n\
                 # CLOCK_MONOTONIC [ns]\n\
                 int64 acquired\n\
                 # NaN: withheld\n\

@@ -559,8 +559,10 @@ mod tests {
         };
         let mut joints = [JointTorque::ABSENT; MAX_JOINTS];
         (joints[0], joints[1]) = (good, withheld);
-        let mut header = proprio_topics::Header::default();
-        header.acquired = Nanos(7);
+        let header = proprio_topics::Header {
+            acquired: Nanos(7),
+            ..Default::default()
+        };
         let estimate = TorqueEstimate {
             header,
             count: 2,

@@ -129,12 +129,15 @@ def test_stamps_are_the_wall_clocks(client):
 
 
 def test_no_topic_is_faster_than_the_rate(robot):
-    with Client(robot.viewer.port, ["*"]) as client:
-        client.collect(1.0)
+    # Slower than shared memory is looked into.
+    viewer = robot.view("--rate", 20)
+    with Client(viewer.port, ["*"]) as client:
+        client.wait("/torques", 10.0)
+        client.collect(0.5)
         received = client.collect(3.0)
     counts = Counter(one.topic for one in received)
-    assert counts["/torques"] > 300, counts  # of 3000
-    assert max(counts.values()) < 3.2 * 200, counts
+    assert counts["/torques"] > 45, counts  # of 3000
+    assert max(counts.values()) <= 62, counts
     times = [one.log_time for one in received if one.topic == "/torques"]
     assert times == sorted(times)
 
