@@ -12,6 +12,12 @@ pub struct Message {
     bytes: Vec<u8>,
 }
 
+impl Default for Message {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
 impl Message {
     /// An empty one.
     #[must_use]

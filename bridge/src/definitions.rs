@@ -80,6 +80,25 @@ pub fn torques() -> Definition {
     Definition::new("proprio_msgs/msg/Torques", text)
 }
 
+/// The torque of one joint, with a band for plots.
+#[must_use]
+pub fn joint_torque() -> Definition {
+    let text = "# The torque of a joint, as in Torques, with a band of two standard deviations:\n\
+                # about 95 % of the errors are smaller.\n\
+                # CLOCK_MONOTONIC [ns]\n\
+                int64 acquired\n\
+                # NaN: withheld\n\
+                float64 torque\n\
+                float64 lower\n\
+                float64 upper\n\
+                bool valid\n\
+                # Why it is withheld; empty: it is not.\n\
+                string reason\n\
+                # The channel that causes it; empty: no single one.\n\
+                string cause\n";
+    Definition::new("proprio_msgs/msg/JointTorque", text)
+}
+
 /// Contact wrenches with deviations and reasons.
 #[must_use]
 pub fn contacts() -> Definition {
@@ -164,6 +183,14 @@ float64 x
 float64 y
 float64 z
 ";
+const QUATERNION: &str = "\
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+";
 
 /// `sensor_msgs/JointState`.
 #[must_use]
@@ -187,16 +214,34 @@ pub fn wrench_stamped() -> Definition {
     Definition::new("geometry_msgs/msg/WrenchStamped", text)
 }
 
+/// `std_msgs/String`.
+#[must_use]
+pub fn string() -> Definition {
+    Definition::new("std_msgs/msg/String", "string data\n")
+}
+
+/// `tf2_msgs/TFMessage`.
+#[must_use]
+pub fn transforms() -> Definition {
+    let line = "=".repeat(80);
+    let text = format!(
+        "geometry_msgs/TransformStamped[] transforms\n{line}\n\
+         MSG: geometry_msgs/TransformStamped\nstd_msgs/Header header\nstring child_frame_id\n\
+         geometry_msgs/Transform transform\n{HEADER}{line}\n\
+         MSG: geometry_msgs/Transform\ngeometry_msgs/Vector3 translation\n\
+         geometry_msgs/Quaternion rotation\n{VECTOR}{QUATERNION}"
+    );
+    Definition::new("tf2_msgs/msg/TFMessage", text)
+}
+
 /// `sensor_msgs/Imu`.
 #[must_use]
 pub fn imu() -> Definition {
-    let line = "=".repeat(80);
     let text = format!(
         "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\n\
          float64[9] orientation_covariance\ngeometry_msgs/Vector3 angular_velocity\n\
          float64[9] angular_velocity_covariance\ngeometry_msgs/Vector3 linear_acceleration\n\
-         float64[9] linear_acceleration_covariance\n{HEADER}{VECTOR}{line}\n\
-         MSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
+         float64[9] linear_acceleration_covariance\n{HEADER}{VECTOR}{QUATERNION}"
     );
     Definition::new("sensor_msgs/msg/Imu", text)
 }

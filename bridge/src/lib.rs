@@ -16,6 +16,7 @@
 //! | `/samples/<kind>/<name>` | `proprio_msgs/msg/<Kind>` | a reading: its stamp, quality, values |
 //! | `/declared/<contact>` | `proprio_msgs/msg/Declared` | a contact is declared, and where |
 //! | `/torques` | `proprio_msgs/msg/Torques` | torques, deviations, validity, reasons, causes |
+//! | `/torque/<joint>` | `proprio_msgs/msg/JointTorque` | one of them with a band, for plots |
 //! | `/contacts` | `proprio_msgs/msg/Contacts` | the same of contact wrenches |
 //! | `/joint_states` | `sensor_msgs/msg/JointState` | positions; efforts: torques, NaN: withheld |
 //! | `/ft/<sensor>` | `geometry_msgs/msg/WrenchStamped` | what an F/T sensor reports |

@@ -279,11 +279,7 @@ impl<S: Sink> Messages<S> {
         estimate: &TorqueEstimate,
     ) -> Result<(), S::Error> {
         let t = estimate.header.acquired;
-        let name =
-            |role, number| (names.find(role, number)).map_or("", |entry| entry.name.as_str());
-        let joints: Vec<(&str, &JointTorque)> = (estimate.joints().iter().zip(0..))
-            .map(|(joint, number)| (name(Role::Joint, number), joint))
-            .collect();
+        let joints: Vec<(&str, &JointTorque)> = joints(names, estimate).collect();
         self.send("/torques", definitions::torques, t, |_| {
             let mut message = Message::new();
             message.i64(t.0);
@@ -296,11 +292,11 @@ impl<S: Sink> Messages<S> {
             message.count(joints.len());
             (joints.iter()).for_each(|(_, joint)| message.bool(joint.valid == 1));
             message.count(joints.len());
-            for (_, joint) in &joints {
-                message.text(joint.reason.get().map_or("?", |reason| reason.word()));
-            }
+            (joints.iter()).for_each(|(_, joint)| message.text(reason(joint)));
             message.count(joints.len());
-            (joints.iter()).for_each(|(_, joint)| message.text(name(Role::Channel, joint.cause)));
+            for (_, joint) in &joints {
+                message.text(name(names, Role::Channel, joint.cause));
+            }
             message
         })?;
         let states: Vec<JointState> = joints.iter().map(|(name, _)| self.state(name)).collect();
@@ -319,6 +315,35 @@ impl<S: Sink> Messages<S> {
             }
             message
         })
+    }
+
+    /// The torques of an instant, each joint's on a topic of its own, with a band of two standard
+    /// deviations: for plots.
+    ///
+    /// # Errors
+    /// Those of the sink.
+    pub fn torque_bands(
+        &mut self,
+        names: &Description,
+        estimate: &TorqueEstimate,
+    ) -> Result<(), S::Error> {
+        let t = estimate.header.acquired;
+        for (joint_name, joint) in joints(names, estimate) {
+            let topic = format!("/torque/{joint_name}");
+            self.send(&topic, definitions::joint_torque, t, |_| {
+                let is_valid = joint.valid == 1;
+                let torque = if is_valid { joint.torque } else { f64::NAN };
+                let half = 2.0 * joint.standard_deviation;
+                let mut message = Message::new();
+                message.i64(t.0);
+                message.f64s(&[torque, torque - half, torque + half]);
+                message.bool(is_valid);
+                message.text(reason(joint));
+                message.text(name(names, Role::Channel, joint.cause));
+                message
+            })?;
+        }
+        Ok(())
     }
 
     /// The newest state of a joint; NaN before the first.
@@ -396,6 +421,25 @@ impl<S: Sink> Messages<S> {
     }
 }
 
+/// The name of this number, if it has one.
+fn name(names: &Description, role: Role, number: u32) -> &str {
+    (names.find(role, number)).map_or("", |entry| entry.name.as_str())
+}
+
+/// The joints of an estimate, with their names.
+fn joints<'a>(
+    names: &'a Description,
+    estimate: &'a TorqueEstimate,
+) -> impl Iterator<Item = (&'a str, &'a JointTorque)> {
+    (estimate.joints().iter().zip(0..))
+        .map(|(joint, number)| (name(names, Role::Joint, number), joint))
+}
+
+/// Why a torque is withheld.
+fn reason(joint: &JointTorque) -> &'static str {
+    joint.reason.get().map_or("?", |reason| reason.word())
+}
+
 fn sample(t: Nanos, reading: &Reading, quality: Quality) -> Message {
     let mut message = Message::new();
     message.i64(t.0);
@@ -440,4 +484,124 @@ fn imu(wall: u64, frame: &str, imu: &Imu) -> Message {
     message.f64s(&imu.proper_acceleration);
     message.f64s(&[0.0; 9]);
     message
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cdr::Parsed;
+    use proprio_topics::{Entry, MAX_JOINTS, Name, Publisher, Reason};
+
+    /// Keeps what it is sent.
+    #[derive(Default)]
+    struct Kept {
+        topics: Vec<(String, String)>,
+        sent: Vec<(String, u64, Vec<u8>)>,
+    }
+
+    impl Sink for Kept {
+        type Channel = String;
+        type Error = std::convert::Infallible;
+
+        fn add(
+            &mut self,
+            topic: &str,
+            definition: &Definition,
+            _: Option<usize>,
+        ) -> Result<Option<String>, Self::Error> {
+            self.topics
+                .push((topic.to_owned(), definition.name.clone()));
+            Ok(Some(topic.to_owned()))
+        }
+
+        fn send(
+            &mut self,
+            topic: &String,
+            wall: u64,
+            message: &Message,
+        ) -> Result<(), Self::Error> {
+            let bytes = message.bytes().to_vec();
+            self.sent.push((topic.clone(), wall, bytes));
+            Ok(())
+        }
+    }
+
+    fn entry(role: Role, index: u32, name: &str) -> Entry {
+        Entry {
+            name: Name::new(name).unwrap_or(Name::EMPTY),
+            role: role.in_memory(),
+            index,
+            ..Entry::NONE
+        }
+    }
+
+    #[test]
+    fn each_torque_has_a_band_of_two_deviations() {
+        let entries = [
+            entry(Role::Joint, 0, "elbow"),
+            entry(Role::Joint, 1, "wrist"),
+            entry(Role::Channel, 3, "ft"),
+        ];
+        let names = Description::new(Publisher::Estimator, entries);
+        let good = JointTorque {
+            torque: 5.0,
+            standard_deviation: 0.25,
+            valid: 1,
+            reason: Reason::None.in_memory(),
+            ..JointTorque::ABSENT
+        };
+        // Too uncertain: the deviation is there, but no torque.
+        let withheld = JointTorque {
+            standard_deviation: 9.0,
+            reason: Reason::Uncertain.in_memory(),
+            cause: 3,
+            ..JointTorque::ABSENT
+        };
+        let mut joints = [JointTorque::ABSENT; MAX_JOINTS];
+        (joints[0], joints[1]) = (good, withheld);
+        let header = proprio_topics::Header {
+            acquired: Nanos(7),
+            ..Default::default()
+        };
+        let estimate = TorqueEstimate {
+            header,
+            count: 2,
+            reserved: 0,
+            joints,
+        };
+        let mut messages = Messages::new(Kept::default(), "arm", Nanos(100));
+        let Ok(()) = messages.torque_bands(&names, &estimate);
+        let kept = messages.into_sink();
+        let type_name = "proprio_msgs/msg/JointTorque".to_owned();
+        let expected = ["/torque/elbow", "/torque/wrist"];
+        assert_eq!(
+            kept.topics,
+            expected.map(|topic| (topic.to_owned(), type_name.clone()))
+        );
+        let mut read = kept.sent.iter().map(|(topic, wall, bytes)| {
+            let mut parsed = Parsed::new(bytes).expect("CDR");
+            assert_eq!((parsed.i64(), *wall), (Some(7), 107));
+            let band = [0; 3].map(|_| parsed.f64().expect("a number"));
+            let valid = parsed.bool();
+            let (reason, cause) = (parsed.text(), parsed.text());
+            assert_eq!(parsed.u8(), None, "the message ends");
+            (topic.as_str(), band, valid, reason, cause)
+        });
+        assert_eq!(
+            read.next(),
+            Some((
+                "/torque/elbow",
+                [5.0, 4.5, 5.5],
+                Some(true),
+                Some(""),
+                Some("")
+            ))
+        );
+        let (_, band, valid, reason, cause) = read.next().expect("the wrist's");
+        assert!(band.iter().all(|number| number.is_nan()), "{band:?}");
+        assert_eq!(
+            (valid, reason, cause),
+            (Some(false), Some("uncertain"), Some("ft"))
+        );
+    }
 }

@@ -34,9 +34,9 @@ pub(crate) fn run(name: &str, args: &Args, domain: &DomainConfig) -> anyhow::Res
         .exec();
     match error.kind() {
         ErrorKind::NotFound => bail!(
-            "{program} is not installed. It is a program of its own: in a clone, `cargo build \
-             --release --manifest-path bridge/{name}/Cargo.toml --target-dir target` puts it \
-             beside this one; or put it into a folder of the PATH"
+            "{program} is not installed. It is a program of its own: in a clone, `cargo install \
+             --path bridge/{name}` builds it; it belongs beside this one or into a folder of the \
+             PATH"
         ),
         _ => bail!("{}: cannot be run: {error}", place.display()),
     }

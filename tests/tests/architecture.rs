@@ -190,6 +190,7 @@ const OUTERMOST: [(&str, &str); 16] = [
         "when its state was written",
     ),
     ("cli/src/", "programs"),
+    ("bridge/view/src/main.rs", "a program"),
     ("tests/", "tests of processes"),
 ];
 

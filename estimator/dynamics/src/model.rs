@@ -260,7 +260,8 @@ pub struct Model {
     link_names: Vec<String>,
     joint_facts: Vec<JointFacts>,
     joint_numbers: HashMap<String, usize>,
-    folded_joints: HashMap<String, ()>,
+    /// Per fixed joint that was folded, its parent and child links.
+    folded_joints: HashMap<String, (String, String)>,
     /// Per joint that follows a fixed one, that one.
     held: HashMap<String, String>,
     frames: HashMap<String, Frame>,
@@ -343,6 +344,12 @@ impl Model {
     /// Whether the URDF has a fixed joint of this name that was folded.
     pub fn is_folded(&self, joint: &str) -> bool {
         self.folded_joints.contains_key(joint)
+    }
+
+    /// The parent and child links of each fixed joint that was folded, in no particular order.
+    pub fn folded_links(&self) -> impl Iterator<Item = (&str, &str)> {
+        let links = self.folded_joints.values();
+        links.map(|(parent, child)| (parent.as_str(), child.as_str()))
     }
 
     /// Whether a link or joint of this name was dropped, because it is the joint that lets the

@@ -142,7 +142,7 @@ pub use inertia::{Inconsistency, RigidInertia};
 
 use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
 
-use nalgebra::{Matrix3, Vector3, Vector6};
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3, Vector6};
 
 /// A vector in three-dimensional space.
 pub type Vec3 = Vector3<f64>;
@@ -436,6 +436,14 @@ impl Pose {
         }
     }
 
+    /// The rotation as a unit quaternion, in the order `x, y, z, w`.
+    pub fn quaternion(&self) -> [f64; 4] {
+        let rotation = Rotation3::from_matrix_unchecked(self.rotation);
+        UnitQuaternion::from_rotation_matrix(&rotation)
+            .coords
+            .into()
+    }
+
     /// Whether every component is finite.
     pub fn is_finite(&self) -> bool {
         self.rotation
@@ -560,7 +568,6 @@ mod tests {
     /// URDF's definition: rotate about fixed x by roll, then fixed y by pitch, then fixed z by yaw.
     #[test]
     fn rpy_is_three_rotations_about_fixed_axes() {
-        use nalgebra::Rotation3;
         let (roll, pitch, yaw) = (0.3, -1.1, 2.7);
         let expected = Rotation3::from_axis_angle(&Vec3::z_axis(), yaw)
             * Rotation3::from_axis_angle(&Vec3::y_axis(), pitch)
@@ -574,6 +581,16 @@ mod tests {
             failure_persistence: None,
             ..ProptestConfig::default()
         })]
+
+        /// The columns of the rotation are the axes, which the quaternion turns by `q v q*`.
+        #[test]
+        fn a_quaternion_turns_as_its_rotation(x_ab in pose(), v in vector()) {
+            let [x, y, z, w] = x_ab.quaternion();
+            let axis = Vec3::new(x, y, z);
+            let turned = v + 2.0 * axis.cross(&(axis.cross(&v) + w * v));
+            prop_assert!((turned - x_ab.rotation * v).norm() < 1e-12);
+            prop_assert!((axis.norm_squared() + w * w - 1.0).abs() < 1e-12);
+        }
 
         #[test]
         fn power_is_the_same_in_every_frame(

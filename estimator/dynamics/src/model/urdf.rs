@@ -648,7 +648,8 @@ impl Folder<'_, '_> {
                     let x_body_joint = x_body_link * joint.origin;
                     let is_fixed = joint.kind == Some(JointKind::Fixed);
                     if is_fixed && !self.keep.contains(joint.name) {
-                        model.folded_joints.insert(joint.name.to_owned(), ());
+                        let links = [link, joint.child].map(|l| self.links[l].name.to_owned());
+                        (model.folded_joints).insert(joint.name.to_owned(), links.into());
                         group.push((joint.child, x_body_joint));
                     } else {
                         below.push((joint.child, Some((number, body, x_body_joint))));
