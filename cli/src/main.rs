@@ -20,6 +20,7 @@ mod scan;
 mod setup;
 mod simulate;
 mod status;
+mod top;
 
 use clap::{Parser, Subcommand};
 use proprio_topics::ipc::DomainConfig;
@@ -65,6 +66,8 @@ enum Verb {
     Identify(identify::Args),
     /// Show the robots of a running system: processes, buses, devices, channels, estimates
     Status(status::Status),
+    /// Show a running robot on the whole terminal, as it is now: torques, contacts, channels, buses
+    Top(top::Top),
     /// Print the samples of a channel, the torques or the contacts as they come
     Echo(echo::Echo),
     /// Record samples and declared contacts into the table that `identify` reads
@@ -106,6 +109,7 @@ fn main() -> ExitCode {
         Verb::Estimate(args) => convert::estimate(&args),
         Verb::Identify(args) => identify::run(&args),
         Verb::Status(args) => status::run(&args, &domain),
+        Verb::Top(args) => top::run(&args, &domain),
         Verb::Echo(args) => echo::run(&args, &domain),
         Verb::Record(args) => record::run(&args, &domain),
         Verb::Ctl(args) => ctl::run(&args, &domain),
