@@ -5,7 +5,7 @@ use crate::echo::{of_contacts, of_joints};
 use crate::status::{counts, load};
 use proprio_topics::ipc::{Presence, Unavailable};
 use proprio_topics::{
-    Controller, Counter, DeviceState, LinkState, Nanos, Reason, Refusal, Role, axes,
+    Controller, Counter, Description, DeviceState, LinkState, Nanos, Reason, Refusal, Role, axes,
 };
 use ratatui::style::Style;
 use ratatui::text::Span;
@@ -29,8 +29,8 @@ pub(super) struct Section {
     pub(super) title: &'static str,
     /// It at a glance.
     pub(super) summary: Span<'static>,
-    /// The columns' names, the first one's with it; `>`: on the right.
-    pub(super) head: &'static [&'static str],
+    /// The columns' names, between bars; `>`: on the right.
+    pub(super) head: &'static str,
     pub(super) rows: Vec<Row>,
 }
 
@@ -128,12 +128,8 @@ fn bar(value: f64, deviation: f64, scale: f64) -> Span<'static> {
 }
 
 fn torques(snapshot: &Snapshot, now: Nanos) -> Section {
-    let mut section = Section {
-        title: "TORQUES",
-        summary: Span::styled("no estimate yet", doubtful()),
-        head: &["joint", ">torque [Nm]", ">± 2σ", "-peak     0     +peak"],
-        ..Section::default()
-    };
+    let mut section = Section::new("TORQUES", "joint|>torque [Nm]|>± 2σ|-peak     0     +peak");
+    section.summary = Span::styled("no estimate yet", doubtful());
     let Some((torques, names)) = snapshot.torques() else {
         return section;
     };
@@ -158,8 +154,7 @@ fn torques(snapshot: &Snapshot, now: Nanos) -> Section {
             }
             (None, Some(withheld)) => vec![why(&withheld)],
         };
-        let name = name.to_owned();
-        section.rows.push(Row { name, cells });
+        section.push(name, cells);
     }
     section.summary = old.unwrap_or_else(|| share(valid, section.rows.len(), "valid"));
     section
@@ -174,19 +169,10 @@ fn vector(values: [f64; 3], deviations: &[f64], digits: usize) -> [Span<'static>
 }
 
 fn contacts(snapshot: &Snapshot, now: Nanos) -> Section {
-    let mut section = Section {
-        title: "CONTACTS",
-        head: &[
-            "contact",
-            "is",
-            ">force x, y, z [N]",
-            ">± 2σ",
-            ">torque x, y, z [Nm]",
-            ">± 2σ",
-            "at [m]",
-        ],
-        ..Section::default()
-    };
+    let mut section = Section::new(
+        "CONTACTS",
+        "contact|is|>force x, y, z [N]|>± 2σ|>torque x, y, z [Nm]|>± 2σ|at [m]",
+    );
     let Some((contacts, names)) = snapshot.contacts() else {
         return section;
     };
@@ -214,8 +200,7 @@ fn contacts(snapshot: &Snapshot, now: Nanos) -> Section {
                 cells
             }
         };
-        let name = entry.name.to_string();
-        section.rows.push(Row { name, cells });
+        section.push(entry.name, cells);
     }
     let all = section.rows.len();
     section.summary = match old {
@@ -227,15 +212,11 @@ fn contacts(snapshot: &Snapshot, now: Nanos) -> Section {
 }
 
 fn channels(snapshot: &Snapshot, now: Nanos) -> Section {
-    let mut section = Section {
-        title: "CHANNELS",
-        head: &["channel", "kind", ">rate [Hz]", ">age", "quality"],
-        ..Section::default()
-    };
+    let mut section = Section::new("CHANNELS", "channel|kind|>rate [Hz]|>age|quality");
     let names = snapshot.channel_names.as_deref();
     let newest = snapshot.gateway.1.as_deref();
     let mut alive = 0;
-    for entry in names.map(|it| it.entries()).unwrap_or_default() {
+    for entry in names.map(Description::entries).unwrap_or_default() {
         let number = entry.index as usize;
         let (Some(kind), Some(channel)) = (entry.kind.get(), snapshot.channels.get(number)) else {
             continue;
@@ -270,14 +251,26 @@ fn channels(snapshot: &Snapshot, now: Nanos) -> Section {
             Span::raw(age.map_or_else(|| "-".to_owned(), duration)),
             quality,
         ];
-        let name = entry.name.to_string();
-        section.rows.push(Row { name, cells });
+        section.push(entry.name, cells);
     }
     section.summary = share(alive, section.rows.len(), "alive");
     section
 }
 
 impl Section {
+    fn new(title: &'static str, head: &'static str) -> Self {
+        Self {
+            title,
+            head,
+            ..Self::default()
+        }
+    }
+
+    fn push(&mut self, name: impl ToString, cells: Vec<Span<'static>>) {
+        let name = name.to_string();
+        self.rows.push(Row { name, cells });
+    }
+
     /// With `summary`, unless what the gateway said last is old.
     fn of_gateway(mut self, snapshot: &Snapshot, now: Nanos, summary: Span<'static>) -> Self {
         let said = snapshot.gateway.1.as_deref().map(|it| it.header.published);
@@ -292,11 +285,7 @@ impl Section {
 }
 
 fn devices(snapshot: &Snapshot, now: Nanos) -> Section {
-    let mut section = Section {
-        title: "DEVICES",
-        head: &["device", "bus", "state", ">rate [Hz]", "counters"],
-        ..Section::default()
-    };
+    let mut section = Section::new("DEVICES", "device|bus|state|>rate [Hz]|notes, counters");
     let Some(health) = snapshot.gateway.1.as_deref() else {
         return section;
     };
@@ -331,27 +320,17 @@ fn devices(snapshot: &Snapshot, now: Nanos) -> Section {
             Span::raw(format!("{rate:.1}")),
             Span::styled(notes.join("; "), style_of_notes),
         ];
-        let name = device.name.to_string();
-        section.rows.push(Row { name, cells });
+        section.push(device.name, cells);
     }
     let summary = share(streaming, section.rows.len(), "streaming");
     section.of_gateway(snapshot, now, summary)
 }
 
 fn buses(snapshot: &Snapshot, now: Nanos) -> Section {
-    let mut section = Section {
-        title: "BUSES",
-        head: &[
-            "bus",
-            "link",
-            "controller",
-            "load",
-            ">dropped",
-            ">error frames",
-            ">not sent",
-        ],
-        ..Section::default()
-    };
+    let mut section = Section::new(
+        "BUSES",
+        "bus|link|controller|load|>dropped|>error frames|>not sent",
+    );
     let Some(health) = snapshot.gateway.1.as_deref() else {
         return section;
     };
@@ -390,24 +369,17 @@ fn buses(snapshot: &Snapshot, now: Nanos) -> Section {
             count(bus.error_frames),
             count(bus.send_failures),
         ];
-        let name = bus.name.to_string();
-        section.rows.push(Row { name, cells });
+        section.push(bus.name, cells);
     }
     let summary = share(up, section.rows.len(), "up");
     section.of_gateway(snapshot, now, summary)
 }
 
 fn identification(snapshot: &Snapshot, now: Nanos) -> Section {
-    let mut section = Section {
-        title: "IDENTIFICATION",
-        head: &[
-            "link, sensor",
-            "mass, or offset known to",
-            "from motion of",
-            "",
-        ],
-        ..Section::default()
-    };
+    let mut section = Section::new(
+        "IDENTIFICATION",
+        "link, sensor|mass, or offset known to|from motion of|",
+    );
     let Some(estimator) = snapshot.estimator.1.as_deref() else {
         return section;
     };
@@ -421,16 +393,13 @@ fn identification(snapshot: &Snapshot, now: Nanos) -> Section {
             } else {
                 good()
             };
-            let text = format!("{groups} groups, {} paused", health.paused);
+            let text = format!("groups: {groups}, paused: {}", health.paused);
             let old = old("as of", snapshot.estimator.0, said, now);
             old.unwrap_or(Span::styled(text, style))
         }
     };
     if health.groups > 0 {
-        section.rows.push(Row {
-            name: "instants".to_owned(),
-            cells: vec![Span::raw(health.to_string())],
-        });
+        section.push("instants", vec![Span::raw(health.to_string())]);
     }
     let Some(inertia) = snapshot.inertia() else {
         return section;
@@ -458,8 +427,7 @@ fn identification(snapshot: &Snapshot, now: Nanos) -> Section {
             Span::raw(format!("{:.1} s", link.motion)),
             known(link.accepted, &link.standard_deviation, "parameters"),
         ];
-        let name = link.name.to_string();
-        section.rows.push(Row { name, cells });
+        section.push(link.name, cells);
     }
     for offset in inertia.offsets() {
         let (force, torque) = offset.standard_deviation.split_at(3);
@@ -470,8 +438,7 @@ fn identification(snapshot: &Snapshot, now: Nanos) -> Section {
             Span::raw(""),
             known(offset.accepted, &offset.standard_deviation, "axes"),
         ];
-        let name = offset.name.to_string();
-        section.rows.push(Row { name, cells });
+        section.push(offset.name, cells);
     }
     section
 }

@@ -11,6 +11,7 @@ use proprio_topics::{
 };
 use ratatui::Terminal;
 use ratatui::backend::TestBackend;
+use ratatui::buffer::Cell;
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 use std::sync::Arc;
 
@@ -195,7 +196,7 @@ fn screen(view: &mut View, (width, height): (u16, u16), now: Nanos) -> Vec<Strin
         .expect("memory");
     let buffer = terminal.backend().buffer();
     let rows = buffer.content.chunks(usize::from(width).max(1));
-    rows.map(|row| row.iter().map(|cell| cell.symbol()).collect::<String>())
+    rows.map(|row| row.iter().map(Cell::symbol).collect::<String>())
         .map(|line| line.trim_end().to_owned())
         .collect()
 }
@@ -240,7 +241,7 @@ fn each_part_shows_its_values_or_why_not() {
         "CHANNELS  1 of 2 alive",
         "DEVICES  1 of 2 streaming",
         "BUSES  1 of 1 up",
-        "IDENTIFICATION  2 groups, 1 paused",
+        "IDENTIFICATION  groups: 2, paused: 1",
     ] {
         assert!(text.contains(expected), "{expected}:\n{text}");
     }

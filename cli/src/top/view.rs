@@ -11,8 +11,8 @@ use ratatui::style::{Style, Stylize as _};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Paragraph, Wrap};
 
-const KEYS: &str = "q quit  p pause  / filter  Tab section  arrows PgUp PgDn scroll  r next robot  \
-                    ? hide";
+const KEYS: &str =
+    "q quit  p pause  / filter  Tab section  arrows PgUp PgDn scroll  r robot  ? hide";
 
 /// What a key asks for that the screen cannot do.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -56,9 +56,10 @@ impl View {
 
     /// A key is pressed.
     pub(super) fn press(&mut self, key: KeyEvent) -> Wish {
-        let has_control = key.modifiers.contains(KeyModifiers::CONTROL);
+        let shortcut = (key.modifiers).intersection(KeyModifiers::CONTROL | KeyModifiers::ALT);
         match key.code {
-            KeyCode::Char('c') if has_control => return Wish::Quit,
+            KeyCode::Char('c') if shortcut == KeyModifiers::CONTROL => return Wish::Quit,
+            _ if !shortcut.is_empty() => {}
             KeyCode::Enter | KeyCode::Esc if self.is_typing => {
                 self.is_typing = false;
                 if key.code == KeyCode::Esc {
@@ -235,32 +236,29 @@ fn table(section: Section, width: usize) -> Vec<Line<'static>> {
         true => name.chars().take(longest - 1).chain(['…']).collect(),
         false => name,
     };
-    let names = section
-        .head
-        .iter()
-        .map(|name| name.trim_start_matches('>').dim());
-    let mut lines_of_cells = vec![names.collect::<Vec<Span<'static>>>()];
+    let head: Vec<&str> = section.head.split('|').collect();
+    let names = head.iter().map(|name| name.trim_start_matches('>').dim());
+    let mut all: Vec<Vec<Span<'_>>> = vec![names.collect()];
     for Row { name, cells } in section.rows {
         let name = Span::raw(shorten(name));
-        lines_of_cells.push(std::iter::once(name).chain(cells).collect());
+        all.push(std::iter::once(name).chain(cells).collect());
     }
-    let columns = section.head.len();
     // The last cell of a short row is not in its column.
     let aligned = |cells: &[Span<'_>]| match cells.len() {
-        few if few < columns => few - 1,
+        few if few < head.len() => few.saturating_sub(1),
         all => all,
     };
-    let mut widths = vec![0; columns];
-    for cells in &lines_of_cells {
+    let mut widths = vec![0; head.len()];
+    for cells in &all {
         for (width, cell) in widths.iter_mut().zip(cells.iter().take(aligned(cells))) {
             *width = cell.width().max(*width);
         }
     }
-    for cells in lines_of_cells {
+    for cells in all {
         let aligned = aligned(&cells);
         let mut spans = Vec::new();
         for (column, ((cell, width), name)) in
-            (cells.into_iter().zip(&widths).zip(section.head)).enumerate()
+            (cells.into_iter().zip(&widths).zip(&head)).enumerate()
         {
             spans.push(Span::raw("  "));
             let gap = Span::raw(" ".repeat(width.saturating_sub(cell.width())));
