@@ -142,7 +142,7 @@ fn robot(ms: i64) -> Snapshot {
             (Role::Joint, "wrist"),
             (Role::Joint, "finger"),
             (Role::Contact, "hand"),
-            (Role::Contact, "foot"),
+            (Role::Contact, "Foot"),
         ],
     ));
     for t in (0..=ms).step_by(10) {
@@ -258,7 +258,7 @@ fn each_part_shows_its_values_or_why_not() {
         "hand",
         "hand detected 10.0 -2.5 0.0 ± 3.0 0.25 0.00 0.00 ± 0.04 as configured, in hand_frame",
     );
-    is("CONTACTS", "foot", "foot withheld: absent");
+    is("CONTACTS", "Foot", "Foot withheld: absent");
     is("CHANNELS", "ft", "ft joint 100.0 0.0 ms saturated");
     is("CHANNELS", "elbow", "elbow joint 0.0 - never seen");
     is(
@@ -391,8 +391,14 @@ fn a_filter_shows_only_names_that_contain_it() {
     );
     assert_eq!(press(&mut view, &[Esc]), Wish::Nothing);
     assert!(shown(&mut view).contains("  wrist "));
-    press(&mut view, &[Char('/'), Char('x'), Esc]);
-    assert!(shown(&mut view).contains("  wrist "));
+    press(&mut view, &[Char('/'), Char('f'), Char('o')]);
+    let text = shown(&mut view);
+    assert!(
+        text.contains("  Foot ") && !text.contains("  hand "),
+        "{text}"
+    );
+    press(&mut view, &[Esc]);
+    assert!(shown(&mut view).contains("  hand "));
     assert_eq!(press(&mut view, &[Esc]), Wish::Quit);
     assert_eq!(press(&mut view, &[Char('q')]), Wish::Quit);
     press(&mut view, &[Char('/')]);
@@ -436,7 +442,7 @@ fn sections_are_reached_by_keys_and_robots_in_turn() {
     );
     assert!(top(&mut view, &[KeyCode::Up, KeyCode::BackTab]).starts_with("TORQUES"));
     assert!(top(&mut view, &[KeyCode::BackTab]).starts_with("IDENTIFICATION"));
-    assert!(top(&mut view, &[KeyCode::Home, KeyCode::PageDown]).starts_with("  foot"));
+    assert!(top(&mut view, &[KeyCode::Home, KeyCode::PageDown]).starts_with("  Foot"));
     assert!(top(&mut view, &[KeyCode::End]).starts_with("IDENTIFICATION"));
     assert!(top(&mut view, &[KeyCode::Tab]).starts_with("TORQUES"));
     assert_eq!(
