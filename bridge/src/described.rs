@@ -71,7 +71,19 @@ impl Described {
         }))
     }
 
-    /// The newest one.
+    /// Those of `publisher`, without waiting for the first one.
+    ///
+    /// # Errors
+    /// They cannot be read.
+    pub fn to_come(domain: &Domain, robot: &str, publisher: Publisher) -> Result<Self, PortError> {
+        Ok(Self {
+            reader: Reader::open(domain, robot)?,
+            publisher,
+            newest: Description::new(publisher, []),
+        })
+    }
+
+    /// The newest one; without entries if none has come.
     #[must_use]
     pub const fn newest(&self) -> &Description {
         &self.newest

@@ -122,13 +122,13 @@ struct Estimates {
 }
 
 impl Estimates {
-    /// Those of the robot's estimator; `None` if it does not run.
+    /// Those of the robot's estimator, without waiting for its names; `None` if it has never run.
     fn of(domain: &Domain, robot: &str) -> Option<Self> {
         Some(Self {
             torques: Reader::open(domain, robot).ok()?,
             contacts: Reader::open(domain, robot).ok()?,
             health: Reader::open(domain, robot).ok(),
-            described: Described::by(domain, robot, Publisher::Estimator).ok()??,
+            described: Described::to_come(domain, robot, Publisher::Estimator).ok()?,
             names: None,
         })
     }
@@ -164,7 +164,8 @@ pub struct Listener {
 }
 
 impl Listener {
-    /// Listens to the robot of this name, or the only one.
+    /// Listens to the robot of this name, or the only one. Waits half a second for the names of an
+    /// estimator that does not run.
     ///
     /// # Errors
     /// [`ListenError`]: its gateway does not run, or it cannot be read.
@@ -181,6 +182,7 @@ impl Listener {
             error => error.into(),
         })?;
         let gateway = Described::by(&domain, &robot, Publisher::Gateway)?;
+        let estimator = Described::by(&domain, &robot, Publisher::Estimator)?;
         let mut listener = Self {
             declarations: Reader::open(&domain, &robot).ok(),
             health: Reader::open(&domain, &robot).ok(),
@@ -200,9 +202,8 @@ impl Listener {
         };
         let description = *listener.gateway.newest();
         listener.name_channels(&description);
-        if let Some(estimates) = &listener.estimates {
-            let names = *estimates.described.newest();
-            listener.name_contacts(&names);
+        if let Some(described) = estimator {
+            listener.name_contacts(described.newest());
         }
         Ok(listener)
     }
@@ -393,10 +394,6 @@ impl Listener {
         }
         if self.estimates.is_none() {
             self.estimates = Estimates::of(&self.domain, &self.robot);
-            if let Some(estimates) = &self.estimates {
-                let names = *estimates.described.newest();
-                self.name_contacts(&names);
-            }
         }
         if self.declarations.is_none() {
             self.declarations = Reader::open(&self.domain, &self.robot).ok();

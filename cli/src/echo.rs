@@ -6,8 +6,8 @@ use anyhow::{Context, bail};
 use proprio_bridge::{Described, next, one_robot, open};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Topic, Unavailable, monotonic};
 use proprio_topics::{
-    Code, ContactEstimate, Description, Name, Nanos, Publisher, Reason, Role, Sample,
-    TorqueEstimate,
+    Code, ContactEstimate, ContactWrench, Description, Entry, Name, Nanos, Publisher, Reason, Role,
+    Sample, TorqueEstimate,
 };
 use serde_json::{Map, Value as Json, json};
 use std::io::{self, BufWriter, ErrorKind, StdoutLock, Write};
@@ -235,6 +235,19 @@ pub(crate) fn of_joints<'a>(
     })
 }
 
+/// The contacts of an estimate: name and frame, wrench, and why it is withheld.
+pub(crate) fn of_contacts<'a>(
+    description: &'a Description,
+    estimate: &'a ContactEstimate,
+) -> impl Iterator<Item = (&'a Entry, &'a ContactWrench, Option<Unavailable>)> {
+    let numbered = (0..).zip(estimate.contacts());
+    numbered.filter_map(|(index, contact)| {
+        let entry = description.find(Role::Contact, index)?;
+        let withheld = withheld(description, contact.valid, contact.reason, contact.cause);
+        Some((entry, contact, withheld))
+    })
+}
+
 /// A torque in JSON; null if it is withheld.
 pub(crate) fn torque_json(torque: f64, deviation: f64, withheld: Option<&Unavailable>) -> Json {
     let given = |value: f64| withheld.is_none().then_some(value);
@@ -303,14 +316,8 @@ fn contacts_of(
         described,
         |out, description, estimate: &ContactEstimate| {
             let t = estimate.header.acquired;
-            let named = (0..)
-                .zip(estimate.contacts())
-                .filter_map(|(index, contact)| {
-                    let name = description.find(Role::Contact, index)?.name.as_str();
-                    let withheld =
-                        withheld(description, contact.valid, contact.reason, contact.cause);
-                    Some((name, contact, withheld))
-                });
+            let named = of_contacts(description, estimate)
+                .map(|(entry, contact, withheld)| (entry.name.as_str(), contact, withheld));
             let wanted = named.filter(|(name, ..)| is_wanted(name));
             if args.json {
                 let of_contacts: Map<_, _> = wanted

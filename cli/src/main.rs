@@ -22,6 +22,7 @@ mod setup;
 mod simulate;
 mod status;
 mod table;
+mod top;
 
 use clap::{Parser, Subcommand};
 use proprio_topics::ipc::DomainConfig;
@@ -69,6 +70,8 @@ enum Verb {
     Identify(identify::Args),
     /// Show the robots of a running system: processes, buses, devices, channels, estimates
     Status(status::Status),
+    /// Show a running robot on the whole terminal, as it is now: torques, contacts, channels, buses
+    Top(top::Top),
     /// Print the samples of a channel, the torques or the contacts as they come
     Echo(echo::Echo),
     /// Record what a robot measures and feels: a table, a recording for viewers, or a black box
@@ -117,6 +120,7 @@ fn main() -> ExitCode {
         Verb::Estimate(args) => convert::estimate(&args),
         Verb::Identify(args) => identify::run(&args),
         Verb::Status(args) => status::run(&args, &domain),
+        Verb::Top(args) => top::run(&args, &domain),
         Verb::Echo(args) => echo::run(&args, &domain),
         Verb::Record(args) => record::run(&args, &domain),
         Verb::Ctl(args) => ctl::run(&args, &domain),

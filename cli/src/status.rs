@@ -1,20 +1,17 @@
 //! `proprio status`: what a running system does, from shared memory alone.
 
 use crate::echo::{of_joints, torque_json};
-use crate::print::CLOSED;
-use crate::running::interrupted;
 use anyhow::bail;
 use proprio_bridge::{Described, first_of, open};
 use proprio_topics::ipc::{
     Domain, DomainConfig, PortError, Reader, RobotPresence, Topic, Unavailable, monotonic,
 };
 use proprio_topics::{
-    Controller, Counter, Description, DeviceState, EstimatorHealth, GatewayHealth, Kind, LinkState,
-    MAX_CHANNELS, Nanos, Publisher, Quality, Role, Sample, TorqueEstimate, axes,
+    Controller, Counter, Description, DeviceHealth, DeviceState, EstimatorHealth, GatewayHealth,
+    Kind, LinkState, MAX_CHANNELS, Nanos, Publisher, Quality, Role, Sample, TorqueEstimate, axes,
 };
 use serde_json::{Value as Json, json};
 use std::collections::BTreeMap;
-use std::sync::atomic::Ordering::Relaxed;
 
 /// How long `status` counts samples and estimates.
 const WINDOW: Nanos = Nanos::from_millis(1000);
@@ -27,9 +24,6 @@ pub(crate) struct Status {
     /// Print as JSON, one object
     #[arg(long)]
     json: bool,
-    /// Show again every second until interrupted
-    #[arg(long)]
-    watch: bool,
 }
 
 /// The robots to show: the named one, or all.
@@ -295,16 +289,10 @@ impl Glance {
         }
         for device in self.gateway.iter().flat_map(GatewayHealth::devices) {
             let state = device.state.get().map_or("unknown", DeviceState::word);
-            let counts: Vec<_> = Counter::ALL
-                .into_iter()
-                .zip(device.counters)
-                .filter(|(_, count)| *count > 0)
-                .map(|(counter, count)| format!("{} {count}", counter.word()))
-                .collect();
             print_line!(
                 "    device {:<21} {state:<10} {}{}",
                 device.name.as_str(),
-                counts.join(", "),
+                counts(device, &[]),
                 match device.frozen_axes {
                     0 => String::new(),
                     mask => format!("; {} frozen", axes(mask)),
@@ -359,34 +347,33 @@ pub(crate) fn load(share: f64, frame_rate: f64) -> String {
     format!("{share}{frame_rate:.0} frames/s")
 }
 
+/// The counters of a device that are not zero, without those of `except`.
+pub(crate) fn counts(device: &DeviceHealth, except: &[Counter]) -> String {
+    let counts = Counter::ALL.into_iter().zip(device.counters);
+    let counts = counts.filter(|(counter, count)| *count > 0 && !except.contains(counter));
+    let words = counts.map(|(counter, count)| format!("{} {count}", counter.word()));
+    words.collect::<Vec<_>>().join(", ")
+}
+
 /// Shows the robots of the domain.
 pub(crate) fn run(args: &Status, config: &DomainConfig) -> anyhow::Result<()> {
-    let stop = interrupted()?;
     let domain = open(config)?;
-    loop {
-        let glances = robots(&domain, args.robot.as_deref())?
-            .into_iter()
-            .map(|presence| Glance::take(&domain, presence))
-            .collect::<anyhow::Result<Vec<_>>>()?;
-        if args.json {
-            let robots: Vec<_> = glances.iter().map(Glance::json).collect();
-            print_line!(
-                "{}",
-                json!({ "domain": config.name, "domains": config.siblings(), "robots": robots })
-            );
-        } else {
-            if args.watch {
-                // Clear the screen.
-                print_part!("\x1b[2J\x1b[H");
-            }
-            print_line!("domain {} in {}", config.name, config.base.display());
-            if glances.is_empty() {
-                print_line!("no robot");
-            }
-            glances.iter().for_each(Glance::print);
-        }
-        if !args.watch || stop.load(Relaxed) || CLOSED.load(Relaxed) {
-            return Ok(());
-        }
+    let glances = robots(&domain, args.robot.as_deref())?
+        .into_iter()
+        .map(|presence| Glance::take(&domain, presence))
+        .collect::<anyhow::Result<Vec<_>>>()?;
+    if args.json {
+        let robots: Vec<_> = glances.iter().map(Glance::json).collect();
+        print_line!(
+            "{}",
+            json!({ "domain": config.name, "domains": config.siblings(), "robots": robots })
+        );
+        return Ok(());
     }
+    print_line!("domain {} in {}", config.name, config.base.display());
+    if glances.is_empty() {
+        print_line!("no robot");
+    }
+    glances.iter().for_each(Glance::print);
+    Ok(())
 }

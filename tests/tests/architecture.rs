@@ -65,7 +65,7 @@ const EVERYTHING: [&str; 10] = [
 
 /// Libraries that only some members may depend on directly: the name (or a prefix with a star) and
 /// these members.
-const CONFINED: [(&str, &[&str]); 6] = [
+const CONFINED: [(&str, &[&str]); 7] = [
     ("socketcan", &["proprio-gateway"]),
     ("iceoryx2*", &["proprio-topics"]),
     (
@@ -82,6 +82,7 @@ const CONFINED: [(&str, &[&str]); 6] = [
     ("tokio", &["proprio-gateway", "proprio-estimator"]),
     // Not in the daemons' crates.
     ("mcap", &["proprio-recording"]),
+    ("ratatui*", &["proprio-cli"]),
 ];
 
 /// The parts of iceoryx2 that topics may use without its feature `ipc`: they are no_std and open
@@ -162,7 +163,7 @@ const CLOCKS: [(&str, &str); 2] = [
 
 /// The files that may call these clocks: the outermost loops of programs, and tests that wait for
 /// processes.
-const OUTERMOST: [(&str, &str); 16] = [
+const OUTERMOST: [(&str, &str); 17] = [
     ("gateway/topics/src/ipc/clock.rs", "is it"),
     ("gateway/src/clock.rs", "the gateway's clock"),
     ("gateway/topics/src/ipc/bell.rs", "tests of waiting"),

@@ -93,7 +93,8 @@ fn commands_and_their_options_exist() {
         for command in commands(&text) {
             let mut words = command.split(' ');
             let verb = words.next().expect("a verb");
-            if verb.starts_with('-') {
+            // These are programs of their own, which are not built here.
+            if verb.starts_with('-') || ["view", "ros2"].contains(&verb) {
                 continue;
             }
             let help = help(verb);

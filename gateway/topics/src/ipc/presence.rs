@@ -53,6 +53,7 @@ const SILENCE: Nanos = Nanos::from_millis(1000);
 #[derive(Debug)]
 pub struct Watch<T: Topic, S: Service = ipc::Service> {
     reader: Option<Reader<T, S>>,
+    newest: Option<T>,
     /// When the last health was published, and at first when its writer was seen.
     last: Nanos,
     /// The writer: its node, and how many had left in order when it was first seen.
@@ -65,6 +66,7 @@ impl<T: Topic, S: Service> Default for Watch<T, S> {
     fn default() -> Self {
         Self {
             reader: None,
+            newest: None,
             last: Nanos::MIN,
             writer: None,
             went: Presence::Ended,
@@ -84,6 +86,7 @@ impl<T: Topic, S: Service> Watch<T, S> {
         };
         if let Ok(Some(health)) = reader.latest() {
             self.last = health.header().published;
+            self.newest = Some(health);
         }
         let alive = reader.live_writer();
         match (self.writer, alive) {
@@ -111,6 +114,12 @@ impl<T: Topic, S: Service> Watch<T, S> {
             (None, None) => {}
         }
         self.went
+    }
+
+    /// The newest health that [`Watch::look`] has seen.
+    #[must_use]
+    pub const fn newest(&self) -> Option<&T> {
+        self.newest.as_ref()
     }
 }
 
