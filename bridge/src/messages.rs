@@ -331,7 +331,8 @@ impl<S: Sink> Messages<S> {
         known.map_or(JointState::ABSENT, |known| known.state)
     }
 
-    /// The contact wrenches of an instant, of the estimator that sent `names`.
+    /// The contact wrenches of an instant and what they leave unexplained of each sub-tree's F/T
+    /// readings, of the estimator that sent `names`.
     ///
     /// # Errors
     /// Those of the sink.
@@ -371,6 +372,23 @@ impl<S: Sink> Messages<S> {
                 torque: contact.torque,
             };
             let topic = format!("/contact/{}", entry.name.as_str());
+            self.send(&topic, definitions::wrench_stamped, t, |wall| {
+                wrench_stamped(wall, entry.frame.as_str(), &wrench)
+            })?;
+        }
+        for (residual, number) in estimate.residuals().iter().zip(0..) {
+            // Zeros without a significance are no measurement: a contact that may be anything
+            // takes all, or a sensor fails.
+            let is_known = !residual.significance.is_nan();
+            let values = residual.force.iter().chain(&residual.torque);
+            let is_known = is_known && values.into_iter().all(|value| value.is_finite());
+            let entry = names.find(Role::SubTree, number).filter(|_| is_known);
+            let Some(entry) = entry else { continue };
+            let wrench = Wrench {
+                force: residual.force,
+                torque: residual.torque,
+            };
+            let topic = format!("/external/{}", entry.name.as_str());
             self.send(&topic, definitions::wrench_stamped, t, |wall| {
                 wrench_stamped(wall, entry.frame.as_str(), &wrench)
             })?;
@@ -440,4 +458,91 @@ fn imu(wall: u64, frame: &str, imu: &Imu) -> Message {
     message.f64s(&imu.proper_acceleration);
     message.f64s(&[0.0; 9]);
     message
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cdr::Parsed;
+    use proprio_topics::{
+        ContactWrench, Entry, Header, MAX_CONTACTS, MAX_SUBTREES, Name, Publisher, Residual,
+    };
+
+    /// All that was sent, by topic.
+    #[derive(Default)]
+    struct Sent(Vec<(String, Vec<u8>)>);
+
+    impl Sink for Sent {
+        type Channel = String;
+        type Error = std::convert::Infallible;
+
+        fn add(
+            &mut self,
+            topic: &str,
+            definition: &Definition,
+            _: Option<usize>,
+        ) -> Result<Option<String>, Self::Error> {
+            let is_wrench = definition.name == "geometry_msgs/msg/WrenchStamped";
+            Ok(is_wrench.then(|| topic.to_owned()))
+        }
+
+        fn send(&mut self, topic: &String, _: u64, message: &Message) -> Result<(), Self::Error> {
+            self.0.push((topic.clone(), message.bytes().to_vec()));
+            Ok(())
+        }
+    }
+
+    fn entry(role: Role, index: u32, name: &str, frame: &str) -> Entry {
+        Entry {
+            name: Name::new(name).unwrap(),
+            frame: Name::new(frame).unwrap(),
+            role: role.in_memory(),
+            index,
+            ..Entry::NONE
+        }
+    }
+
+    #[test]
+    fn an_external_wrench_is_sent_where_it_is_known() {
+        let names = Description::new(
+            Publisher::Estimator,
+            [
+                entry(Role::Contact, 0, "hand", "l_hand"),
+                entry(Role::SubTree, 0, "chest", "chest"),
+                entry(Role::SubTree, 1, "l_upper_arm", "l_upper_arm"),
+                entry(Role::SubTree, 2, "r_upper_arm", "r_upper_arm"),
+            ],
+        );
+        let mut residuals = [Residual::ABSENT; MAX_SUBTREES];
+        // Zeros that nobody measured, as of a sub-tree with a contact that may be anything.
+        (residuals[0].force, residuals[0].torque) = ([0.0; 3], [0.0; 3]);
+        residuals[1] = Residual {
+            force: [1.0, 2.0, 3.0],
+            torque: [4.0, 5.0, 6.0],
+            significance: 7.0,
+            ..Residual::ABSENT
+        };
+        residuals[2].significance = 0.0;
+        let acquired = Nanos::from_millis(2_000);
+        let estimate = ContactEstimate {
+            header: Header {
+                acquired,
+                ..Header::default()
+            },
+            count: 1,
+            residual_count: 3,
+            contacts: [ContactWrench::ABSENT; MAX_CONTACTS],
+            residuals,
+        };
+        let mut messages = Messages::new(Sent::default(), "arm", Nanos::from_millis(500));
+        assert_eq!(messages.contacts(&names, &estimate), Ok(()));
+        let Sent(sent) = messages.into_sink();
+        let topics: Vec<&str> = sent.iter().map(|(topic, _)| topic.as_str()).collect();
+        assert_eq!(topics, ["/external/l_upper_arm"]);
+        let mut message = Parsed::new(&sent[0].1).unwrap();
+        assert_eq!(message.time(), Some(Nanos::from_millis(2_500)));
+        assert_eq!(message.text(), Some("l_upper_arm"));
+        let values = [(); 6].map(|()| message.f64().unwrap());
+        assert_eq!(values, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+    }
 }
