@@ -29,8 +29,8 @@ const WINDOW: i32 = 16_384;
 /// How many messages wait while a reader owes too many acknowledgements. Each reader that is new
 /// does at first, for some milliseconds.
 const QUEUE: usize = 100;
-/// How long they wait \[ns\]. Then a writer that owes nothing takes the old one's place, so that one
-/// reader without acknowledgements does not stop the others for ever.
+/// How long they wait \[ns\]. Then a writer that is owed nothing takes the old one's place, so that
+/// a reader without acknowledgements does not stop the others for ever.
 const PATIENCE: u64 = 1_000_000_000;
 
 /// Why the node cannot work.

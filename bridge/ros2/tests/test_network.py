@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from conftest import DOMAIN, ROBOT, Subscription, until
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
-from cyclonedds.core import Policy
+from cyclonedds.core import InstanceState, Policy
 from cyclonedds.domain import DomainParticipant
 from messages import Imu, JointState, ParticipantEntitiesInfo, WrenchStamped
 
@@ -27,7 +27,7 @@ class Publications:
 
     def find(self):
         for one in self.reader.take(N=1000):
-            if one.sample_info.valid_data and one.topic_name:
+            if one.sample_info.instance_state == InstanceState.Alive:
                 self.there[str(one.key)] = one
             else:
                 self.there.pop(str(one.key), None)
