@@ -22,6 +22,7 @@
 //! | `/ft/<sensor>` | `geometry_msgs/msg/WrenchStamped` | what an F/T sensor reports |
 //! | `/imu/<sensor>` | `sensor_msgs/msg/Imu` | what an IMU reports |
 //! | `/contact/<name>` | `geometry_msgs/msg/WrenchStamped` | the wrench of a contact, while valid |
+//! | `/external/<link>` | `geometry_msgs/msg/WrenchStamped` | F/T beyond model and known contacts |
 //! | `/diagnostics` | `diagnostic_msgs/msg/DiagnosticArray` | buses, devices, estimator |
 //!
 //! Stamps of standard messages are the wall clock's; `acquired` is CLOCK_MONOTONIC \[ns\].

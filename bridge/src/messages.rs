@@ -356,7 +356,8 @@ impl<S: Sink> Messages<S> {
         known.map_or(JointState::ABSENT, |known| known.state)
     }
 
-    /// The contact wrenches of an instant, of the estimator that sent `names`.
+    /// The contact wrenches of an instant and what they leave unexplained of each sub-tree's F/T
+    /// readings, of the estimator that sent `names`.
     ///
     /// # Errors
     /// Those of the sink.
@@ -396,6 +397,23 @@ impl<S: Sink> Messages<S> {
                 torque: contact.torque,
             };
             let topic = format!("/contact/{}", entry.name.as_str());
+            self.send(&topic, definitions::wrench_stamped, t, |wall| {
+                wrench_stamped(wall, entry.frame.as_str(), &wrench)
+            })?;
+        }
+        for (residual, number) in estimate.residuals().iter().zip(0..) {
+            // Zeros without a significance are no measurement: a contact that may be anything
+            // takes all, or a sensor fails.
+            let is_known = !residual.significance.is_nan();
+            let values = residual.force.iter().chain(&residual.torque);
+            let is_known = is_known && values.into_iter().all(|value| value.is_finite());
+            let entry = names.find(Role::SubTree, number).filter(|_| is_known);
+            let Some(entry) = entry else { continue };
+            let wrench = Wrench {
+                force: residual.force,
+                torque: residual.torque,
+            };
+            let topic = format!("/external/{}", entry.name.as_str());
             self.send(&topic, definitions::wrench_stamped, t, |wall| {
                 wrench_stamped(wall, entry.frame.as_str(), &wrench)
             })?;
@@ -490,7 +508,10 @@ fn imu(wall: u64, frame: &str, imu: &Imu) -> Message {
 mod tests {
     use super::*;
     use crate::cdr::Parsed;
-    use proprio_topics::{Entry, MAX_JOINTS, Name, Publisher, Reason};
+    use proprio_topics::{
+        ContactWrench, Entry, Header, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Publisher,
+        Reason, Residual,
+    };
 
     /// Keeps what it is sent.
     #[derive(Default)]
@@ -529,6 +550,7 @@ mod tests {
     fn entry(role: Role, index: u32, name: &str) -> Entry {
         Entry {
             name: Name::new(name).unwrap_or(Name::EMPTY),
+            frame: Name::new(name).unwrap_or(Name::EMPTY),
             role: role.in_memory(),
             index,
             ..Entry::NONE
@@ -559,7 +581,7 @@ mod tests {
         };
         let mut joints = [JointTorque::ABSENT; MAX_JOINTS];
         (joints[0], joints[1]) = (good, withheld);
-        let header = proprio_topics::Header {
+        let header = Header {
             acquired: Nanos(7),
             ..Default::default()
         };
@@ -603,5 +625,50 @@ mod tests {
             (valid, reason, cause),
             (Some(false), Some("uncertain"), Some("ft"))
         );
+    }
+
+    #[test]
+    fn an_external_wrench_is_sent_where_it_is_known() {
+        let names = Description::new(
+            Publisher::Estimator,
+            [
+                entry(Role::Contact, 0, "hand"),
+                entry(Role::SubTree, 0, "chest"),
+                entry(Role::SubTree, 1, "l_upper_arm"),
+                entry(Role::SubTree, 2, "r_upper_arm"),
+            ],
+        );
+        let mut residuals = [Residual::ABSENT; MAX_SUBTREES];
+        // Zeros that nobody measured, as of a sub-tree with a contact that may be anything.
+        (residuals[0].force, residuals[0].torque) = ([0.0; 3], [0.0; 3]);
+        residuals[1] = Residual {
+            force: [1.0, 2.0, 3.0],
+            torque: [4.0, 5.0, 6.0],
+            significance: 7.0,
+            ..Residual::ABSENT
+        };
+        residuals[2].significance = 0.0;
+        let acquired = Nanos::from_millis(2_000);
+        let estimate = ContactEstimate {
+            header: Header {
+                acquired,
+                ..Header::default()
+            },
+            count: 1,
+            residual_count: 3,
+            contacts: [ContactWrench::ABSENT; MAX_CONTACTS],
+            residuals,
+        };
+        let mut messages = Messages::new(Kept::default(), "arm", Nanos::from_millis(500));
+        assert_eq!(messages.contacts(&names, &estimate), Ok(()));
+        let mut sent = messages.into_sink().sent;
+        sent.retain(|(topic, ..)| topic.starts_with("/external"));
+        let topics: Vec<&str> = sent.iter().map(|(topic, ..)| topic.as_str()).collect();
+        assert_eq!(topics, ["/external/l_upper_arm"]);
+        let mut message = Parsed::new(&sent[0].2).expect("CDR");
+        assert_eq!(message.time(), Some(Nanos::from_millis(2_500)));
+        assert_eq!(message.text(), Some("l_upper_arm"));
+        let values = [(); 6].map(|()| message.f64().expect("a number"));
+        assert_eq!(values, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
     }
 }

@@ -36,10 +36,7 @@ pub(crate) fn of_recording(
 }
 
 /// The table that `input` is, or has as a recording.
-pub(crate) fn table(
-    input: impl Read + Send + 'static,
-    path: &Path,
-) -> anyhow::Result<Box<dyn Read + Send>> {
+pub(crate) fn table(input: impl Read + Send + 'static, path: &Path) -> anyhow::Result<Bytes> {
     convert(input, path, Into::Table { from_table: true })
         .with_context(|| format!("{}: cannot be read", path.display()))
 }
@@ -61,7 +58,7 @@ fn convert(mut input: impl Read + Send + 'static, path: &Path, what: Into) -> io
     let whole = Cursor::new(beginning).chain(input);
     match (is_recording, what) {
         (true, _) => {}
-        (false, Into::Table { from_table: true } | Into::Frames) => return Ok(Box::new(whole)),
+        (false, Into::Table { from_table: true } | Into::Frames) => return Ok(Bytes::of(whole)),
         (false, _) => return Err(io::Error::other("it is no recording (MCAP)")),
     }
     let (pipe, to) = io::pipe()?;
@@ -75,7 +72,7 @@ fn convert(mut input: impl Read + Send + 'static, path: &Path, what: Into) -> io
                 Into::Frames => to_log(whole, to),
             }
         })?;
-    Ok(Box::new(Converted {
+    Ok(Bytes::of(Converted {
         name: path.display().to_string(),
         pipe,
         thread: Some(thread),

@@ -9,10 +9,12 @@ use std::io::{Read, Write};
 
 /// What is estimated at one instant: column and cell.
 type Row = Vec<(String, String)>;
+/// Reads a message: its instant, and what it tells.
+type ReadMessage = fn(&[u8]) -> Option<(i64, Row)>;
 
 /// The table that is being made.
 struct Table<W: Write> {
-    channels: BTreeMap<u16, fn(&[u8]) -> Option<(i64, Row)>>,
+    channels: BTreeMap<u16, ReadMessage>,
     output: csv::Writer<W>,
     columns: Vec<String>,
     /// The instant whose torques have come.
@@ -37,7 +39,7 @@ pub fn to_estimates<W: Write>(recording: impl Read, output: W) -> Result<Summary
     table.summary.is_cut = walk(recording, &mut table, is_known, |table, record| {
         match record {
             Record::Channel(channel) => {
-                let read: fn(&[u8]) -> _ = match channel.topic.as_str() {
+                let read: ReadMessage = match channel.topic.as_str() {
                     "/torques" => torques,
                     "/contacts" => contacts,
                     _ => return Ok(()),

@@ -40,7 +40,7 @@ fn fill(domain: &str, bus: &str, rate: u64, stop: &AtomicBool) {
         }
         // What others send is not read here; the socket drops it.
         let _ = link.counters();
-        next = next + Nanos::from_millis(1);
+        next += Nanos::from_millis(1);
         sleep_until(next);
     }
 }

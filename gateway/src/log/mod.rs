@@ -50,13 +50,34 @@ pub use reader::{REORDER, Reader, Report, StepBack};
 pub use record::{Direction, LineError, LogFormat, Record};
 pub use stamps::{STAMPS_OPTION, Stamps};
 
+use std::fmt;
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 use std::sync::OnceLock;
 
 /// A log, as bytes of one of these formats.
-pub type Bytes = Box<dyn Read + Send>;
+pub struct Bytes(Box<dyn Read + Send>);
+
+impl Bytes {
+    /// Those that `from` gives.
+    pub fn of(from: impl Read + Send + 'static) -> Self {
+        Self(Box::new(from))
+    }
+}
+
+impl Read for Bytes {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        self.0.read(buffer)
+    }
+}
+
+impl fmt::Debug for Bytes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Bytes")
+    }
+}
+
 /// Makes of a file what can be read: the file itself, or what it is as a log of these formats.
 pub type Convert = fn(File, &Path) -> io::Result<Bytes>;
 
@@ -75,6 +96,6 @@ pub fn open(path: &Path) -> io::Result<Bytes> {
     let file = File::open(path)?;
     match CONVERT.get() {
         Some(convert) => convert(file, path),
-        None => Ok(Box::new(file)),
+        None => Ok(Bytes::of(file)),
     }
 }

@@ -1,0 +1,62 @@
+"""Killed daemons, and a bridge that is there before them."""
+
+import math
+import time
+
+from conftest import DOMAIN, ROBOT, Diagnostics, Subscription, until
+from cyclonedds.domain import DomainParticipant
+from messages import ERROR, OK, STALE, DiagnosticArray, JointState
+
+
+def torques(states):
+    """Whether a joint state with torques has come."""
+    return any(not any(map(math.isnan, state.effort)) for state in states.take())
+
+
+def killed(robot, states, diagnostics, name):
+    """Kills a daemon; within 3 s no torque is published any more, and diagnostics say so. Starts it
+    again, and torques return."""
+    until("torques", lambda: torques(states))
+    until("all is well", lambda: diagnostics.level(name) == OK)
+    robot.kill(name)
+    died = time.monotonic()
+    until("diagnostics", lambda: diagnostics.level(name) in (ERROR, STALE), 3.0)
+    time.sleep(max(0.0, died + 3.0 - time.monotonic()))
+    states.take()
+    assert not torques_within(states, 1.0)
+    assert "no word" in diagnostics.newest()[name].message
+    robot.start(name)
+    until("torques again", lambda: torques(states))
+    until("all is well again", lambda: diagnostics.level(name) == OK, 5.0)
+
+
+def torques_within(states, seconds):
+    return any(not all(map(math.isnan, state.effort)) for state in states.collect(seconds))
+
+
+def test_a_killed_estimator(robot, subscribe, diagnostics):
+    killed(robot, subscribe("rt/joint_states", JointState), diagnostics, "estimator")
+
+
+def test_a_killed_gateway(robot, subscribe, diagnostics):
+    states = subscribe("rt/joint_states", JointState)
+    killed(robot, states, diagnostics, "gateway")
+    assert diagnostics.level("device l_arm_ft_sensor") == OK
+
+
+def test_the_bridge_may_be_first(other_robot):
+    robot, domain = other_robot, DOMAIN + 6
+    robot.bridge(domain=domain)
+    participant = DomainParticipant(domain)
+    states = Subscription(participant, "rt/joint_states", JointState)
+    until("it waits", lambda: "waiting" in robot.said("bridge"))
+    time.sleep(2.0)
+    said = robot.said("bridge").splitlines()
+    assert len(said) == len(set(said)) == 1, said
+    robot.start("estimator")
+    time.sleep(1.0)
+    robot.start("gateway", "simulate")
+    until("torques", lambda: torques(states))
+    diagnostics = Diagnostics(Subscription(participant, "rt/diagnostics", DiagnosticArray))
+    until("all is well", lambda: diagnostics.level("gateway") == OK)
+    assert f"publishing {ROBOT}" in robot.said("bridge")
