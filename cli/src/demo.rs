@@ -30,8 +30,11 @@ use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
 use watching::watch;
 
+/// The domain of who names none: a robot may run there.
+const DEFAULT: &str = "default";
+
 /// Runs the demonstration.
-pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     let original = Robot::open(&args.robot)?;
     // Check the faults before anything is started.
     let faults = args
@@ -77,12 +80,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         .prefix("proprio-")
         .tempdir()
         .context("cannot create a temporary folder")?;
-    // In memory: on a disk, processes start when it has time for them.
-    let shared = tempfile::Builder::new()
-        .prefix("proprio-")
-        .tempdir_in("/dev/shm")
-        .context("cannot create a folder in shared memory")?;
-    let domain = DomainConfig::new(shared.path(), &format!("demo-{}", std::process::id()));
+    // One of its own: a robot that runs here is left alone. Others can look, if they know it.
+    let domain = match domain.name == DEFAULT {
+        true => DomainConfig::new(&domain.base, &format!("demo-{}", std::process::id())),
+        false => domain.clone(),
+    };
     let folder = private.path().join("robot");
     copy_robot(&original, &args.bus, &folder)?;
     let robot = Robot::load(&folder)?;
@@ -94,6 +96,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         args.seconds
     );
     print_line!("{}", experiment.story(args));
+    print_line!(
+        "To look at it meanwhile: proprio top --domain {}",
+        domain.name
+    );
     let mut processes = Processes {
         private: private.path().to_owned(),
         domain: domain.clone(),

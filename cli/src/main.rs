@@ -108,7 +108,7 @@ fn main() -> ExitCode {
         domain.name = name;
     }
     let result = match args.verb {
-        Verb::Demo(args) => demo::run(&args),
+        Verb::Demo(args) => demo::run(&args, &domain),
         Verb::Gateway(args) => proprio_gateway::daemon::run(&args.config, &domain, args.check),
         Verb::Estimator(args) => estimator::run(&args, &domain),
         Verb::Simulate(args) => simulate::run(&args, &domain),
