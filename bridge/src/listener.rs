@@ -156,10 +156,11 @@ pub struct Listener {
     /// Of each channel number of the gateway's start `epoch`: its series.
     numbers: Vec<Option<usize>>,
     epoch: u64,
-    /// Samples that wait to be sorted.
-    inbox: Vec<Sample>,
+    /// What waits to be sorted.
+    inbox: Vec<Event>,
     look: Nanos,
     lost: u64,
+    lost_estimates: u64,
     unknown: u64,
 }
 
@@ -197,6 +198,7 @@ impl Listener {
             inbox: Vec::new(),
             look: Nanos::MIN,
             lost: 0,
+            lost_estimates: 0,
             unknown: 0,
             domain,
         };
@@ -230,6 +232,14 @@ impl Listener {
     #[must_use]
     pub fn lost(&self) -> u64 {
         self.lost + self.samples.lost()
+    }
+
+    /// Estimates (torques, and contacts) that came too fast to be read, or before the names of
+    /// their estimator, and are lost.
+    #[must_use]
+    pub fn lost_estimates(&self) -> u64 {
+        let of = |estimates: &Estimates| estimates.torques.lost() + estimates.contacts.lost();
+        self.lost_estimates + self.estimates.as_ref().map_or(0, of)
     }
 
     /// Samples whose channel has no name: those of a gateway that has ended meanwhile.
@@ -270,7 +280,7 @@ impl Listener {
         }
     }
 
-    /// Gives what has come to `take`: samples in the order of time, then estimates and health.
+    /// Gives what has come to `take`: declarations, then all else in the order of time.
     /// `now` is CLOCK_MONOTONIC.
     ///
     /// # Errors
@@ -292,13 +302,25 @@ impl Listener {
             };
             take(self, event)?;
         }
-        // Shared memory delivers all samples of one bus before those of the next.
+        // Shared memory delivers all samples of one bus before those of the next, and an estimate
+        // apart from the samples that it is of.
         let mut inbox = std::mem::take(&mut self.inbox);
-        while let Some(sample) = next(&mut self.samples).map_err(failed)? {
-            inbox.push(sample);
+        self.gather(&mut inbox)?;
+        inbox.sort_by_key(|event| event.t);
+        for event in inbox.drain(..) {
+            take(self, event)?;
         }
-        inbox.sort_by_key(|sample| sample.header.acquired);
-        for sample in inbox.drain(..) {
+        self.inbox = inbox;
+        if now >= self.look {
+            self.look = now + LOOK;
+            self.look_again();
+        }
+        Ok(())
+    }
+
+    /// Takes what has come: samples, then estimates and health.
+    fn gather(&mut self, inbox: &mut Vec<Event>) -> Result<(), ListenError> {
+        while let Some(sample) = next(&mut self.samples)? {
             let epoch = sample.header.epoch;
             if epoch != self.epoch
                 && let Some(description) = self.gateway.of(epoch).copied()
@@ -312,64 +334,51 @@ impl Listener {
                 continue;
             };
             let value = Value::Reading(reading, sample.header.quality);
-            let event = Event {
+            inbox.push(Event {
                 t: sample.header.acquired,
                 epoch,
                 heard: Heard::Value(number, value),
-            };
-            take(self, event)?;
+            });
         }
-        self.inbox = inbox;
         while let Some(reader) = &mut self.health
-            && let Some(health) = next(reader).map_err(failed)?
+            && let Some(health) = next(reader)?
         {
-            let event = Event {
+            inbox.push(Event {
                 t: health.header.published,
                 epoch: health.header.epoch,
                 heard: Heard::Gateway(Box::new(health)),
-            };
-            take(self, event)?;
+            });
         }
-        self.poll_estimator(&mut take)?;
-        if now >= self.look {
-            self.look = now + LOOK;
-            self.look_again();
-        }
-        Ok(())
-    }
-
-    fn poll_estimator<E: From<ListenError>>(
-        &mut self,
-        take: &mut impl FnMut(&Self, Event) -> Result<(), E>,
-    ) -> Result<(), E> {
-        let failed = |error: TakeError| E::from(error.into());
-        let Some(mut estimates) = self.estimates.take() else {
+        let Some(estimates) = &mut self.estimates else {
             return Ok(());
         };
-        while let Some(torques) = next(&mut estimates.torques).map_err(failed)? {
-            let epoch = torques.header.epoch;
-            if let Some(names) = estimates.names_of(epoch) {
-                let t = torques.header.acquired;
-                let heard = Heard::Torques(Box::new(torques), names);
-                take(self, Event { t, epoch, heard })?;
+        while let Some(torques) = next(&mut estimates.torques)? {
+            let (t, epoch) = (torques.header.acquired, torques.header.epoch);
+            match estimates.names_of(epoch) {
+                Some(names) => {
+                    let heard = Heard::Torques(Box::new(torques), names);
+                    inbox.push(Event { t, epoch, heard });
+                }
+                None => self.lost_estimates += 1,
             }
         }
-        while let Some(contacts) = next(&mut estimates.contacts).map_err(failed)? {
-            let epoch = contacts.header.epoch;
-            if let Some(names) = estimates.names_of(epoch) {
-                let t = contacts.header.acquired;
-                let heard = Heard::Contacts(Box::new(contacts), names);
-                take(self, Event { t, epoch, heard })?;
+        while let Some(contacts) = next(&mut estimates.contacts)? {
+            let (t, epoch) = (contacts.header.acquired, contacts.header.epoch);
+            match estimates.names_of(epoch) {
+                Some(names) => {
+                    let heard = Heard::Contacts(Box::new(contacts), names);
+                    inbox.push(Event { t, epoch, heard });
+                }
+                None => self.lost_estimates += 1,
             }
         }
         while let Some(reader) = &mut estimates.health
-            && let Some(health) = next(reader).map_err(failed)?
+            && let Some(health) = next(reader)?
         {
             let (t, epoch) = (health.header.published, health.header.epoch);
             let heard = Heard::Estimator(Box::new(health));
-            take(self, Event { t, epoch, heard })?;
+            inbox.push(Event { t, epoch, heard });
         }
-        self.estimates = Some(estimates);
         Ok(())
     }
 
@@ -381,10 +390,12 @@ impl Listener {
             && let Ok(new) = Self::of(&self.config, domain, self.robot.clone())
         {
             let lost = self.lost();
+            let lost_estimates = self.lost_estimates();
             let (series, unknown) = (std::mem::take(&mut self.series), self.unknown);
             *self = Self {
                 series,
                 lost,
+                lost_estimates,
                 unknown,
                 look: self.look,
                 ..new

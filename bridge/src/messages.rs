@@ -11,6 +11,15 @@ use proprio_topics::{
 };
 use std::collections::BTreeMap;
 
+/// A joint's position whose reading has one of these flags is none.
+const UNTRUSTED: Quality = Quality(Quality::UNTRUSTED_ENCODER.0 | Quality::IMPLAUSIBLE.0);
+/// The newest state of a joint holds for four of its periods, but no shorter and no longer than
+/// this.
+const SHORTEST: Nanos = Nanos::from_millis(50);
+const LONGEST: Nanos = Nanos::from_millis(1000);
+/// How often it is said how everything is.
+const SECOND: Nanos = Nanos::from_millis(1000);
+
 /// Where messages go: a file, a viewer, a network.
 pub trait Sink {
     /// A topic of it.
@@ -49,8 +58,10 @@ struct Known<C> {
     /// Of readings of other kinds than the main one, as temperatures.
     others: BTreeMap<&'static str, Option<C>>,
     standard: Option<C>,
-    /// The newest state of a joint.
+    /// The newest state of a joint, its instant, and until when it holds.
     state: JointState,
+    newest: Nanos,
+    holds_until: Nanos,
 }
 
 /// The topics of everything that is not a series, as they come to be needed.
@@ -84,6 +95,8 @@ pub struct Messages<S: Sink> {
     topics: Topics<S::Channel>,
     gateway: Option<Box<GatewayHealth>>,
     estimator: Option<Box<EstimatorHealth>>,
+    /// When it is said next how everything is.
+    second: Nanos,
 }
 
 impl<S: Sink> Messages<S> {
@@ -99,12 +112,33 @@ impl<S: Sink> Messages<S> {
             },
             gateway: None,
             estimator: None,
+            second: Nanos::MIN,
         }
     }
 
     /// Where they go.
     pub const fn sink(&mut self) -> &mut S {
         &mut self.sink
+    }
+
+    /// Goes on with another sink, whose topics are added as to a new one; returns the one before.
+    /// `offset` as in [`Messages::new`].
+    ///
+    /// # Errors
+    /// Those of the new sink.
+    pub fn turn_to(&mut self, sink: S, offset: Nanos) -> Result<S, S::Error> {
+        let before = std::mem::replace(&mut self.sink, sink);
+        self.offset = offset;
+        self.topics.known.clear();
+        let known = std::mem::take(&mut self.known);
+        let series: Vec<Series> = known.iter().map(|one| one.series.clone()).collect();
+        self.know(&series)?;
+        for (now, before) in self.known.iter_mut().zip(known) {
+            now.state = before.state;
+            (now.newest, now.holds_until) = (before.newest, before.holds_until);
+        }
+        self.announce()?;
+        Ok(before)
     }
 
     /// Where they went.
@@ -155,6 +189,8 @@ impl<S: Sink> Messages<S> {
                 others: BTreeMap::new(),
                 standard,
                 state: JointState::ABSENT,
+                newest: Nanos::MIN,
+                holds_until: Nanos::MIN,
             });
         }
         Ok(())
@@ -249,7 +285,16 @@ impl<S: Sink> Messages<S> {
                 }
                 match (reading, &known.standard) {
                     (Reading::Joint(state), _) => {
-                        known.state = *state;
+                        let is_believed = !quality.intersects(UNTRUSTED);
+                        known.state = if is_believed {
+                            *state
+                        } else {
+                            JointState::ABSENT
+                        };
+                        let period = t.saturating_sub(known.newest);
+                        let longest = (period + period + period + period).min(LONGEST);
+                        known.holds_until = t + longest.max(SHORTEST);
+                        known.newest = t;
                         Ok(())
                     }
                     (Reading::Wrench(wrench), Some(channel)) => {
@@ -299,7 +344,8 @@ impl<S: Sink> Messages<S> {
             }
             message
         })?;
-        let states: Vec<JointState> = joints.iter().map(|(name, _)| self.state(name)).collect();
+        let states = joints.iter().map(|(name, _)| self.state(name, t));
+        let states: Vec<JointState> = states.collect();
         self.send("/joint_states", definitions::joint_state, t, |wall| {
             let mut message = Message::stamped(wall, "");
             message.count(joints.len());
@@ -346,13 +392,15 @@ impl<S: Sink> Messages<S> {
         Ok(())
     }
 
-    /// The newest state of a joint; NaN before the first.
+    /// The newest state of a joint at `t`; NaN before the first, after its board has fallen silent,
+    /// and while its encoder is not to be trusted.
     #[must_use]
-    pub fn state(&self, joint: &str) -> JointState {
+    pub fn state(&self, joint: &str, t: Nanos) -> JointState {
         let is_joint = |known: &&Known<S::Channel>| {
             known.series.what == What::Channel(Kind::Joint) && known.series.name == joint
         };
         let known = self.known.iter().find(is_joint);
+        let known = known.filter(|known| t <= known.holds_until);
         known.map_or(JointState::ABSENT, |known| known.state)
     }
 
@@ -419,6 +467,23 @@ impl<S: Sink> Messages<S> {
             })?;
         }
         Ok(())
+    }
+
+    /// [`Messages::diagnostics`], if the last ones were a second before `t`; from a second after the
+    /// first call on, when health has come.
+    ///
+    /// # Errors
+    /// Those of the sink.
+    pub fn each_second(&mut self, t: Nanos) -> Result<(), S::Error> {
+        if t < self.second {
+            return Ok(());
+        }
+        let is_first = self.second == Nanos::MIN;
+        self.second = t + SECOND;
+        match is_first {
+            true => Ok(()),
+            false => self.diagnostics(t),
+        }
     }
 
     /// How gateway and estimator are at `now`, of what was heard of them last.

@@ -78,7 +78,8 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     let text = ask(domain, server, &robot, &line.to_string())
         .map_err(|error| match error.kind() {
             io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut => {
-                anyhow!("no answer within 5 s: `proprio status` shows whether it is stuck")
+                let seconds = server.patience().as_secs();
+                anyhow!("no answer within {seconds} s: `proprio status` shows whether it is stuck")
             }
             io::ErrorKind::UnexpectedEof => anyhow!("it has ended meanwhile"),
             _ => anyhow!(error),

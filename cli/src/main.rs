@@ -70,7 +70,7 @@ enum Verb {
     Identify(identify::Args),
     /// Show the robots of a running system: processes, buses, devices, channels, estimates
     Status(status::Status),
-    /// Show a running robot on the whole terminal, as it is now: torques, contacts, channels, buses
+    /// Show a running robot on the whole terminal: torques, contacts, channels, buses
     Top(top::Top),
     /// Print the samples of a channel, the torques or the contacts as they come
     Echo(echo::Echo),

@@ -31,6 +31,8 @@ const PROGRAM: &str = concat!("proprio ", env!("CARGO_PKG_VERSION"));
 const REORDER: Nanos = Nanos::from_millis(2000);
 /// How often what was recorded is written to the file: a killed recorder loses no more.
 const FLUSH: Nanos = Nanos::from_millis(500);
+/// So many frames are taken before samples are looked at again.
+const FRAMES: usize = 4096;
 
 /// `proprio record`.
 #[derive(clap::Args)]
@@ -154,12 +156,15 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
         Item::Heard(heard) => out.push(t, heard, series),
         Item::Frame(bus, frame) => {
             let bus = buses.get(*bus).map_or("", String::as_str);
-            out.frame(bus, frame, series)
+            out.frame(bus, frame)
         }
     };
     while !stop.load(Relaxed) && end.is_none_or(|end| monotonic() < end) {
         let now = monotonic();
-        while let Some((bus, frame)) = frames.as_ref().and_then(Frames::next) {
+        for _ in 0..FRAMES {
+            let Some((bus, frame)) = frames.as_ref().and_then(Frames::next) else {
+                break;
+            };
             counts.frames += 1;
             let item = Item::Frame(bus, frame);
             order.push(frame.t, item, |t, it| {
@@ -185,6 +190,7 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
             let item = Item::Heard(heard);
             Ok(order.push(t, item, |t, it| write(t, it, listener.series(), &mut out))?)
         })?;
+        order.advance(now, |t, it| write(t, it, listener.series(), &mut out))?;
         let is_silent = gaps.wait(now);
         if let Output::BlackBox(black_box) = &mut out {
             if is_silent {
@@ -204,21 +210,25 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
     order.finish(|t, it| write(t, it, listener.series(), &mut out))?;
     let without_column = out.without_column();
     let is_table = matches!(out, Output::Table(_));
-    let black_box = match &out {
-        Output::BlackBox(it) => Some((it.written(), it.memory())),
+    let black_box = match &mut out {
+        Output::BlackBox(it) => Some((it.finish(monotonic(), listener.series())?, it.memory())),
         _ => None,
     };
     out.finish()?;
     print_line!(
         "{}: {} samples in {:.1} s, {} lost, {} out of order",
         args.out.display(),
-        counts.samples - without_column,
+        counts.samples.saturating_sub(without_column),
         (monotonic() - began).seconds(),
         listener.lost(),
         order.out_of_order()
     );
     if !is_table {
-        print_line!("{} estimates of torques", counts.torques);
+        let lost = listener.lost_estimates();
+        print_line!(
+            "{} estimates of torques, {lost} estimates lost",
+            counts.torques
+        );
     }
     if let Some(frames) = &frames {
         print_line!("{} frames, {} lost", counts.frames, frames.lost());

@@ -226,7 +226,12 @@ impl Recorder {
         thread::Builder::new()
             .name("control".into())
             .spawn(move || {
-                while let Ok((client, _)) = listener.accept() {
+                loop {
+                    let Ok((client, _)) = listener.accept() else {
+                        // No descriptor is free: do not ask again at once.
+                        thread::sleep(Duration::from_millis(100));
+                        continue;
+                    };
                     let order = Self::order(&client);
                     let is_ended = match order {
                         Some(Ok(())) => orders.send(Asking(client)).is_err(),
@@ -394,8 +399,17 @@ impl Lines {
 
 // ---------------------------------------------------------------- the operator's end
 
-/// How long a client waits for an answer: longer than the gateway for its devices.
-const ANSWER: Duration = Duration::from_secs(5);
+impl Server {
+    /// How long a client waits for an answer: longer than the gateway for its devices, and a
+    /// recorder for a slow disk.
+    #[must_use]
+    pub const fn patience(self) -> Duration {
+        match self {
+            Self::Gateway => Duration::from_secs(5),
+            Self::Recorder => Duration::from_secs(120),
+        }
+    }
+}
 
 /// The robots whose gateways, or recorders, can be asked, by name.
 ///
@@ -436,8 +450,8 @@ pub fn running(domain: &DomainConfig, server: Server) -> io::Result<Vec<String>>
 /// [`io::ErrorKind::ConnectionRefused`]), or it does not answer.
 pub fn ask(domain: &DomainConfig, server: Server, robot: &str, line: &str) -> io::Result<String> {
     let mut stream = net::UnixStream::connect(Folder::open(domain)?.socket(server, robot))?;
-    stream.set_read_timeout(Some(ANSWER))?;
-    stream.set_write_timeout(Some(ANSWER))?;
+    stream.set_read_timeout(Some(server.patience()))?;
+    stream.set_write_timeout(Some(server.patience()))?;
     stream.write_all(format!("{line}\n").as_bytes())?;
     let mut answer = String::new();
     match BufReader::new(stream).read_line(&mut answer)? {

@@ -130,14 +130,26 @@ impl<T> InOrder<T> {
         &mut self,
         t: Nanos,
         item: T,
-        mut write: impl FnMut(Nanos, &T) -> io::Result<()>,
+        write: impl FnMut(Nanos, &T) -> io::Result<()>,
     ) -> io::Result<()> {
         self.out_of_order += u64::from(t < self.passed_on);
         self.newest = self.newest.max(t);
         let place = self.waiting.iter().rposition(|(other, _)| *other <= t);
         self.waiting.insert(place.map_or(0, |i| i + 1), (t, item));
+        self.advance(self.newest, write)
+    }
+
+    /// Calls `write` for the items that are due at `now`, in order: nothing earlier comes any more.
+    ///
+    /// # Errors
+    /// The first of `write`.
+    pub fn advance(
+        &mut self,
+        now: Nanos,
+        mut write: impl FnMut(Nanos, &T) -> io::Result<()>,
+    ) -> io::Result<()> {
         while let Some((first, item)) = self.waiting.front()
-            && self.newest - *first > self.window
+            && now - *first > self.window
         {
             self.passed_on = self.passed_on.max(*first);
             write(*first, item)?;
@@ -151,9 +163,11 @@ impl<T> InOrder<T> {
     /// # Errors
     /// The first of `write`.
     pub fn finish(&mut self, mut write: impl FnMut(Nanos, &T) -> io::Result<()>) -> io::Result<()> {
-        self.waiting
-            .drain(..)
-            .try_for_each(|(t, item)| write(t, &item))
+        for (t, item) in self.waiting.drain(..) {
+            self.passed_on = self.passed_on.max(t);
+            write(t, &item)?;
+        }
+        Ok(())
     }
 
     /// The instant of the last item written: an earlier one would be out of order.

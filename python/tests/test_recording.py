@@ -52,6 +52,14 @@ def test_others_read_a_recording(arm, tmp_path):
     ]
     assert shown[0].orientation_covariance[0] == (-1 if np.isnan(raw[0].qw) else 0)
 
+    # All was well, and the file says so.
+    states = [status for _, _, all_ in seen["/diagnostics"] for status in all_.status]
+    assert len(states) > 20 and {status.name for status in states} >= {
+        "icub_left_arm: gateway", "icub_left_arm: bus left_arm", "icub_left_arm: estimator"
+    }
+    bad = [(status.name, status.message) for status in states if status.level not in (0, b"\0")]
+    assert not bad, bad
+
     # As tables: the samples, and the estimates, to the last bit.
     samples, estimates = proprio.read_recording(out), proprio.read_recording(out, estimates=True)
     own = samples.of("wrench/l_arm_ft_sensor/fx")["wrench/l_arm_ft_sensor/fx"]

@@ -4,26 +4,34 @@
 use crate::read::{ReadError, Summary, walk};
 use mcap::records::Record;
 use proprio_bridge::cdr::Parsed;
-use std::collections::BTreeMap;
-use std::io::{Read, Write};
+use proprio_topics::Nanos;
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{self, Read, Write};
+use std::ops::ControlFlow;
 
 /// What is estimated at one instant: column and cell.
 type Row = Vec<(String, String)>;
 /// Reads a message: its instant, and what it tells.
 type ReadMessage = fn(&[u8]) -> Option<(i64, Row)>;
 
+/// So many instants are looked at for columns, if not all are found before.
+const LOOK: usize = 1000;
+
 /// The table that is being made.
 struct Table<W: Write> {
     channels: BTreeMap<u16, ReadMessage>,
     output: csv::Writer<W>,
-    columns: Vec<String>,
-    /// The instant whose torques have come.
-    row: Option<(i64, Row)>,
+    /// The place of each column; none before the first row is written.
+    columns: BTreeMap<String, usize>,
+    /// The first instants, until torques and contacts have come, and the newest.
+    rows: Vec<(i64, Row)>,
+    /// How many of the topics have had a message.
+    seen: BTreeSet<u16>,
     summary: Summary,
 }
 
 /// Writes the torques and contacts of a recording as a table: a row per instant, an empty cell
-/// where something is withheld. Its columns are those of the first instant.
+/// where something is withheld. Its columns are those of the first instants.
 ///
 /// # Errors
 /// [`ReadError`]; [`ReadError::NoEstimates`] if it has none.
@@ -31,8 +39,9 @@ pub fn to_estimates<W: Write>(recording: impl Read, output: W) -> Result<Summary
     let mut table = Table {
         channels: BTreeMap::new(),
         output: csv::Writer::from_writer(output),
-        columns: Vec::new(),
-        row: None,
+        columns: BTreeMap::new(),
+        rows: Vec::new(),
+        seen: BTreeSet::new(),
         summary: Summary::default(),
     };
     let is_known = |table: &Table<W>| !table.channels.is_empty();
@@ -42,23 +51,26 @@ pub fn to_estimates<W: Write>(recording: impl Read, output: W) -> Result<Summary
                 let read: ReadMessage = match channel.topic.as_str() {
                     "/torques" => torques,
                     "/contacts" => contacts,
-                    _ => return Ok(()),
+                    _ => return Ok(ControlFlow::Continue(())),
                 };
                 table.channels.insert(channel.id, read);
             }
             Record::Message { header, data } => {
                 if let Some(read) = table.channels.get(&header.channel_id) {
                     match read(&data) {
-                        Some((t, cells)) => table.take(t, cells)?,
+                        Some((t, cells)) => {
+                            table.seen.insert(header.channel_id);
+                            table.take(t, cells)?;
+                        }
                         None => table.summary.damaged += 1,
                     }
                 }
             }
             _ => {}
         }
-        Ok(())
+        Ok(ControlFlow::Continue(()))
     })?;
-    table.end_row()?;
+    table.write_rows(0)?;
     if table.summary.values == 0 {
         return Err(ReadError::NoEstimates);
     }
@@ -69,45 +81,51 @@ pub fn to_estimates<W: Write>(recording: impl Read, output: W) -> Result<Summary
 impl<W: Write> Table<W> {
     /// Cells of the instant `t`.
     fn take(&mut self, t: i64, cells: Row) -> Result<(), ReadError> {
-        match &mut self.row {
+        match self.rows.last_mut() {
             Some((of, row)) if *of == t => row.extend(cells),
-            _ => {
-                self.end_row()?;
-                self.row = Some((t, cells));
+            _ => self.rows.push((t, cells)),
+        }
+        let is_known = !self.columns.is_empty() || self.seen.len() == 2;
+        match is_known || self.rows.len() > LOOK {
+            // The newest instant may not be complete.
+            true => self.write_rows(1),
+            false => Ok(()),
+        }
+    }
+
+    /// Writes all rows but the newest `keep`.
+    fn write_rows(&mut self, keep: usize) -> Result<(), ReadError> {
+        let kept = self.rows.split_off(self.rows.len().saturating_sub(keep));
+        let rows = std::mem::replace(&mut self.rows, kept);
+        if self.columns.is_empty() && !rows.is_empty() {
+            let mut header = vec!["t"];
+            for (column, _) in rows.iter().chain(&self.rows).flat_map(|(_, row)| row) {
+                if !self.columns.contains_key(column) {
+                    self.columns.insert(column.clone(), header.len());
+                    header.push(column);
+                }
             }
+            self.output.write_record(header).map_err(io::Error::other)?;
+        }
+        for (t, row) in rows {
+            let mut cells = vec![String::new(); self.columns.len() + 1];
+            for (column, cell) in row {
+                match self
+                    .columns
+                    .get(&column)
+                    .and_then(|place| cells.get_mut(*place))
+                {
+                    Some(place) => *place = cell,
+                    None => self.summary.without_column += 1,
+                }
+            }
+            if let Some(first) = cells.first_mut() {
+                *first = Nanos(t).to_string();
+            }
+            self.summary.values += 1;
+            self.output.write_record(cells).map_err(io::Error::other)?;
         }
         Ok(())
-    }
-
-    fn end_row(&mut self) -> Result<(), ReadError> {
-        let Some((t, row)) = self.row.take() else {
-            return Ok(());
-        };
-        if self.columns.is_empty() {
-            self.columns = row.iter().map(|(column, _)| column.clone()).collect();
-            let columns = self.columns.clone();
-            self.write(["t"].into_iter().chain(columns.iter().map(String::as_str)))?;
-        }
-        let cells: BTreeMap<&str, &str> = (row
-            .iter()
-            .map(|(column, cell)| (column.as_str(), cell.as_str())))
-        .collect();
-        let others = cells
-            .keys()
-            .filter(|key| !self.columns.iter().any(|it| it == *key));
-        self.summary.without_column += others.count() as u64;
-        self.summary.values += 1;
-        let t = proprio_topics::Nanos(t).to_string();
-        let columns = self.columns.clone();
-        let cells = columns
-            .iter()
-            .map(|column| cells.get(column.as_str()).copied());
-        let cells: Vec<&str> = cells.map(Option::unwrap_or_default).collect();
-        self.write([t.as_str()].into_iter().chain(cells))
-    }
-
-    fn write<'a>(&mut self, cells: impl Iterator<Item = &'a str>) -> Result<(), ReadError> {
-        Ok((self.output.write_record(cells)).map_err(std::io::Error::other)?)
     }
 }
 

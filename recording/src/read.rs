@@ -10,6 +10,7 @@ use proprio_topics::csv::{Columns, Series, Value, What, Writer};
 use proprio_topics::{ContactState, Kind, Nanos, Quality, Reading, StampKind, VALUES};
 use std::collections::BTreeMap;
 use std::io::{self, Read, Write};
+use std::ops::ControlFlow;
 
 /// Why a recording cannot be read.
 #[derive(Debug, thiserror::Error)]
@@ -59,12 +60,13 @@ pub fn is_mcap(beginning: &[u8]) -> bool {
 }
 
 /// Walks through the records of a recording, and whatever of it can be read. Returns whether its
-/// end is missing. `is_known` says whether enough was found that damage is no more than that.
+/// end is missing. `is_known` says whether enough was found that damage is no more than that; `take`
+/// may end the walk.
 pub(crate) fn walk<S>(
     mut recording: impl Read,
     state: &mut S,
     is_known: impl Fn(&S) -> bool,
-    mut take: impl FnMut(&mut S, Record<'_>) -> Result<(), ReadError>,
+    mut take: impl FnMut(&mut S, Record<'_>) -> Result<ControlFlow<()>, ReadError>,
 ) -> Result<bool, ReadError> {
     let options = LinearReaderOptions::default()
         .with_skip_end_magic(true)
@@ -84,7 +86,9 @@ pub(crate) fn walk<S>(
                 if matches!(record, Record::DataEnd(_)) {
                     is_ended = false;
                 }
-                take(state, record)?;
+                if take(state, record)?.is_break() {
+                    return Ok(false);
+                }
             }
             // A chunk that was not written to its end, or is damaged: where the next one begins is
             // not known.
@@ -130,7 +134,7 @@ pub fn to_table<W: Write>(recording: impl Read, output: W) -> Result<Summary, Re
             }
             _ => {}
         }
-        Ok(())
+        Ok(ControlFlow::Continue(()))
     })?;
     table.summary.is_cut = is_cut;
     table.finish()
@@ -246,7 +250,7 @@ pub fn frames(
                 }
                 _ => {}
             }
-            Ok(())
+            Ok(ControlFlow::Continue(()))
         },
     )?;
     let (channels, mut summary) = state;
@@ -279,9 +283,11 @@ pub fn about(recording: impl Read) -> Result<About, ReadError> {
             Record::Attachment { header, data, .. } => {
                 files.push((header.name, data.into_owned()));
             }
+            // They come first.
+            Record::Message { .. } => return Ok(ControlFlow::Break(())),
             _ => {}
         }
-        Ok(())
+        Ok(ControlFlow::Continue(()))
     })?;
     let found = found.ok_or(ReadError::Foreign)?;
     Ok(About { files, ..found })
@@ -306,7 +312,7 @@ fn frame(is_fd: bool, message: &[u8]) -> Option<Frame> {
         false => Id::standard(u16::try_from(id).ok()?),
     };
     let frame = match (is_error, is_remote) {
-        (true, _) => return None,
+        (true, _) => Frame::with_format(id, Format::Error, parsed.bytes(length)?)?,
         (_, true) => Frame::remote(id, u8::try_from(length).ok()?),
         _ => {
             let format = match is_fd {

@@ -17,6 +17,8 @@ const PARTS: i64 = 8;
 /// The last seconds.
 pub struct Ring {
     about: About,
+    /// They are needed in a snapshot alone.
+    files: Vec<(String, Vec<u8>)>,
     duration: Nanos,
     /// Each with its end.
     parts: VecDeque<(Nanos, Arc<[u8]>)>,
@@ -31,10 +33,12 @@ impl Ring {
     ///
     /// # Errors
     /// A part cannot be begun.
-    pub fn new(about: About, series: &[Series], duration: Nanos) -> Result<Self, WriteError> {
-        let newest = Self::begin(&about, series)?;
+    pub fn new(mut about: About, series: &[Series], duration: Nanos) -> Result<Self, WriteError> {
+        let files = std::mem::take(&mut about.files);
+        let newest = Recorder::new(Cursor::new(Vec::new()), &about, series)?;
         Ok(Self {
             about,
+            files,
             duration,
             parts: VecDeque::new(),
             newest,
@@ -43,28 +47,19 @@ impl Ring {
         })
     }
 
-    fn begin(about: &About, series: &[Series]) -> Result<Recorder<Cursor<Vec<u8>>>, WriteError> {
-        // The files are needed in a snapshot alone.
-        let about = About {
-            files: Vec::new(),
-            ..about.clone()
-        };
-        Recorder::new(Cursor::new(Vec::new()), &about, series)
+    /// The wall clock minus CLOCK_MONOTONIC, from the next part on.
+    pub const fn set_offset(&mut self, offset: Nanos) {
+        self.about.offset = offset;
     }
 
-    /// The recorder of the present part, for something of the instant `t`; `series` are all that
-    /// are known.
+    /// The recorder of the present part, for something of the instant `t`.
     ///
     /// # Errors
     /// A part cannot be ended or begun.
-    pub fn at(
-        &mut self,
-        t: Nanos,
-        series: &[Series],
-    ) -> Result<&mut Recorder<Cursor<Vec<u8>>>, WriteError> {
+    pub fn at(&mut self, t: Nanos) -> Result<&mut Recorder<Cursor<Vec<u8>>>, WriteError> {
         let began = *self.began.get_or_insert(t);
         if t.saturating_sub(began).0 >= self.duration.0 / PARTS {
-            self.turn(series)?;
+            self.turn()?;
             self.began = Some(t);
         }
         self.last = self.last.max(t);
@@ -72,9 +67,9 @@ impl Ring {
     }
 
     /// Ends the newest part, and forgets those that are too old.
-    fn turn(&mut self, series: &[Series]) -> Result<(), WriteError> {
-        let ended = std::mem::replace(&mut self.newest, Self::begin(&self.about, series)?);
-        let ended = ended.finish()?.into_inner();
+    fn turn(&mut self) -> Result<(), WriteError> {
+        let ended = self.newest.turn_to(Cursor::new(Vec::new()), &self.about)?;
+        let ended = ended.into_inner();
         self.parts.push_back((self.last, ended.into()));
         self.began = None;
         let from = self.last.saturating_sub(self.duration);
@@ -95,9 +90,13 @@ impl Ring {
     /// # Errors
     /// A part cannot be ended or begun.
     pub fn snapshot(&mut self, series: &[Series]) -> Result<Snapshot, WriteError> {
-        self.turn(series)?;
+        self.turn()?;
+        let files = self.files.clone();
         Ok(Snapshot {
-            about: self.about.clone(),
+            about: About {
+                files,
+                ..self.about.clone()
+            },
             series: series.to_vec(),
             parts: self
                 .parts

@@ -3,7 +3,7 @@
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
 use proprio_bridge::cdr::Message;
-use proprio_bridge::definitions::{self, Definition};
+use proprio_bridge::definitions::{self, Definition, MESSAGE, SCHEMA};
 use proprio_bridge::{Messages, Sink};
 use proprio_drivers::{Format, Frame, Id};
 use proprio_topics::Nanos;
@@ -13,9 +13,6 @@ use std::collections::BTreeMap;
 use std::io::{Seek, Write};
 use std::ops::{Deref, DerefMut};
 
-/// The encoding of all definitions, and of all messages.
-const SCHEMA: &str = "ros2msg";
-const MESSAGE: &str = "cdr";
 /// The name of this program's metadata.
 pub(crate) const PROPRIO: &str = "proprio";
 
@@ -43,6 +40,46 @@ pub struct File<W: Write + Seek> {
     sequence: u32,
     /// Of topics that were copied: their channel here.
     copied: BTreeMap<String, u16>,
+}
+
+impl<W: Write + Seek> File<W> {
+    fn begin(output: W, about: &About) -> Result<Self, WriteError> {
+        let mut mcap = WriteOptions::new()
+            .profile("ros2")
+            .library(about.program.clone())
+            .compression(Some(Compression::Zstd))
+            // In this thread: others are the daemons'.
+            .compression_threads(0)
+            .chunk_size(Some(1 << 20))
+            // A chunk is written when it is complete: a killed program leaves no half of one.
+            .disable_seeking(true)
+            .create(output)?;
+        let offset = about.offset.0.to_string();
+        let metadata = [
+            ("robot", about.robot.as_str()),
+            ("program", about.program.as_str()),
+            ("wall_clock_minus_monotonic_ns", offset.as_str()),
+        ]
+        .map(|(key, value)| (key.to_owned(), value.to_owned()));
+        mcap.write_metadata(&Metadata {
+            name: PROPRIO.to_owned(),
+            metadata: metadata.into(),
+        })?;
+        for (name, data) in &about.files {
+            mcap.attach(&Attachment {
+                log_time: 0,
+                create_time: 0,
+                name: name.clone(),
+                media_type: "application/octet-stream".to_owned(),
+                data: Cow::Borrowed(data),
+            })?;
+        }
+        Ok(Self {
+            mcap,
+            sequence: 0,
+            copied: BTreeMap::new(),
+        })
+    }
 }
 
 impl<W: Write + Seek> Sink for File<W> {
@@ -87,43 +124,22 @@ impl<W: Write + Seek> Recorder<W> {
     /// # Errors
     /// The file cannot be written.
     pub fn new(output: W, about: &About, series: &[Series]) -> Result<Self, WriteError> {
-        let mut mcap = WriteOptions::new()
-            .profile("ros2")
-            .library(about.program.clone())
-            .compression(Some(Compression::Zstd))
-            .chunk_size(Some(1 << 20))
-            // A chunk is written when it is complete: a killed program leaves no half of one.
-            .disable_seeking(true)
-            .create(output)?;
-        let offset = about.offset.0.to_string();
-        let metadata = [
-            ("robot", about.robot.as_str()),
-            ("program", about.program.as_str()),
-            ("wall_clock_minus_monotonic_ns", offset.as_str()),
-        ]
-        .map(|(key, value)| (key.to_owned(), value.to_owned()));
-        mcap.write_metadata(&Metadata {
-            name: PROPRIO.to_owned(),
-            metadata: metadata.into(),
-        })?;
-        for (name, data) in &about.files {
-            mcap.attach(&Attachment {
-                log_time: 0,
-                create_time: 0,
-                name: name.clone(),
-                media_type: "application/octet-stream".to_owned(),
-                data: Cow::Borrowed(data),
-            })?;
-        }
-        let file = File {
-            mcap,
-            sequence: 0,
-            copied: BTreeMap::new(),
-        };
+        let file = File::begin(output, about)?;
         let mut messages = Messages::new(file, &about.robot, about.offset);
         messages.know(series)?;
         messages.announce()?;
         Ok(Self { messages })
+    }
+
+    /// Goes on in a new file, which knows what this one does; ends this one, and returns it.
+    ///
+    /// # Errors
+    /// A file cannot be written.
+    pub fn turn_to(&mut self, output: W, about: &About) -> Result<W, WriteError> {
+        let file = File::begin(output, about)?;
+        let mut ended = self.messages.turn_to(file, about.offset)?;
+        ended.mcap.finish()?;
+        Ok(ended.mcap.into_inner())
     }
 
     /// A frame on `bus`.

@@ -3,7 +3,9 @@
 #![allow(missing_docs, clippy::unwrap_used)]
 
 use proprio_drivers::{Format, Frame, Id};
-use proprio_recording::{About, ReadError, Recorder, Ring, about, frames, is_mcap, to_table};
+use proprio_recording::{
+    About, ReadError, Recorder, Ring, about, frames, is_mcap, to_estimates, to_table,
+};
 use proprio_topics::csv::{Columns, Series, Value, What, Writer};
 use proprio_topics::{
     ContactEstimate, ContactState, ContactWrench, Description, Entry, Header, JointTorque, Kind,
@@ -271,6 +273,13 @@ fn frames_come_back() {
                 3,
             ),
         ),
+        (
+            "can1",
+            at(
+                Frame::with_format(Id::extended(4), Format::Error, &[1; 8]).unwrap(),
+                4,
+            ),
+        ),
         ("can0", at(Frame::new(Id::standard(0), &[]), 1_234_567_891)),
     ];
     let output = Cursor::new(Vec::new());
@@ -282,9 +291,6 @@ fn frames_come_back() {
     for (bus, frame) in &sent {
         recorder.frame(bus, frame).unwrap();
     }
-    // An error frame tells of a controller, not of a device: it is recorded, and not read.
-    let error = Frame::with_format(Id::extended(4), Format::Error, &[0; 8]).unwrap();
-    recorder.frame("can0", &at(error, 9)).unwrap();
     let recorded = recorder.finish().unwrap().into_inner();
     let mut found = Vec::new();
     let summary = frames(recorded.as_slice(), |bus, frame| {
@@ -292,7 +298,7 @@ fn frames_come_back() {
         Ok(())
     })
     .unwrap();
-    assert_eq!((summary.values, summary.damaged), (5, 1));
+    assert_eq!((summary.values, summary.damaged), (6, 0));
     for ((bus, frame), (sent_on, sent)) in found.iter().zip(&sent) {
         let expected = sent.at(sent.t + OFFSET, StampKind::Log);
         assert_eq!((bus.as_str(), frame), (*sent_on, &expected));
@@ -309,7 +315,7 @@ fn a_ring_has_the_last_seconds() {
     let mut ring = Ring::new(about_it(), &series(), duration).unwrap();
     let mut snapshots = Vec::new();
     for (number, (t, series_number, value)) in values.iter().enumerate() {
-        let recorder = ring.at(*t, &series()).unwrap();
+        let recorder = ring.at(*t).unwrap();
         recorder.value(*t, *series_number, value).unwrap();
         if number == 20 || number == values.len() - 1 {
             recorder.torques(&names(), &torques()).unwrap();
@@ -366,4 +372,77 @@ fn late_channels_have_no_column() {
         .map(|message| message.unwrap().channel.topic.clone())
         .collect();
     assert!(topics.iter().any(|topic| topic == "/samples/imu/chest"));
+}
+
+/// The table of estimates has the columns of torques and contacts, whichever comes first, and what
+/// has no value is an empty cell.
+#[test]
+fn estimates_become_a_table() {
+    let mut recorder = Recorder::new(Cursor::new(Vec::new()), &about_it(), &series()).unwrap();
+    let later = |step: i64| {
+        let (mut torques, mut contacts) = (torques(), contacts());
+        torques.header.acquired += Nanos(step);
+        contacts.header.acquired += Nanos(step);
+        (torques, contacts)
+    };
+    recorder.contacts(&names(), &contacts()).unwrap();
+    for step in [1, 2] {
+        let (torques, contacts) = later(step);
+        recorder.torques(&names(), &torques).unwrap();
+        recorder.contacts(&names(), &contacts).unwrap();
+    }
+    let recorded = recorder.finish().unwrap().into_inner();
+    let mut found = Vec::new();
+    let summary = to_estimates(recorded.as_slice(), &mut found).unwrap();
+    assert_eq!((summary.values, summary.without_column), (3, 0));
+    let found = String::from_utf8(found).unwrap();
+    let rows: Vec<Vec<&str>> = found.lines().map(|row| row.split(',').collect()).collect();
+    let cell = |row: usize, column: &str| {
+        let place = rows[0].iter().position(|name| *name == column);
+        rows[row][place.unwrap_or_else(|| panic!("no {column}: {found}"))]
+    };
+    assert_eq!(cell(1, "torque/elbow"), "");
+    assert_eq!(cell(1, "contact/hand/fx"), "1.0");
+    assert_eq!(cell(2, "torque/elbow"), "1.5");
+    assert_eq!(cell(3, "torque_std/elbow"), "0.25");
+    assert_eq!(cell(3, "valid/elbow"), "1");
+    assert_eq!(cell(3, "valid/wrist"), "0");
+    assert_eq!(cell(3, "contact/hand/tz"), "6.0");
+    let none = recording(&values(&[1.0], 3), 1);
+    assert!(to_estimates(none.as_slice(), Vec::new()).is_ok());
+    let empty = Recorder::new(Cursor::new(Vec::new()), &about_it(), &series()).unwrap();
+    let empty = empty.finish().unwrap().into_inner();
+    assert!(matches!(
+        to_estimates(empty.as_slice(), Vec::new()),
+        Err(ReadError::NoEstimates)
+    ));
+}
+
+/// What is known of joints and daemons goes on in the next part of a ring.
+#[test]
+fn a_part_goes_on_with_what_is_known() {
+    let mut recorder = Recorder::new(Cursor::new(Vec::new()), &about_it(), &series()).unwrap();
+    let mut state = [0.0; VALUES];
+    state[0] = 0.75;
+    let reading = Reading::from_values(Kind::Joint, &state).unwrap();
+    let t = torques().header.acquired;
+    let value = Value::Reading(reading, Quality::GOOD);
+    recorder.value(t - Nanos(1), 0, &value).unwrap();
+    let first = recorder
+        .turn_to(Cursor::new(Vec::new()), &about_it())
+        .unwrap();
+    recorder.torques(&names(), &torques()).unwrap();
+    assert_eq!(recorder.state("elbow", t).position, 0.75);
+    // Its board has fallen silent.
+    assert!(
+        recorder
+            .state("elbow", t + Nanos::from_millis(1001))
+            .position
+            .is_nan()
+    );
+    let second = recorder.finish().unwrap().into_inner();
+    for (part, values) in [(first.into_inner(), 1), (second, 0)] {
+        let summary = to_table(part.as_slice(), Vec::new()).unwrap();
+        assert_eq!((summary.values, summary.is_cut), (values, false));
+    }
 }

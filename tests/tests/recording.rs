@@ -178,7 +178,6 @@ fn a_recording_with_frames_and_configuration_is_enough() {
     let told = recorder.output();
     assert!(told.contains(" frames, 0 lost"), "{told}");
 
-    // The whole time is in the parts, each of which can be read alone.
     let table = |recording: &str, more: &[&str]| {
         let out = path("table.csv");
         let mut arguments = vec!["table", "--recording", recording, "--out", &out];
@@ -186,16 +185,25 @@ fn a_recording_with_frames_and_configuration_is_enough() {
         rig.run(&arguments);
         fs::read_to_string(&out).expect("the table")
     };
-    let parts = ["part_0001.mcap", "part_0002.mcap", "part_0003.mcap"].map(&path);
-    let count: usize = parts
+
+    // The whole time is in the parts, each of which can be read alone.
+    let fx = "wrench/l_arm_ft_sensor/fx";
+    let whole = column(&table(&path("run.mcap"), &[]), fx);
+    let mut in_parts = BTreeMap::new();
+    for number in 1..=3 {
+        let part = table(&path(&format!("part_{number:04}.mcap")), &[]);
+        in_parts.extend(column(&part, fx));
+    }
+    let (begin, end) = (in_parts.keys().next(), in_parts.keys().next_back());
+    let common = whole
         .iter()
-        .map(|part| table(part, &[]).lines().count() - 1)
-        .sum();
-    let told = split.output();
-    assert!(
-        count > 1000 && told.contains("estimates of torques"),
-        "{count} {told}"
-    );
+        .filter(|(t, _)| Some(*t) >= begin && Some(*t) <= end);
+    let (mut count, mut missing) = (0, 0);
+    for (t, force) in common {
+        count += 1;
+        missing += u64::from(in_parts.get(t) != Some(force));
+    }
+    assert!(count > 500 && missing == 0, "{missing} of {count}");
 
     // The robot's configuration is in it, and what is estimated with it is what was estimated live,
     // to the last digit wherever all samples had come in time. The differentiation of the first
@@ -303,7 +311,7 @@ fn a_black_box_writes_when_something_happens() {
         .write(&rig.path("robot"));
     let _simulator = rig.start(&["simulate", "--robot", &arm.folder]);
     let mut gateway = rig.start(&["gateway", "--config", &arm.gateway]);
-    let _estimator = rig.start(&["estimator", "--config", &arm.estimator]);
+    let mut estimator = rig.start(&["estimator", "--config", &arm.estimator]);
     let mut torques = open::<TorqueEstimate>(&rig.open(), "icub_left_arm");
     assert!(valid_since(&mut torques, Nanos::ZERO, PATIENCE).is_some());
 
@@ -357,11 +365,30 @@ fn a_black_box_writes_when_something_happens() {
         valid.len()
     );
 
-    let before = fs::read_dir(&folder).expect("the folder").count();
+    let all = || -> BTreeSet<String> {
+        let entries = fs::read_dir(&folder).expect("the folder").flatten();
+        let names = entries.map(|entry| entry.path().display().to_string());
+        names.filter(|name| name.ends_with(".mcap")).collect()
+    };
+    let before = all();
+    estimator.kill();
     gateway.kill();
+    let killed = monotonic();
     // On a busy machine something else may have happened before, and have the name of the file.
-    let all = || fs::read_dir(&folder).expect("the folder").count();
-    assert!(until(PATIENCE, || (all() > before).then_some(())).is_some());
+    let reaches = |file: &String| {
+        let out = rig.path("last.csv").display().to_string();
+        rig.run(&["table", "--recording", file, "--out", &out]);
+        let forces = column(
+            &fs::read_to_string(&out).expect("the table"),
+            "wrench/l_arm_ft_sensor/fx",
+        );
+        let span = at(forces.keys().next_back()) - at(forces.keys().next());
+        span > 1.0 && at(forces.keys().next_back()) > killed.seconds() - 0.5
+    };
+    let written = until(PATIENCE, || {
+        all().difference(&before).any(reaches).then_some(())
+    });
+    assert!(written.is_some(), "{:?} {}", all(), recorder.output());
     let id = Pid::from_raw(i32::try_from(recorder.id()).expect("a process number"));
     kill(id, Signal::SIGTERM).expect("the signal is sent");
     recorder.wait();

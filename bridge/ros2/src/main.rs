@@ -151,6 +151,7 @@ fn run(args: &Args, options: Options) -> anyhow::Result<()> {
     let mut told = String::new();
     while !stop.load(Relaxed) {
         let now = monotonic();
+        messages.sink().turn(now)?;
         let heard = listener.poll(now, |listener, event| {
             messages.know(listener.series())?;
             Ok(messages.say(event.t, &event.heard)?)

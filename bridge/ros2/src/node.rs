@@ -5,6 +5,7 @@ use crate::names::{Topics, dds_topic, dds_type};
 use proprio_bridge::Sink;
 use proprio_bridge::cdr::Message;
 use proprio_bridge::definitions::Definition;
+use proprio_topics::Nanos;
 use rustdds::bytes::Bytes;
 use rustdds::dds::{CreateError, WriteError};
 use rustdds::no_key::{DataWriter, SerializerAdapter};
@@ -29,9 +30,9 @@ const WINDOW: i32 = 16_384;
 /// How many messages wait while a reader owes too many acknowledgements. Each reader that is new
 /// does at first, for some milliseconds.
 const QUEUE: usize = 100;
-/// How long they wait \[ns\]. Then a writer that is owed nothing takes the old one's place, so that
+/// How long they wait. Then a writer that is owed nothing takes the old one's place, so that
 /// a reader without acknowledgements does not stop the others for ever.
-const PATIENCE: u64 = 1_000_000_000;
+const PATIENCE: Nanos = Nanos::from_millis(1000);
 
 /// Why the node cannot work.
 #[derive(Debug, thiserror::Error)]
@@ -139,8 +140,8 @@ struct Topic {
     pace: Option<Pace>,
     /// What could not be written yet, with its stamp.
     waiting: VecDeque<(Bytes, Timestamp)>,
-    /// Since when \[ns since 1970, UTC\].
-    since: u64,
+    /// Since when (CLOCK_MONOTONIC).
+    since: Nanos,
     /// A reader that does not acknowledge has been told of.
     is_told: bool,
 }
@@ -171,6 +172,8 @@ pub(crate) struct Node {
     publisher: Publisher,
     names: Topics,
     topics: Vec<Topic>,
+    /// The time (CLOCK_MONOTONIC).
+    now: Nanos,
     /// Says which nodes are in this participant.
     graph: DataWriter<Bytes, Encoded>,
 }
@@ -213,6 +216,7 @@ impl Node {
             graph: graph.map_err(failed("ros_discovery_info"))?,
             names: Topics::new(&options.namespace),
             topics: Vec::new(),
+            now: Nanos::ZERO,
             participant,
             publisher,
             options,
@@ -238,6 +242,39 @@ impl Node {
             },
         };
         qos.reliability(reliability).build()
+    }
+
+    /// Writes what still waits, at `now` (CLOCK_MONOTONIC): a topic may have no further message for
+    /// long. A writer to which a reader owes acknowledgements for too long is replaced.
+    ///
+    /// # Errors
+    /// DDS refuses something.
+    pub(crate) fn turn(&mut self, now: Nanos) -> Result<(), NodeError> {
+        self.now = now;
+        for place in 0..self.topics.len() {
+            let Some(topic) = self.topics.get_mut(place) else {
+                break;
+            };
+            topic.write()?;
+            if topic.waiting.is_empty() || now.saturating_sub(topic.since) < PATIENCE {
+                continue;
+            }
+            if !std::mem::replace(&mut topic.is_told, true) {
+                eprintln!(
+                    "{}: a reliable reader does not acknowledge (a firewall?), which others notice \
+                     as gaps; --best-effort asks for no acknowledgements",
+                    topic.name
+                );
+            }
+            topic.waiting.clear();
+            let (name, kind) = (topic.name.clone(), topic.kind.clone());
+            let writer = self.writer(&name, &kind)?;
+            if let Some(topic) = self.topics.get_mut(place) {
+                topic.writer = writer;
+            }
+            self.say_who_it_is()?;
+        }
+        Ok(())
     }
 
     /// A writer of the topic `name` of messages of `kind`.
@@ -318,7 +355,7 @@ impl Sink for Node {
             writer,
             pace: self.options.rate.map(Pace::new),
             waiting: VecDeque::new(),
-            since: 0,
+            since: Nanos::ZERO,
             is_told: false,
         });
         self.say_who_it_is()?;
@@ -333,29 +370,12 @@ impl Sink for Node {
             return Ok(());
         }
         if topic.waiting.is_empty() {
-            topic.since = wall;
+            topic.since = self.now;
         } else if topic.waiting.len() == QUEUE {
             topic.waiting.pop_front();
         }
         topic.waiting.push_back((body(message), timestamp(wall)));
-        topic.write()?;
-        if topic.waiting.is_empty() || wall.saturating_sub(topic.since) < PATIENCE {
-            return Ok(());
-        }
-        if !std::mem::replace(&mut topic.is_told, true) {
-            eprintln!(
-                "{}: a reliable reader does not acknowledge (a firewall?), which others notice as \
-                 gaps; --best-effort asks for no acknowledgements",
-                topic.name
-            );
-        }
-        topic.waiting.clear();
-        let (name, kind) = (topic.name.clone(), topic.kind.clone());
-        let writer = self.writer(&name, &kind)?;
-        if let Some(topic) = self.topics.get_mut(*channel) {
-            topic.writer = writer;
-        }
-        self.say_who_it_is()
+        topic.write()
     }
 }
 

@@ -248,8 +248,8 @@ impl View {
             && (self.moves || is_second)
         {
             self.moves = false;
-            let transforms = model.transforms(|joint| self.messages.state(joint).position);
             let t = self.moved.unwrap_or(now);
+            let transforms = model.transforms(|joint| self.messages.state(joint, t).position);
             let Ok(()) = self
                 .messages
                 .send("/tf", definitions::transforms, t, |wall| {

@@ -1,12 +1,13 @@
 //! A black box: the last seconds in memory, written to a file when something happens.
 //!
 //! A torque that was valid and is withheld, a sensor or device that reports a fault, a bus that is
-//! lost: the file is written a while later, so that it has what followed. The next one is written
+//! lost, a daemon that ends: the file is written a while later, so that it has what followed. The next one is written
 //! when the memory is full of new seconds, or when `proprio ctl snapshot` asks for it.
 
 use anyhow::Context;
 use proprio_bridge::Heard;
 use proprio_drivers::Frame;
+use proprio_gateway::clock::realtime_offset;
 use proprio_gateway::control;
 use proprio_recording::{About, Ring, Snapshot, WriteError};
 use proprio_topics::csv::{Series, Value};
@@ -16,6 +17,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fs;
 use std::io::{self, BufWriter, Write as _};
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 
 /// How long after its cause a file is written, at most: it has what followed.
@@ -24,6 +26,8 @@ const AFTER: Nanos = Nanos::from_millis(5000);
 const LATEST: Nanos = Nanos::from_millis(4000);
 /// So many files are kept: the oldest of this run are deleted.
 const KEPT: usize = 20;
+/// Samples without a torque for so long: the estimator has ended or hangs.
+const SILENCE: Nanos = Nanos::from_millis(1000);
 /// The flags of a reading that are a fault.
 const FAULTS: Quality = Quality(
     Quality::FROZEN.0
@@ -42,8 +46,6 @@ pub(super) struct BlackBox {
     folder: PathBuf,
     robot: String,
     duration: Nanos,
-    /// The wall clock minus CLOCK_MONOTONIC.
-    offset: Nanos,
     control: control::Recorder,
     asking: Option<control::Asking>,
     faults: Faults,
@@ -53,9 +55,9 @@ pub(super) struct BlackBox {
     newest: Nanos,
     /// The next file is written no sooner, so that it has new seconds alone.
     next: Nanos,
-    written: VecDeque<PathBuf>,
+    /// The files of this run that are there.
+    written: Arc<Mutex<VecDeque<PathBuf>>>,
     writing: Vec<JoinHandle<()>>,
-    next_diagnostics: Nanos,
 }
 
 impl BlackBox {
@@ -73,7 +75,6 @@ impl BlackBox {
         }
         fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         Ok(Self {
-            offset: about.offset,
             ring: Ring::new(about, series, duration)?,
             folder: folder.to_owned(),
             control: control::Recorder::open(domain, &robot)
@@ -85,9 +86,8 @@ impl BlackBox {
             due: None,
             newest: Nanos::MIN,
             next: Nanos::MIN,
-            written: VecDeque::new(),
+            written: Arc::default(),
             writing: Vec::new(),
-            next_diagnostics: Nanos::MIN,
         })
     }
 
@@ -97,11 +97,12 @@ impl BlackBox {
         heard: &Heard,
         series: &[Series],
     ) -> Result<(), WriteError> {
-        let recorder = self.ring.at(t, series)?;
+        let recorder = self.ring.at(t)?;
         recorder.know(series)?;
         recorder.say(t, heard)?;
+        recorder.each_second(t)?;
         self.newest = self.newest.max(t);
-        if let Some(why) = self.faults.new_in(heard, series) {
+        if let Some(why) = self.faults.new_in(t, heard, series) {
             self.happened(t, why);
         }
         Ok(())
@@ -117,13 +118,8 @@ impl BlackBox {
         }
     }
 
-    pub(super) fn frame(
-        &mut self,
-        bus: &str,
-        frame: &Frame,
-        series: &[Series],
-    ) -> Result<(), WriteError> {
-        self.ring.at(frame.t, series)?.frame(bus, frame)
+    pub(super) fn frame(&mut self, bus: &str, frame: &Frame) -> Result<(), WriteError> {
+        self.ring.at(frame.t)?.frame(bus, frame)
     }
 
     /// Whether a client asks for a file: what waits to be sorted should be pushed before
@@ -137,11 +133,7 @@ impl BlackBox {
 
     /// Writes what is due at `now`, and what is asked for.
     pub(super) fn turn(&mut self, now: Nanos, series: &[Series]) -> io::Result<()> {
-        if now >= self.next_diagnostics {
-            self.next_diagnostics = now + Nanos::from_millis(1000);
-            let recorder = self.ring.at(now, series).map_err(io::Error::other)?;
-            recorder.diagnostics(now).map_err(io::Error::other)?;
-        }
+        self.ring.set_offset(realtime_offset());
         let newest = self.newest;
         let is_due = |at: Nanos| newest >= at || now >= at + LATEST;
         if let Some((at, why)) = self.due.take_if(|(at, _)| is_due(*at)) {
@@ -162,7 +154,7 @@ impl BlackBox {
         series: &[Series],
         client: Option<control::Asking>,
     ) -> io::Result<()> {
-        let wall = now.saturating_add(self.offset).0;
+        let wall = now.saturating_add(realtime_offset()).0;
         let time = jiff::Timestamp::from_nanosecond(wall.into()).map_err(io::Error::other)?;
         let time = time.strftime("%Y%m%dT%H%M%S%.3fZ");
         let is_word = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
@@ -170,32 +162,24 @@ impl BlackBox {
         let place = self
             .folder
             .join(format!("{}_{time}_{why}.mcap", self.robot));
-        self.written.push_back(place.clone());
-        let oldest = match self.written.len() > KEPT {
-            true => self.written.pop_front(),
-            false => None,
-        };
         let snapshot = self.ring.snapshot(series).map_err(io::Error::other)?;
+        let all = Arc::clone(&self.written);
         let writing = thread::Builder::new()
             .name("snapshot".into())
             .spawn(move || {
                 let written = write(&snapshot, &place);
-                let text = |error| format!("{}: cannot be written: {error}", place.display());
-                let written = written.map_err(text);
+                let written = written
+                    .map_err(|error| format!("{}: cannot be written: {error}", place.display()));
                 match &written {
                     Ok(()) => tracing::info!("{} is written", place.display()),
                     Err(error) => tracing::error!("{error}"),
                 }
-                if let Some(client) = client {
-                    client.answer(
-                        written
-                            .as_ref()
-                            .map(|()| place.as_path())
-                            .map_err(String::as_str),
-                    );
+                if written.is_ok() {
+                    keep(&all, place.clone());
                 }
-                if let Some(oldest) = oldest {
-                    let _ = fs::remove_file(oldest);
+                if let Some(client) = client {
+                    let file = written.as_ref().map(|()| place.as_path());
+                    client.answer(file.map_err(String::as_str));
                 }
             })?;
         self.writing.retain(|thread| !thread.is_finished());
@@ -203,16 +187,16 @@ impl BlackBox {
         Ok(())
     }
 
-    /// Waits for the files that are being written.
-    pub(super) fn finish(self) {
-        for thread in self.writing {
+    /// Writes what is due, though not all that followed has come, and waits for the files that are
+    /// being written; returns their number.
+    pub(super) fn finish(&mut self, now: Nanos, series: &[Series]) -> io::Result<usize> {
+        if let Some((_, why)) = self.due.take() {
+            self.write(now, &why, series, None)?;
+        }
+        for thread in self.writing.drain(..) {
             let _ = thread.join();
         }
-    }
-
-    /// The files of this run that are there.
-    pub(super) fn written(&self) -> usize {
-        self.written.len()
+        Ok(self.written.lock().map_or(0, |written| written.len()))
     }
 
     /// The memory that the last seconds take \[bytes\].
@@ -221,14 +205,36 @@ impl BlackBox {
     }
 }
 
-/// Writes a file: it has its name when it is complete.
+/// Writes a file: it has its name when it is complete, and outlives a loss of power then.
 fn write(snapshot: &Snapshot, place: &Path) -> io::Result<()> {
     let part = place.with_extension("part");
-    let file = BufWriter::new(fs::File::create(&part)?);
-    let mut file = snapshot.write(file).map_err(io::Error::other)?;
-    file.flush()?;
-    file.get_ref().sync_all()?;
-    fs::rename(&part, place)
+    let write = || {
+        let file = BufWriter::new(fs::File::create(&part)?);
+        let mut file = snapshot.write(file).map_err(io::Error::other)?;
+        file.flush()?;
+        file.get_ref().sync_all()?;
+        fs::rename(&part, place)
+    };
+    let written = write();
+    if written.is_err() {
+        let _ = fs::remove_file(&part);
+    }
+    let folder = place.parent().unwrap_or(Path::new("."));
+    let _ = fs::File::open(folder).and_then(|folder| folder.sync_all());
+    written
+}
+
+/// Adds a file to those that are there; the oldest is deleted if there are enough.
+fn keep(written: &Mutex<VecDeque<PathBuf>>, place: PathBuf) {
+    let Ok(mut written) = written.lock() else {
+        return;
+    };
+    written.push_back(place);
+    if written.len() > KEPT
+        && let Some(oldest) = written.pop_front()
+    {
+        let _ = fs::remove_file(oldest);
+    }
 }
 
 /// What is wrong at present.
@@ -237,12 +243,22 @@ struct Faults {
     valid: BTreeMap<usize, bool>,
     readings: BTreeMap<usize, Quality>,
     health: BTreeSet<String>,
+    /// The newest torques, until it was told that none come any more.
+    torques: Option<Nanos>,
 }
 
 impl Faults {
-    /// What has become wrong with this.
-    fn new_in(&mut self, heard: &Heard, series: &[Series]) -> Option<Why> {
+    /// What has become wrong with this, heard at `t`.
+    fn new_in(&mut self, t: Nanos, heard: &Heard, series: &[Series]) -> Option<Why> {
         match heard {
+            Heard::Value(..)
+                if self
+                    .torques
+                    .take_if(|newest| t - *newest > SILENCE)
+                    .is_some() =>
+            {
+                Some("estimator-silent".to_owned())
+            }
             Heard::Value(number, Value::Reading(_, quality)) => {
                 let now = Quality(quality.0 & FAULTS.0);
                 let before = self.readings.insert(*number, now).unwrap_or(Quality::GOOD);
@@ -251,6 +267,7 @@ impl Faults {
                 is_new.then(|| format!("{name}-{now}"))
             }
             Heard::Torques(torques, names) => {
+                self.torques = Some(t);
                 let mut why = None;
                 for (number, joint) in torques.joints().iter().enumerate() {
                     let is_valid = joint.valid == 1;
@@ -352,8 +369,16 @@ mod tests {
             (bus(LinkState::Down), None),
             (bus(LinkState::BusOff), Some("can0-bus_off")),
         ] {
-            let found = faults.new_in(&heard, &series);
+            let found = faults.new_in(Nanos::ZERO, &heard, &series);
             assert_eq!(found.as_deref(), expected, "{heard:?}");
         }
+        // The estimator ends while samples go on.
+        let at = |ms| Nanos::from_millis(ms);
+        let mut hear = |ms, heard: &Heard| faults.new_in(at(ms), heard, &series);
+        assert_eq!(hear(5_000, &torque(Reason::Frozen)), None);
+        let reading = reading(Quality::FROZEN);
+        assert_eq!(hear(6_000, &reading), None);
+        assert_eq!(hear(6_001, &reading).as_deref(), Some("estimator-silent"));
+        assert_eq!(hear(9_000, &reading), None);
     }
 }

@@ -4,15 +4,13 @@ use super::black_box::BlackBox;
 use anyhow::{Context, bail};
 use proprio_bridge::Heard;
 use proprio_drivers::Frame;
+use proprio_gateway::clock::realtime_offset;
 use proprio_recording::{About, Recorder};
 use proprio_topics::Nanos;
 use proprio_topics::csv::{Columns, Series, Writer};
 use std::fs::File;
 use std::io::{self, BufWriter, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
-
-/// How often it is recorded how gateway, buses, devices and estimator are.
-const DIAGNOSTICS: Nanos = Nanos::from_millis(1000);
 
 /// Creates the file of a recording. An existing one is overwritten only if that is asked for; what
 /// is no file, such as a pipe, has nothing to lose.
@@ -53,7 +51,6 @@ pub(super) struct Recording {
     series: Vec<Series>,
     /// Where the next file is begun, and after what time.
     split: Option<(Split, Nanos)>,
-    next_diagnostics: Nanos,
 }
 
 /// The names of the files of one recording.
@@ -105,7 +102,6 @@ impl Output {
             about,
             series: series.to_vec(),
             split: None,
-            next_diagnostics: Nanos::MIN,
         })))
     }
 
@@ -144,11 +140,11 @@ impl Output {
     }
 
     /// A raw frame on `bus`.
-    pub(super) fn frame(&mut self, bus: &str, frame: &Frame, series: &[Series]) -> io::Result<()> {
+    pub(super) fn frame(&mut self, bus: &str, frame: &Frame) -> io::Result<()> {
         match self {
             Self::Table(_) => Ok(()),
             Self::Recording(recording) => recording.recorder.frame(bus, frame),
-            Self::BlackBox(black_box) => black_box.frame(bus, frame, series),
+            Self::BlackBox(black_box) => black_box.frame(bus, frame),
         }
         .map_err(io::Error::other)
     }
@@ -175,7 +171,7 @@ impl Output {
         match self {
             Self::Table(table) => table.writer.finish()?.flush()?,
             Self::Recording(recording) => recording.recorder.finish()?.flush()?,
-            Self::BlackBox(black_box) => black_box.finish(),
+            Self::BlackBox(_) => {}
         }
         Ok(())
     }
@@ -187,23 +183,18 @@ impl Recording {
             self.series = series.to_vec();
             self.recorder.know(series).map_err(io::Error::other)?;
         }
-        self.recorder.say(t, heard).map_err(io::Error::other)
+        self.recorder.say(t, heard).map_err(io::Error::other)?;
+        self.recorder.each_second(t).map_err(io::Error::other)
     }
 
     fn flush(&mut self, now: Nanos) -> anyhow::Result<()> {
-        if now >= self.next_diagnostics {
-            self.next_diagnostics = now + DIAGNOSTICS;
-            self.recorder.diagnostics(now)?;
-        }
         if let Some((split, next)) = &mut self.split
             && now >= *next
         {
             *next = now + split.every;
             let file = BufWriter::new(split.next(true)?);
-            let new = Recorder::new(file, &self.about, &self.series)?;
-            std::mem::replace(&mut self.recorder, new)
-                .finish()?
-                .flush()?;
+            self.about.offset = realtime_offset();
+            self.recorder.turn_to(file, &self.about)?.flush()?;
         }
         Ok(self.recorder.flush()?)
     }
