@@ -469,8 +469,8 @@ impl<S: Sink> Messages<S> {
         Ok(())
     }
 
-    /// [`Messages::diagnostics`], if the last ones were a second before `t`; from a second after the
-    /// first call on, when health has come.
+    /// [`Messages::diagnostics`], if the last ones were a second before `t`; the first ones come a
+    /// second after the first call, when health has come.
     ///
     /// # Errors
     /// Those of the sink.

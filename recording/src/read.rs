@@ -60,8 +60,8 @@ pub fn is_mcap(beginning: &[u8]) -> bool {
 }
 
 /// Walks through the records of a recording, and whatever of it can be read. Returns whether its
-/// end is missing. `is_known` says whether enough was found that damage is no more than that; `take`
-/// may end the walk.
+/// end is missing. `is_known` says whether enough was found that damage is no more than that;
+/// `take` may end the walk.
 pub(crate) fn walk<S>(
     mut recording: impl Read,
     state: &mut S,

@@ -1,8 +1,9 @@
 //! A black box: the last seconds in memory, written to a file when something happens.
 //!
 //! A torque that was valid and is withheld, a sensor or device that reports a fault, a bus that is
-//! lost, a daemon that ends: the file is written a while later, so that it has what followed. The next one is written
-//! when the memory is full of new seconds, or when `proprio ctl snapshot` asks for it.
+//! lost, a daemon that ends: the file is written a while later, so that it has what followed. The
+//! next one is written when the memory is full of new seconds, or when `proprio ctl snapshot` asks
+//! for it.
 
 use anyhow::Context;
 use proprio_bridge::Heard;
