@@ -5,11 +5,28 @@
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use proprio_tests::watch::{open, valid_since};
-use proprio_tests::{Arm, PATIENCE, Rig, until};
+use proprio_tests::{Arm, PATIENCE, Process, Rig, Written, until};
 use proprio_topics::ipc::monotonic;
 use proprio_topics::{Nanos, Sample, TorqueEstimate};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
+
+/// A simulated arm whose torques are valid: simulator, gateway, estimator.
+fn running(rig: &Rig) -> (Written, [Process; 3]) {
+    let arm = Arm::new()
+        .periods(4, 10, 4)
+        .on_virtual(["a", "b"])
+        .aligned(20.0)
+        .write(&rig.path("robot"));
+    let processes = [
+        rig.start(&["simulate", "--robot", &arm.folder]),
+        rig.start(&["gateway", "--config", &arm.gateway]),
+        rig.start(&["estimator", "--config", &arm.estimator]),
+    ];
+    let mut torques = open::<TorqueEstimate>(&rig.open(), "icub_left_arm");
+    assert!(valid_since(&mut torques, Nanos::ZERO, PATIENCE).is_some());
+    (arm, processes)
+}
 
 /// The rows of a table, without its header.
 fn rows(text: &str) -> BTreeSet<&str> {
@@ -19,16 +36,7 @@ fn rows(text: &str) -> BTreeSet<&str> {
 #[test]
 fn a_recording_has_what_a_table_has_and_is_read_as_one() {
     let rig = Rig::new();
-    let arm = Arm::new()
-        .periods(4, 10, 4)
-        .on_virtual(["a", "b"])
-        .aligned(20.0)
-        .write(&rig.path("robot"));
-    let _simulator = rig.start(&["simulate", "--robot", &arm.folder]);
-    let _gateway = rig.start(&["gateway", "--config", &arm.gateway]);
-    let _estimator = rig.start(&["estimator", "--config", &arm.estimator]);
-    let mut torques = open::<TorqueEstimate>(&rig.open(), "icub_left_arm");
-    assert!(valid_since(&mut torques, Nanos::ZERO, PATIENCE).is_some());
+    let (arm, [_simulator, _gateway, _estimator]) = running(&rig);
 
     let path = |name: &str| rig.path(name).display().to_string();
     let (mcap, csv, killed) = (path("run.mcap"), path("run.csv"), path("killed.mcap"));
@@ -137,16 +145,7 @@ fn column(table: &str, name: &str) -> BTreeMap<String, String> {
 #[test]
 fn a_recording_with_frames_and_configuration_is_enough() {
     let rig = Rig::new();
-    let arm = Arm::new()
-        .periods(4, 10, 4)
-        .on_virtual(["a", "b"])
-        .aligned(20.0)
-        .write(&rig.path("robot"));
-    let _simulator = rig.start(&["simulate", "--robot", &arm.folder]);
-    let mut gateway = rig.start(&["gateway", "--config", &arm.gateway]);
-    let _estimator = rig.start(&["estimator", "--config", &arm.estimator]);
-    let mut torques = open::<TorqueEstimate>(&rig.open(), "icub_left_arm");
-    assert!(valid_since(&mut torques, Nanos::ZERO, PATIENCE).is_some());
+    let (arm, [_simulator, mut gateway, _estimator]) = running(&rig);
 
     let path = |name: &str| rig.path(name).display().to_string();
     let mut recorder = rig.start(&[
@@ -304,16 +303,7 @@ fn a_recording_with_frames_and_configuration_is_enough() {
 #[test]
 fn a_black_box_writes_when_something_happens() {
     let rig = Rig::new();
-    let arm = Arm::new()
-        .periods(4, 10, 4)
-        .on_virtual(["a", "b"])
-        .aligned(20.0)
-        .write(&rig.path("robot"));
-    let _simulator = rig.start(&["simulate", "--robot", &arm.folder]);
-    let mut gateway = rig.start(&["gateway", "--config", &arm.gateway]);
-    let mut estimator = rig.start(&["estimator", "--config", &arm.estimator]);
-    let mut torques = open::<TorqueEstimate>(&rig.open(), "icub_left_arm");
-    assert!(valid_since(&mut torques, Nanos::ZERO, PATIENCE).is_some());
+    let (arm, [_simulator, mut gateway, mut estimator]) = running(&rig);
 
     let folder = rig.path("box");
     let out = folder.display().to_string();
