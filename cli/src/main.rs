@@ -74,7 +74,7 @@ enum Verb {
     Top(top::Top),
     /// Print the samples of a channel, the torques or the contacts as they come
     Echo(echo::Echo),
-    /// Record what a robot measures and feels: a table, a recording for viewers, or a black box
+    /// Record what a robot measures and feels: a table, a recording, a black box
     Record(record::Record),
     /// Ask a running gateway: its state, its devices, a tare, a changed configuration
     Ctl(ctl::Args),
