@@ -138,7 +138,7 @@ def test_an_external_wrench_is_the_push(robot, subscribe):
             # The same force in other axes, but for what the contact leaves unexplained.
             assert abs(size(message) - size(push)) < 0.25 * size(push) + 0.5
             compared += 1
-    assert compared > 100
+    assert compared > 10
     # On a busy machine samples come late, and single residuals are large.
     sizes = sorted(size(message) for message in external.messages)
     largest = sizes[-1 - len(sizes) // 50]
