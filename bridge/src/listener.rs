@@ -206,6 +206,9 @@ impl Listener {
         listener.name_channels(&description);
         if let Some(described) = estimator {
             listener.name_contacts(described.newest());
+            if let Some(estimates) = &mut listener.estimates {
+                estimates.described = described;
+            }
         }
         Ok(listener)
     }
