@@ -3,7 +3,7 @@
 
 use crate::described::{Described, next};
 use proprio_topics::csv::{Series, Value, What};
-use proprio_topics::ipc::{Domain, DomainConfig, DomainError, PortError, Reader, TakeError};
+use proprio_topics::ipc::{Domain, DomainConfig, DomainError, PortError, Reader, TakeError, Topic};
 use proprio_topics::{
     ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth, MAX_CHANNELS,
     Nanos, Publisher, Role, Sample, TorqueEstimate,
@@ -112,13 +112,28 @@ pub struct Event {
     pub heard: Heard,
 }
 
+/// The names of an estimator, over its restarts.
+struct Names {
+    described: Described,
+    known: Option<Rc<Description>>,
+}
+
+impl Names {
+    /// Those of the estimator's start `epoch`, if they have come.
+    fn of(&mut self, epoch: u64) -> Option<Rc<Description>> {
+        if (self.known.as_ref()).is_none_or(|known| known.header.epoch != epoch) {
+            self.known = self.described.of(epoch).map(|names| Rc::new(*names));
+        }
+        self.known.clone()
+    }
+}
+
 /// What the estimator sends.
 struct Estimates {
     torques: Reader<TorqueEstimate>,
     contacts: Reader<ContactEstimate>,
     health: Option<Reader<EstimatorHealth>>,
-    described: Described,
-    names: Option<Rc<Description>>,
+    names: Names,
 }
 
 impl Estimates {
@@ -128,18 +143,52 @@ impl Estimates {
             torques: Reader::open(domain, robot).ok()?,
             contacts: Reader::open(domain, robot).ok()?,
             health: Reader::open(domain, robot).ok(),
-            described: Described::to_come(domain, robot, Publisher::Estimator).ok()?,
-            names: None,
+            names: Names {
+                described: Described::to_come(domain, robot, Publisher::Estimator).ok()?,
+                known: None,
+            },
         })
     }
+}
 
-    /// The names of this start of the estimator, if they have come.
-    fn names_of(&mut self, epoch: u64) -> Option<Rc<Description>> {
-        if (self.names.as_ref()).is_none_or(|known| known.header.epoch != epoch) {
-            self.names = self.described.of(epoch).map(|names| Rc::new(*names));
+/// Takes the estimates that have come; returns how many were lost, because the names of their
+/// estimator have not.
+fn gather_named<T: Topic>(
+    reader: &mut Reader<T>,
+    names: &mut Names,
+    heard: fn(Box<T>, Rc<Description>) -> Heard,
+    inbox: &mut Vec<Event>,
+) -> Result<u64, TakeError> {
+    let mut lost = 0;
+    while let Some(estimate) = next(reader)? {
+        let header = estimate.header();
+        let (t, epoch) = (header.acquired, header.epoch);
+        match names.of(epoch) {
+            Some(names) => {
+                let heard = heard(Box::new(estimate), names);
+                inbox.push(Event { t, epoch, heard });
+            }
+            None => lost += 1,
         }
-        self.names.clone()
     }
+    Ok(lost)
+}
+
+/// Takes what has come of how a daemon is.
+fn gather_health<T: Topic>(
+    reader: &mut Option<Reader<T>>,
+    heard: fn(Box<T>) -> Heard,
+    inbox: &mut Vec<Event>,
+) -> Result<(), TakeError> {
+    while let Some(reader) = reader
+        && let Some(health) = next(reader)?
+    {
+        let header = health.header();
+        let (t, epoch) = (header.published, header.epoch);
+        let heard = heard(Box::new(health));
+        inbox.push(Event { t, epoch, heard });
+    }
+    Ok(())
 }
 
 /// Follows one robot.
@@ -207,7 +256,7 @@ impl Listener {
         if let Some(described) = estimator {
             listener.name_contacts(described.newest());
             if let Some(estimates) = &mut listener.estimates {
-                estimates.described = described;
+                estimates.names.described = described;
             }
         }
         Ok(listener)
@@ -343,44 +392,18 @@ impl Listener {
                 heard: Heard::Value(number, value),
             });
         }
-        while let Some(reader) = &mut self.health
-            && let Some(health) = next(reader)?
+        gather_health(&mut self.health, Heard::Gateway, inbox)?;
+        if let Some(Estimates {
+            torques,
+            contacts,
+            health,
+            names,
+        }) = &mut self.estimates
         {
-            inbox.push(Event {
-                t: health.header.published,
-                epoch: health.header.epoch,
-                heard: Heard::Gateway(Box::new(health)),
-            });
-        }
-        let Some(estimates) = &mut self.estimates else {
-            return Ok(());
-        };
-        while let Some(torques) = next(&mut estimates.torques)? {
-            let (t, epoch) = (torques.header.acquired, torques.header.epoch);
-            match estimates.names_of(epoch) {
-                Some(names) => {
-                    let heard = Heard::Torques(Box::new(torques), names);
-                    inbox.push(Event { t, epoch, heard });
-                }
-                None => self.lost_estimates += 1,
-            }
-        }
-        while let Some(contacts) = next(&mut estimates.contacts)? {
-            let (t, epoch) = (contacts.header.acquired, contacts.header.epoch);
-            match estimates.names_of(epoch) {
-                Some(names) => {
-                    let heard = Heard::Contacts(Box::new(contacts), names);
-                    inbox.push(Event { t, epoch, heard });
-                }
-                None => self.lost_estimates += 1,
-            }
-        }
-        while let Some(reader) = &mut estimates.health
-            && let Some(health) = next(reader)?
-        {
-            let (t, epoch) = (health.header.published, health.header.epoch);
-            let heard = Heard::Estimator(Box::new(health));
-            inbox.push(Event { t, epoch, heard });
+            let lost = &mut self.lost_estimates;
+            *lost += gather_named(torques, names, Heard::Torques, inbox)?;
+            *lost += gather_named(contacts, names, Heard::Contacts, inbox)?;
+            gather_health(health, Heard::Estimator, inbox)?;
         }
         Ok(())
     }

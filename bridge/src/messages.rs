@@ -6,8 +6,8 @@ use crate::diagnostics;
 use crate::listener::Heard;
 use proprio_topics::csv::{Series, Value, What};
 use proprio_topics::{
-    ContactEstimate, ContactState, Description, EstimatorHealth, GatewayHealth, Imu, JointState,
-    JointTorque, Kind, Nanos, Quality, Reading, Role, TorqueEstimate, Wrench,
+    ContactEstimate, ContactState, Description, Entry, EstimatorHealth, GatewayHealth, Imu,
+    JointState, JointTorque, Kind, Nanos, Quality, Reading, Role, TorqueEstimate, Wrench,
 };
 use std::collections::BTreeMap;
 
@@ -440,14 +440,7 @@ impl<S: Sink> Messages<S> {
             let Some(entry) = entry(number).filter(|_| contact.valid == 1) else {
                 continue;
             };
-            let wrench = Wrench {
-                force: contact.force,
-                torque: contact.torque,
-            };
-            let topic = format!("/contact/{}", entry.name.as_str());
-            self.send(&topic, definitions::wrench_stamped, t, |wall| {
-                wrench_stamped(wall, entry.frame.as_str(), &wrench)
-            })?;
+            self.wrench("contact", entry, t, contact.force, contact.torque)?;
         }
         for (residual, number) in estimate.residuals().iter().zip(0..) {
             // Zeros without a significance are no measurement: a contact that may be anything
@@ -457,16 +450,24 @@ impl<S: Sink> Messages<S> {
             let is_known = is_known && values.into_iter().all(|value| value.is_finite());
             let entry = names.find(Role::SubTree, number).filter(|_| is_known);
             let Some(entry) = entry else { continue };
-            let wrench = Wrench {
-                force: residual.force,
-                torque: residual.torque,
-            };
-            let topic = format!("/external/{}", entry.name.as_str());
-            self.send(&topic, definitions::wrench_stamped, t, |wall| {
-                wrench_stamped(wall, entry.frame.as_str(), &wrench)
-            })?;
+            self.wrench("external", entry, t, residual.force, residual.torque)?;
         }
         Ok(())
+    }
+
+    /// A wrench \[N, Nm\] on the topic `/<what>/<name>`, in the frame of its entry.
+    fn wrench(
+        &mut self,
+        what: &str,
+        entry: &Entry,
+        t: Nanos,
+        force: [f64; 3],
+        torque: [f64; 3],
+    ) -> Result<(), S::Error> {
+        let topic = format!("/{what}/{}", entry.name.as_str());
+        self.send(&topic, definitions::wrench_stamped, t, |wall| {
+            wrench_stamped(wall, entry.frame.as_str(), &Wrench { force, torque })
+        })
     }
 
     /// [`Messages::diagnostics`], if the last ones were a second before `t`; the first ones come a

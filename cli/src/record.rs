@@ -210,11 +210,7 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
     order.finish(|t, it| write(t, it, listener.series(), &mut out))?;
     let without_column = out.without_column();
     let is_table = matches!(out, Output::Table(_));
-    let black_box = match &mut out {
-        Output::BlackBox(it) => Some((it.finish(monotonic(), listener.series())?, it.memory())),
-        _ => None,
-    };
-    out.finish()?;
+    let told = out.finish(monotonic(), listener.series())?;
     print_line!(
         "{}: {} samples in {:.1} s, {} lost, {} out of order",
         args.out.display(),
@@ -233,9 +229,8 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
     if let Some(frames) = &frames {
         print_line!("{} frames, {} lost", counts.frames, frames.lost());
     }
-    if let Some((written, memory)) = black_box {
-        let memory = memory as f64 / 1e6;
-        print_line!("{written} files were written; the last seconds took {memory:.1} MB");
+    if let Some(told) = told {
+        print_line!("{told}");
     }
     let without = gaps.summary(monotonic());
     if !without.is_empty() {

@@ -86,6 +86,22 @@ fn asked_by_name(text: &str) -> Result<String, String> {
     }
 }
 
+/// Opens a bus; also returns the interface, of a bus of the kernel.
+pub(crate) fn open_bus(
+    source: &Source,
+    domain: &DomainConfig,
+) -> anyhow::Result<(Box<dyn Link>, Option<String>)> {
+    Ok(match source {
+        Source::SocketCan(named) => {
+            let link = SocketCan::open_adapter(named, Path::new(adapter::SYS), &[])?;
+            let interface = link.interface().to_owned();
+            (Box::new(link), Some(interface))
+        }
+        Source::Virtual { name } => (Box::new(VirtualBus::open(&domain.name, name, &[])?), None),
+        Source::Replay { log, .. } => anyhow::bail!("{} is a log", log.display()),
+    })
+}
+
 /// What was heard on a bus.
 pub(crate) struct Heard {
     pub(crate) traffic: Traffic,
@@ -96,17 +112,11 @@ pub(crate) struct Heard {
 impl How {
     /// Listens to `source`, and asks if that is wanted.
     pub(crate) fn scan(&self, source: &Source, domain: &DomainConfig) -> anyhow::Result<Heard> {
-        let (mut link, fd): (Box<dyn Link>, bool) = match source {
-            Source::SocketCan(named) => {
-                let link = SocketCan::open_adapter(named, Path::new(adapter::SYS), &[])?;
-                let health = Netlink::default().ask(link.interface());
-                (Box::new(link), health.is_ok_and(|health| health.fd == 1))
-            }
-            Source::Virtual { name } => {
-                (Box::new(VirtualBus::open(&domain.name, name, &[])?), true)
-            }
-            Source::Replay { log, .. } => anyhow::bail!("{} is a log", log.display()),
-        };
+        let (mut link, interface) = open_bus(source, domain)?;
+        let fd = interface.is_none_or(|interface| {
+            let health = Netlink::default().ask(&interface);
+            health.is_ok_and(|health| health.fd == 1)
+        });
         let asks = self.active || !self.ask.is_empty();
         if !asks {
             link = Box::new(ListenOnly(link));

@@ -77,6 +77,16 @@ impl Server {
             Self::Recorder => "recorder",
         }
     }
+
+    /// How long a client waits for an answer: longer than the gateway for its devices, and a
+    /// recorder for a slow disk.
+    #[must_use]
+    pub const fn patience(self) -> Duration {
+        match self {
+            Self::Gateway => Duration::from_secs(5),
+            Self::Recorder => Duration::from_secs(120),
+        }
+    }
 }
 
 /// What is asked.
@@ -232,17 +242,17 @@ impl Recorder {
                         thread::sleep(Duration::from_millis(100));
                         continue;
                     };
-                    let order = Self::order(&client);
-                    let is_ended = match order {
-                        Some(Ok(())) => orders.send(Asking(client)).is_err(),
-                        Some(Err(error)) => {
-                            Asking(client).answer(Err(&error));
-                            false
-                        }
-                        None => false,
+                    let Some(order) = Self::order(&client) else {
+                        continue;
                     };
-                    if is_ended {
-                        return;
+                    let client = Asking(client);
+                    match order {
+                        Ok(()) => {
+                            if orders.send(client).is_err() {
+                                return;
+                            }
+                        }
+                        Err(error) => client.answer(Err(&error)),
                     }
                 }
             })?;
@@ -398,18 +408,6 @@ impl Lines {
 }
 
 // ---------------------------------------------------------------- the operator's end
-
-impl Server {
-    /// How long a client waits for an answer: longer than the gateway for its devices, and a
-    /// recorder for a slow disk.
-    #[must_use]
-    pub const fn patience(self) -> Duration {
-        match self {
-            Self::Gateway => Duration::from_secs(5),
-            Self::Recorder => Duration::from_secs(120),
-        }
-    }
-}
 
 /// The robots whose gateways, or recorders, can be asked, by name.
 ///

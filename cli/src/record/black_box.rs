@@ -8,6 +8,7 @@
 use anyhow::Context;
 use proprio_bridge::Heard;
 use proprio_drivers::Frame;
+use proprio_estimator::files;
 use proprio_gateway::clock::realtime_offset;
 use proprio_gateway::control;
 use proprio_recording::{About, Ring, Snapshot, WriteError};
@@ -16,7 +17,7 @@ use proprio_topics::ipc::DomainConfig;
 use proprio_topics::{DeviceState, LinkState, Nanos, Quality};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fs;
-use std::io::{self, BufWriter, Write as _};
+use std::io::{self, BufWriter};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
@@ -208,21 +209,9 @@ impl BlackBox {
 
 /// Writes a file: it has its name when it is complete, and outlives a loss of power then.
 fn write(snapshot: &Snapshot, place: &Path) -> io::Result<()> {
-    let part = place.with_extension("part");
-    let write = || {
-        let file = BufWriter::new(fs::File::create(&part)?);
-        let mut file = snapshot.write(file).map_err(io::Error::other)?;
-        file.flush()?;
-        file.get_ref().sync_all()?;
-        fs::rename(&part, place)
-    };
-    let written = write();
-    if written.is_err() {
-        let _ = fs::remove_file(&part);
-    }
-    let folder = place.parent().unwrap_or(Path::new("."));
-    let _ = fs::File::open(folder).and_then(|folder| folder.sync_all());
-    written
+    let file = BufWriter::new(files::begin(place)?);
+    let file = snapshot.write(file).map_err(io::Error::other)?;
+    files::end(file.into_inner()?, place, 0o644)
 }
 
 /// Adds a file to those that are there; the oldest is deleted if there are enough.

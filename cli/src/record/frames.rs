@@ -1,15 +1,12 @@
 //! The raw frames of buses, heard beside the gateway by sockets of this program's own.
 
+use crate::scan::open_bus;
 use anyhow::Context;
 use proprio_drivers::Frame;
-use proprio_gateway::config::Source;
-use proprio_gateway::link::socketcan::SocketCan;
-use proprio_gateway::link::virtual_bus::VirtualBus;
-use proprio_gateway::link::{Link, ListenOnly, Received, adapter};
+use proprio_gateway::link::{Link as _, ListenOnly, Received};
 use proprio_simulator::parse_bus;
 use proprio_topics::Nanos;
 use proprio_topics::ipc::{DomainConfig, monotonic};
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
@@ -41,20 +38,11 @@ impl Frames {
         };
         for (number, bus) in buses.iter().enumerate() {
             let source = parse_bus(bus)?;
-            let (name, link): (_, Box<dyn Link>) = match &source {
-                Source::SocketCan(named) => {
-                    let link = SocketCan::open_adapter(named, Path::new(adapter::SYS), &[])
-                        .with_context(|| format!("bus {bus}"))?;
-                    (link.interface().to_owned(), Box::new(link))
-                }
-                Source::Virtual { name } => {
-                    let link = VirtualBus::open(&domain.name, name, &[])
-                        .with_context(|| format!("bus {bus}"))?;
-                    (name.clone(), Box::new(link))
-                }
-                Source::Replay { log, .. } => anyhow::bail!("{} is a log", log.display()),
-            };
-            all.buses.push(name);
+            let opened = open_bus(&source, domain).with_context(|| format!("bus {bus}"))?;
+            let (link, interface) = opened;
+            // A virtual bus has the name after `virtual:`.
+            let name = bus.split_once(':').map_or(bus.as_str(), |(_, name)| name);
+            all.buses.push(interface.unwrap_or_else(|| name.to_owned()));
             let mut bus = Bus {
                 number,
                 link: ListenOnly(link),

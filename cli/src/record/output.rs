@@ -48,7 +48,6 @@ pub(super) struct Table {
 pub(super) struct Recording {
     recorder: Recorder<BufWriter<File>>,
     about: About,
-    series: Vec<Series>,
     /// Where the next file is begun, and after what time.
     split: Option<(Split, Nanos)>,
 }
@@ -100,7 +99,6 @@ impl Output {
         Ok(Self::Recording(Box::new(Recording {
             recorder: Recorder::new(BufWriter::new(file), &about, series)?,
             about,
-            series: series.to_vec(),
             split: None,
         })))
     }
@@ -167,22 +165,26 @@ impl Output {
         Ok(())
     }
 
-    pub(super) fn finish(self) -> anyhow::Result<()> {
+    /// Ends it at `now`; returns what a person should know of it, if there is something.
+    pub(super) fn finish(self, now: Nanos, series: &[Series]) -> anyhow::Result<Option<String>> {
         match self {
             Self::Table(table) => table.writer.finish()?.flush()?,
             Self::Recording(recording) => recording.recorder.finish()?.flush()?,
-            Self::BlackBox(_) => {}
+            Self::BlackBox(mut black_box) => {
+                let (written, memory) = (black_box.finish(now, series)?, black_box.memory());
+                return Ok(Some(format!(
+                    "{written} files were written; the last seconds took {:.1} MB",
+                    memory as f64 / 1e6
+                )));
+            }
         }
-        Ok(())
+        Ok(None)
     }
 }
 
 impl Recording {
     fn push(&mut self, t: Nanos, heard: &Heard, series: &[Series]) -> io::Result<()> {
-        if series.len() > self.series.len() {
-            self.series = series.to_vec();
-            self.recorder.know(series).map_err(io::Error::other)?;
-        }
+        self.recorder.know(series).map_err(io::Error::other)?;
         self.recorder.say(t, heard).map_err(io::Error::other)?;
         self.recorder.each_second(t).map_err(io::Error::other)
     }
