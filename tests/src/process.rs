@@ -219,6 +219,24 @@ impl Rig {
             .collect()
     }
 
+    /// The domain's segments as soon as they stay the same for half a second: until then processes
+    /// still open each other's services.
+    ///
+    /// # Panics
+    /// If they do not settle within [`PATIENCE`].
+    #[must_use]
+    pub fn settled_segments(&self) -> Vec<String> {
+        let (mut segments, mut since) = (Vec::new(), now());
+        until(PATIENCE, || {
+            let before = std::mem::replace(&mut segments, self.segments());
+            if before != segments {
+                since = now();
+            }
+            (now() - since > Nanos::from_millis(500)).then(|| segments.clone())
+        })
+        .expect("the segments settle")
+    }
+
     /// The remaining files and shared-memory segments of the domain.
     #[must_use]
     pub fn leftovers(&self) -> Vec<String> {

@@ -28,20 +28,6 @@ fn setting(name: &str, default: u64) -> u64 {
     })
 }
 
-/// The number of the domain's segments as soon as it stays the same for half a second: until then
-/// processes still open each other's services.
-fn settled_segments(rig: &Rig) -> usize {
-    let (mut count, mut since) = (0, now());
-    until(PATIENCE, || {
-        let before = std::mem::replace(&mut count, rig.segments().len());
-        if before != count {
-            since = now();
-        }
-        (now() - since > Nanos::from_millis(500)).then_some(count)
-    })
-    .expect("the number of segments settles")
-}
-
 /// The number of these files that are connections of a writer to a reader.
 fn connections(files: &[String]) -> usize {
     let connections = files.iter().filter(|name| name.ends_with(".connection"));
@@ -110,8 +96,8 @@ fn the_chain_recovers_from_kills_at_any_instant() {
         valid_since(&mut torques, Nanos::ZERO, PATIENCE).is_some(),
         "the chain does not start"
     );
-    let segments = settled_segments(&rig);
-    let at_start = rig.segments();
+    let at_start = rig.settled_segments();
+    let segments = at_start.len();
 
     let mut random = fastrand::Rng::with_seed(7);
     let mut times: Vec<(Nanos, usize, bool)> = Vec::new();

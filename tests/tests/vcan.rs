@@ -444,7 +444,7 @@ fn the_chain_recovers_from_kills() {
         return;
     }
     let mut chain = Chain::start();
-    let segments = chain.rig.segments().len();
+    let segments = chain.rig.settled_segments().len();
     let mut random = fastrand::Rng::with_seed(11);
     let startup = if uml() { 1500.0 } else { 15.0 };
     let begin = now();
