@@ -47,12 +47,15 @@ pub(crate) fn run(args: &Top, config: &DomainConfig) -> anyhow::Result<()> {
     let (out, snapshots) = sync_channel(1);
     let (config, robot) = (config.clone(), args.robot.clone());
     let view = View::new(&config.name, monotonic());
-    std::thread::Builder::new()
-        .name("reader".into())
-        .spawn(move || follow(&config, robot, &wanted, &out))
-        .context("cannot start a thread")?;
+    // First, so that the domain keeps the panics that it catches from the terminal's hook.
     let terminal = ratatui::try_init().context("the terminal cannot be used");
-    let shown = terminal.and_then(|terminal| show(terminal, view, &snapshots, &ask));
+    let shown = terminal.and_then(|terminal| {
+        std::thread::Builder::new()
+            .name("reader".into())
+            .spawn(move || follow(&config, robot, &wanted, &out))
+            .context("cannot start a thread")?;
+        show(terminal, view, &snapshots, &ask)
+    });
     ratatui::restore();
     drop(ask);
     while snapshots.recv_timeout(FAREWELL).is_ok() {}

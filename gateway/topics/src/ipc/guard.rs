@@ -5,8 +5,8 @@
 //! handler replaces what is missing of a domain's file by empty memory of this process, and counts
 //! that. An empty list of ports has no ports, an empty queue no payloads, and an empty payload is
 //! no valid one: the loop sees that nothing comes, until its ports are opened again. Where iceoryx2
-//! panics because of what it finds, that is caught ([`Guard::survive`]). Any other bus error goes
-//! to whoever would have got it without this handler.
+//! panics because of what it finds, that is caught and not printed ([`Guard::survive`]). Any other
+//! bus error or panic goes to whoever would have got it without this module.
 
 use crate::maps::Mapping;
 use core::sync::atomic::Ordering::{Acquire, Relaxed, Release};
@@ -18,9 +18,12 @@ use nix::sys::signal::{SaFlags, SigAction, SigHandler, SigSet, Signal, raise, si
 use nix::sys::stat::Mode;
 use nix::sys::uio::pread;
 use nix::unistd::{SysconfVar, sysconf};
+use std::boxed::Box;
+use std::cell::Cell;
 use std::os::fd::OwnedFd;
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::panic::{self, AssertUnwindSafe, catch_unwind};
 use std::sync::{Once, OnceLock};
+use std::thread_local;
 
 /// What the handler needs and must not ask for: the bytes of a page, and who is asked if it is not
 /// responsible.
@@ -28,6 +31,11 @@ static PREPARED: OnceLock<(usize, SigAction)> = OnceLock::new();
 
 /// The mappings that were damaged so far.
 static DAMAGES: AtomicU32 = AtomicU32::new(0);
+
+thread_local! {
+    /// Whether a panic of this thread is caught by [`Guard::survive`].
+    static SURVIVES: Cell<bool> = const { Cell::new(false) };
+}
 
 /// Whether a domain's memory is sound.
 #[derive(Debug)]
@@ -58,7 +66,9 @@ impl Guard {
         if !self.is_sound() {
             return None;
         }
+        let before = SURVIVES.replace(true);
         let survived = catch_unwind(AssertUnwindSafe(call)).ok();
+        SURVIVES.set(before);
         if survived.is_none() {
             self.has_failed.store(true, Relaxed);
         }
@@ -66,11 +76,21 @@ impl Guard {
     }
 }
 
-/// Installs the handler, once for the process; not without a list of the process's mappings.
+/// Installs the handler, once for the process; not without a list of the process's mappings. And
+/// hides panics that are caught: what follows from them is told otherwise.
 #[allow(unsafe_code)]
 fn install() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
+        // A thread that panics may not change the hook.
+        if !std::thread::panicking() {
+            let others = panic::take_hook();
+            panic::set_hook(Box::new(move |info| {
+                if !SURVIVES.try_with(Cell::get).unwrap_or_default() {
+                    others(info);
+                }
+            }));
+        }
         let page = sysconf(SysconfVar::PAGE_SIZE).ok().flatten();
         let page = page.and_then(|page| usize::try_from(page).ok());
         let (Some(page), Ok(_)) = (page, mappings()) else {
