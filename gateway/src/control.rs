@@ -44,6 +44,8 @@ use std::os::fd::AsRawFd as _;
 use std::os::unix::fs::{DirBuilderExt as _, PermissionsExt as _};
 use std::os::unix::net;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+use std::sync::atomic::Ordering::Relaxed;
 use std::sync::{Arc, mpsc as std_mpsc};
 use std::thread;
 use std::time::Duration;
@@ -203,11 +205,14 @@ fn bind(
     Ok((folder, listener))
 }
 
+/// How often a recorder looks for clients, and whether its socket is still there.
+const TURN: Duration = Duration::from_millis(100);
+
 /// The socket of a recorder: hands on `{"do": "snapshot"}`, one client after the other.
 pub struct Recorder {
     asked: std_mpsc::Receiver<Asking>,
-    folder: Folder,
-    robot: String,
+    stop: Arc<AtomicBool>,
+    thread: Option<thread::JoinHandle<()>>,
 }
 
 /// A client that waits for a snapshot.
@@ -225,21 +230,38 @@ impl Asking {
 }
 
 impl Recorder {
-    /// Makes the socket and listens, in a thread of its own. One that another recorder of this
-    /// robot has made is replaced.
+    /// Makes the socket and listens, in a thread of its own, which makes it again if it is deleted.
+    /// One that another recorder of this robot has made is replaced.
     ///
     /// # Errors
     /// The socket cannot be made.
     pub fn open(domain: &DomainConfig, robot: &str) -> io::Result<Self> {
-        let (folder, listener) = bind(domain, Server::Recorder, robot)?;
+        let bind = {
+            let (domain, robot) = (domain.clone(), robot.to_owned());
+            move || {
+                let (folder, listener) = bind(&domain, Server::Recorder, &robot)?;
+                listener.set_nonblocking(true)?;
+                Ok::<_, io::Error>((folder.socket(Server::Recorder, &robot), folder, listener))
+            }
+        };
+        let name = format!("{robot}.{}.sock", Server::Recorder.word());
+        let path = domain.base.join(&domain.name).join(name);
+        let mut bound = bind()?;
         let (orders, asked) = std_mpsc::channel();
-        thread::Builder::new()
+        let stop = Arc::new(AtomicBool::new(false));
+        let is_stopped = Arc::clone(&stop);
+        let thread = thread::Builder::new()
             .name("control".into())
             .spawn(move || {
-                loop {
-                    let Ok((client, _)) = listener.accept() else {
-                        // No descriptor is free: do not ask again at once.
-                        thread::sleep(Duration::from_millis(100));
+                while !is_stopped.load(Relaxed) {
+                    let Ok((client, _)) = bound.2.accept() else {
+                        // Nobody is there, or no descriptor is free.
+                        thread::sleep(TURN);
+                        if !path.exists()
+                            && let Ok(new) = bind()
+                        {
+                            bound = new;
+                        }
                         continue;
                     };
                     let Some(order) = Self::order(&client) else {
@@ -247,24 +269,22 @@ impl Recorder {
                     };
                     let client = Asking(client);
                     match order {
-                        Ok(()) => {
-                            if orders.send(client).is_err() {
-                                return;
-                            }
-                        }
+                        Ok(()) => drop(orders.send(client)),
                         Err(error) => client.answer(Err(&error)),
                     }
                 }
+                let _ = fs::remove_file(bound.0);
             })?;
         Ok(Self {
             asked,
-            folder,
-            robot: robot.to_owned(),
+            stop,
+            thread: Some(thread),
         })
     }
 
     /// The order of a client; `None` if it has left, or is too slow.
     fn order(client: &net::UnixStream) -> Option<Result<(), String>> {
+        client.set_nonblocking(false).ok()?;
         client.set_read_timeout(Some(Duration::from_secs(1))).ok()?;
         client
             .set_write_timeout(Some(Duration::from_secs(1)))
@@ -289,7 +309,10 @@ impl Recorder {
 
 impl Drop for Recorder {
     fn drop(&mut self) {
-        let _ = fs::remove_file(self.folder.socket(Server::Recorder, &self.robot));
+        self.stop.store(true, Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
     }
 }
 
