@@ -9,9 +9,14 @@ use proprio_topics::{
     Nanos, Publisher, Role, Sample, TorqueEstimate,
 };
 use std::rc::Rc;
+use std::sync::atomic::AtomicBool;
+use std::sync::atomic::Ordering::Relaxed;
+use std::time::Duration;
 
 /// How often a listener looks for an estimator, and whether the domain is intact.
 const LOOK: Nanos = Nanos::from_millis(500);
+/// How often a robot that is not there is looked for.
+const AGAIN: Duration = Duration::from_millis(250);
 
 /// Why a robot cannot be listened to.
 #[derive(Debug, thiserror::Error)]
@@ -193,7 +198,6 @@ fn gather_health<T: Topic>(
 
 /// Follows one robot.
 pub struct Listener {
-    config: DomainConfig,
     domain: Domain,
     robot: String,
     gateway: Described,
@@ -222,10 +226,39 @@ impl Listener {
     pub fn open(config: &DomainConfig, robot: Option<&str>) -> Result<Self, ListenError> {
         let domain = open(config)?;
         let robot = one_robot(&domain, robot)?;
-        Self::of(config, domain, robot)
+        Self::of(domain, robot)
     }
 
-    fn of(config: &DomainConfig, domain: Domain, robot: String) -> Result<Self, ListenError> {
+    /// As [`Listener::open`], as soon as the robot is there; `None` if `stop` was set before. Gives
+    /// `say` each reason why it waits, once.
+    ///
+    /// # Errors
+    /// [`ListenError::Several`]: which one, only the user knows.
+    pub fn wait_open(
+        config: &DomainConfig,
+        robot: Option<&str>,
+        stop: &AtomicBool,
+        mut say: impl FnMut(&str),
+    ) -> Result<Option<Self>, ListenError> {
+        let mut told = String::new();
+        while !stop.load(Relaxed) {
+            match Self::open(config, robot) {
+                Ok(listener) => return Ok(Some(listener)),
+                Err(error @ ListenError::Several { .. }) => return Err(error),
+                Err(error) => {
+                    let why = error.to_string();
+                    if why != told {
+                        say(&why);
+                        told = why;
+                    }
+                }
+            }
+            std::thread::sleep(AGAIN);
+        }
+        Ok(None)
+    }
+
+    fn of(domain: Domain, robot: String) -> Result<Self, ListenError> {
         // The readers first: what comes meanwhile is heard, too.
         let samples = Reader::open(&domain, &robot).map_err(|error| match error {
             PortError::NotYet { .. } => ListenError::NoGateway,
@@ -237,7 +270,6 @@ impl Listener {
             declarations: Reader::open(&domain, &robot).ok(),
             health: Reader::open(&domain, &robot).ok(),
             estimates: Estimates::of(&domain, &robot),
-            config: config.clone(),
             robot,
             gateway: gateway.ok_or(ListenError::NoGateway)?,
             samples,
@@ -411,9 +443,8 @@ impl Listener {
     /// Looks for what may have come or gone.
     fn look_again(&mut self) {
         // Gateway and estimator make a damaged domain again; until they have, nothing comes.
-        if !self.domain.is_intact()
-            && let Ok(domain) = open(&self.config)
-            && let Ok(new) = Self::of(&self.config, domain, self.robot.clone())
+        if let Some(Ok(domain)) = self.domain.reopened()
+            && let Ok(new) = Self::of(domain, self.robot.clone())
         {
             let lost = self.lost();
             let lost_estimates = self.lost_estimates();

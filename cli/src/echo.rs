@@ -45,17 +45,19 @@ type Out = BufWriter<StdoutLock<'static>>;
 
 /// Without a line for so long, it says that it waits.
 const PATIENCE: Nanos = Nanos::from_millis(2000);
+/// How often it looks whether the domain is intact.
+const LOOK: Nanos = Nanos::from_millis(500);
 
 /// Prints what is asked for.
 pub(crate) fn run(args: &Echo, config: &DomainConfig) -> anyhow::Result<()> {
     let domain = open(config)?;
     let robot = one_robot(&domain, args.robot.as_deref())?;
     let printed = match (&args.channel, &args.torques, &args.contacts) {
-        (Some(channel), ..) => channels(args, &domain, &robot, channel),
-        (None, Some(joints), _) => torques(args, &domain, &robot, joints),
+        (Some(channel), ..) => channels(args, domain, &robot, channel),
+        (None, Some(joints), _) => torques(args, domain, &robot, joints),
         (None, None, contacts) => contacts_of(
             args,
-            &domain,
+            domain,
             &robot,
             contacts.as_deref().unwrap_or_default(),
         ),
@@ -93,19 +95,21 @@ fn check(
 
 /// Prints each payload of a topic with `print`, which returns whether it printed a line, until
 /// interrupted or `args.count` is reached. What has come is printed at once, a line a payload.
+/// Gateway and estimator make a damaged domain again: then it goes on in that.
 fn follow<T: Topic>(
     args: &Echo,
-    domain: &Domain,
+    mut domain: Domain,
     robot: &str,
     mut described: Described,
     mut print: impl FnMut(&mut Out, &Description, &T) -> io::Result<bool>,
 ) -> anyhow::Result<()> {
     let stop = interrupted()?;
-    let mut payloads = Reader::<T>::open(domain, robot)?;
+    let mut payloads = Reader::<T>::open(&domain, robot)?;
     let mut out = BufWriter::new(io::stdout().lock());
     let is_enough = |printed| args.count.is_some_and(|count| printed >= count);
     let mut printed = 0_u64;
     let (mut newest, mut is_told) = (monotonic(), false);
+    let mut look = newest + LOOK;
     while !stop.load(Relaxed) && !is_enough(printed) {
         let before = printed;
         while !is_enough(printed)
@@ -119,11 +123,18 @@ fn follow<T: Topic>(
         if printed > before {
             (newest, is_told) = (monotonic(), false);
         } else if !is_told && monotonic() - newest > PATIENCE {
-            if !domain.is_intact() {
-                bail!("{}: start this again", domain.damage());
-            }
             eprintln!("waiting: nothing is published; `proprio status` says what is missing");
             is_told = true;
+        }
+        if monotonic() > look {
+            look = monotonic() + LOOK;
+            if let Some(Ok(new)) = domain.reopened()
+                && let Some(publisher) = described.newest().publisher.get()
+                && let Ok(names) = Described::to_come(&new, robot, publisher)
+                && let Ok(reader) = Reader::open(&new, robot)
+            {
+                (payloads, described, domain) = (reader, names, new);
+            }
         }
         if !is_enough(printed) {
             payloads.wait(monotonic() + Nanos::from_millis(100));
@@ -132,8 +143,8 @@ fn follow<T: Topic>(
     Ok(())
 }
 
-fn channels(args: &Echo, domain: &Domain, robot: &str, channel: &str) -> anyhow::Result<()> {
-    let described = Described::by(domain, robot, Publisher::Gateway)?
+fn channels(args: &Echo, domain: Domain, robot: &str, channel: &str) -> anyhow::Result<()> {
+    let described = Described::by(&domain, robot, Publisher::Gateway)?
         .context("the robot's gateway is not running")?;
     let wanted = [channel.to_owned()];
     check(described.newest(), Role::Channel, "channel", &wanted)?;
@@ -258,8 +269,8 @@ pub(crate) fn torque_json(torque: f64, deviation: f64, withheld: Option<&Unavail
     object(keys, withheld)
 }
 
-fn torques(args: &Echo, domain: &Domain, robot: &str, joints: &[String]) -> anyhow::Result<()> {
-    let described = estimator(domain, robot, (Role::Joint, "joint"), joints)?;
+fn torques(args: &Echo, domain: Domain, robot: &str, joints: &[String]) -> anyhow::Result<()> {
+    let described = estimator(&domain, robot, (Role::Joint, "joint"), joints)?;
     let is_wanted = |name: &str| joints.is_empty() || joints.iter().any(|joint| joint == name);
     follow(
         args,
@@ -295,11 +306,11 @@ fn torques(args: &Echo, domain: &Domain, robot: &str, joints: &[String]) -> anyh
 
 fn contacts_of(
     args: &Echo,
-    domain: &Domain,
+    domain: Domain,
     robot: &str,
     contacts: &[String],
 ) -> anyhow::Result<()> {
-    let described = estimator(domain, robot, (Role::Contact, "contact"), contacts)?;
+    let described = estimator(&domain, robot, (Role::Contact, "contact"), contacts)?;
     if !described
         .newest()
         .entries()

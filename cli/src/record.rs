@@ -143,7 +143,18 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
         true => None,
         false => Some(Frames::open(&args.frames, config)?),
     };
-    let mut listener = Listener::open(config, args.robot.as_deref())?;
+    let robot = args.robot.as_deref();
+    // A black box is started with the machine, perhaps before the daemons.
+    let mut listener = match args.ring {
+        None => Listener::open(config, robot)?,
+        Some(_) => {
+            let say = |why: &str| tracing::info!("waiting: {why}");
+            match Listener::wait_open(config, robot, &stop, say)? {
+                Some(listener) => listener,
+                None => return Ok(()),
+            }
+        }
+    };
     let began = monotonic();
     let mut out = args.output(listener.robot(), listener.series(), config, began)?;
     let mut gaps = Gaps::new(listener.description());

@@ -25,8 +25,6 @@ use std::sync::atomic::Ordering::Relaxed;
 
 /// How often diagnostics are published, and the wall clock is looked at.
 const SECOND: Nanos = Nanos::from_millis(1000);
-/// How often a robot that is not there is looked for.
-const LOOK: Nanos = Nanos::from_millis(250);
 /// What comes within this time is sent together: half of the processor's time, and late by this.
 const GATHER: Nanos = Nanos::from_millis(2);
 /// The longest wait: then signals are looked at.
@@ -139,7 +137,9 @@ fn run(args: &Args, options: Options) -> anyhow::Result<()> {
         config.name.clone_from(name);
     }
     let node = Node::new(options)?;
-    let Some(mut listener) = open(&config, args.robot.as_deref(), &stop)? else {
+    let say = |why: &str| eprintln!("waiting: {why}");
+    let opened = Listener::wait_open(&config, args.robot.as_deref(), &stop, say)?;
+    let Some(mut listener) = opened else {
         return Ok(());
     };
     let robot = listener.robot().to_owned();
@@ -178,31 +178,6 @@ fn run(args: &Args, options: Options) -> anyhow::Result<()> {
         sleep_until(monotonic() + GATHER);
     }
     Ok(())
-}
-
-/// Waits for the robot; `None` if a signal came before.
-fn open(
-    config: &DomainConfig,
-    robot: Option<&str>,
-    stop: &AtomicBool,
-) -> anyhow::Result<Option<Listener>> {
-    let mut told = String::new();
-    while !stop.load(Relaxed) {
-        match Listener::open(config, robot) {
-            Ok(listener) => return Ok(Some(listener)),
-            // Which one, only the user knows.
-            Err(error @ ListenError::Several { .. }) => return Err(error.into()),
-            Err(error) => {
-                let text = error.to_string();
-                if text != told {
-                    eprintln!("waiting: {text}");
-                    told = text;
-                }
-            }
-        }
-        sleep_until(monotonic() + LOOK);
-    }
-    Ok(None)
 }
 
 #[cfg(test)]

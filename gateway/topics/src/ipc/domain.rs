@@ -413,6 +413,14 @@ impl<S: Service> Domain<S> {
         self.inner.hold();
     }
 
+    /// Notes what this process holds of a domain that cannot be used any more, before it opens the
+    /// one that replaces it: then it is given back with the last port.
+    pub(super) fn give_up(&self) {
+        if !self.is_usable() {
+            self.inner.hold();
+        }
+    }
+
     /// The bell of `service`.
     pub(super) fn bell(&self, service: &ServiceName) -> Result<Bell, PortError> {
         Bell::open(&self.inner.place.root, service.as_str())

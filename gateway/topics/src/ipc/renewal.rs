@@ -24,6 +24,18 @@ impl Domain {
             Self::create(self.config(), FEW_STEPS)
         })
     }
+
+    /// As [`Domain::renewed`], for who only reads: it waits for those who write to make the domain
+    /// anew, and removes nothing.
+    ///
+    /// # Errors
+    /// As [`Domain::open_existing`]: call it again later.
+    pub fn reopened(&self) -> Option<Result<Self, DomainError>> {
+        (!self.is_intact()).then(|| {
+            self.give_up();
+            Self::open_existing(self.config())
+        })
+    }
 }
 
 /// How often a data plane tries again to create its ports.
