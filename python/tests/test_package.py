@@ -49,4 +49,5 @@ def test_the_notebook_runs(tmp_path):
     client.execute()
     text = nbformat.writes(notebook)
     assert "image/png" in text and "<iframe" in text
+    assert "Nothing was identified" not in text and "identified parameters" in text
     assert proprio.__doc__

@@ -7,6 +7,8 @@
 //! - [`Arm`]: `config/icub_left_arm` with other sources, periods and time-outs.
 //! - [`watch`]: waits for a health condition or the first valid estimate; records everything
 //!   published; reads the truth.
+//! - [`damage`]: what another program may do to the files of a domain.
+//! - [`terminal`]: a program on a pseudo-terminal.
 //! - [`browse`]: checks a report in a headless browser.
 //! - [`truth`]: is a valid torque true, whatever goes wrong?
 //! - [`fuzz`]: readers of what others write, as functions of bytes.
@@ -19,10 +21,12 @@ mod arm;
 mod browser;
 pub mod can;
 pub mod chain;
+pub mod damage;
 pub mod fuzz;
 mod parallel;
 mod process;
 pub mod promise;
+pub mod terminal;
 pub mod truth;
 pub mod watch;
 

@@ -7,43 +7,14 @@
 //! service manager starts the daemon again, and the loop goes on as before.
 #![allow(missing_docs)]
 
+use proprio_tests::damage::{DELETIONS, SHORTENINGS};
 use proprio_tests::{Arm, PATIENCE, Process, Rig, now, until};
 use proprio_topics::Nanos;
 use proprio_topics::ipc::{RobotReader, Unavailable};
 use std::fs;
-use std::os::unix::fs::PermissionsExt as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 const ROBOT: &str = "icub_left_arm";
-
-/// Sets the length of each of these files to a part of what it was.
-fn shorten(files: &[PathBuf], kind: &str, part: u64) {
-    for path in files
-        .iter()
-        .filter(|path| path.to_string_lossy().ends_with(kind))
-    {
-        // Whoever makes the domain again at the same time may remove it.
-        let _ = (|| {
-            // Files that their owners may only read belong to the same user all the same.
-            fs::set_permissions(path, fs::Permissions::from_mode(0o600))?;
-            let file = fs::OpenOptions::new().write(true).open(path)?;
-            file.set_len(file.metadata()?.len() * part / 100)
-        })();
-    }
-}
-
-fn below(folder: &Path) -> Vec<PathBuf> {
-    let mut all = Vec::new();
-    for entry in fs::read_dir(folder).expect("a folder").flatten() {
-        let path = entry.path();
-        if path.is_dir() {
-            all.extend(below(&path));
-        } else {
-            all.push(path);
-        }
-    }
-    all
-}
 
 /// How many deleted segments a process has mapped, and how many files it has open.
 fn held(process: &Process) -> [usize; 2] {
@@ -65,7 +36,6 @@ fn whatever_is_deleted_or_shortened_is_made_again() {
     let mut gateway = rig.start(&["gateway", "--config", &arm.gateway]);
     let mut estimator = rig.start(&["estimator", "--config", &arm.estimator]);
     let domain = rig.domain.clone();
-    let root = domain.base.join(&domain.name);
     let mut robot = RobotReader::new(&domain, ROBOT, Nanos::from_millis(100)).expect("a thread");
     let elbow = robot.torque_handle("l_elbow");
     // A valid torque that was acquired after `since`, as a loop of 1 kHz reads it.
@@ -86,51 +56,10 @@ fn whatever_is_deleted_or_shortened_is_made_again() {
         "the chain does not start"
     );
 
-    let segments = || -> Vec<PathBuf> {
-        let names = rig.segments().into_iter();
-        names.map(|name| Path::new("/dev/shm").join(name)).collect()
-    };
-    let delete = |files: &[PathBuf]| files.iter().for_each(|path| drop(fs::remove_file(path)));
-    type Damage<'a> = (&'a str, &'a dyn Fn());
-    let deleted: [Damage<'_>; 3] = [
-        ("the folder is deleted", &|| {
-            // A process that makes it again at the same time leaves nothing to remove.
-            let _ = fs::remove_dir_all(&root);
-        }),
-        ("what is in the folder is deleted", &|| {
-            delete(&below(&root));
-        }),
-        ("the segments are deleted", &|| {
-            delete(&segments());
-        }),
-    ];
-    let shortened: [Damage<'_>; 7] = [
-        ("payloads are emptied", &|| {
-            shorten(&segments(), ".data", 0);
-        }),
-        ("payloads are halved", &|| {
-            shorten(&segments(), ".data", 50);
-        }),
-        ("connections are emptied", &|| {
-            shorten(&segments(), ".connection", 0);
-        }),
-        ("connections are halved", &|| {
-            shorten(&segments(), ".connection", 50);
-        }),
-        ("lists of ports are emptied", &|| {
-            shorten(&segments(), ".dynamic", 0);
-        }),
-        ("bells are emptied", &|| {
-            shorten(&below(&root.join("bells")), "", 0);
-        }),
-        ("all segments are emptied", &|| {
-            shorten(&segments(), "", 0);
-        }),
-    ];
     let before = [held(&gateway), held(&estimator)];
-    for (what, damage) in deleted {
+    for (what, damage) in DELETIONS {
         let start = now();
-        damage();
+        damage(&rig);
         let recovered = valid_after(now() + Nanos::from_millis(300), &mut || ());
         for process in [&mut simulator, &mut gateway, &mut estimator] {
             process.assert_runs();
@@ -167,9 +96,9 @@ fn whatever_is_deleted_or_shortened_is_made_again() {
         gateway.log()
     );
 
-    for (what, damage) in shortened {
+    for (what, damage) in SHORTENINGS {
         let start = now();
-        damage();
+        damage(&rig);
         let mut restarts = 0;
         let recovered = valid_after(now() + Nanos::from_millis(300), &mut || {
             for (process, arguments) in [

@@ -1,109 +1,13 @@
 //! `proprio top` on a pseudo-terminal, beside daemons that come, go and are killed.
 #![allow(missing_docs)]
 
-use nix::fcntl::{FcntlArg, OFlag, fcntl};
-use nix::pty::{Winsize, openpty};
 use nix::sys::signal::{Signal, kill};
-use nix::sys::termios::{Termios, tcgetattr};
 use nix::unistd::{Pid, ttyname};
-use proprio_tests::{Arm, PATIENCE, Rig, now, until};
+use proprio_tests::terminal::Terminal;
+use proprio_tests::{Arm, Rig, now};
 use proprio_topics::Nanos;
-use std::fs::{self, File};
-use std::io::{Read, Write};
-use std::num::NonZeroU16;
-use std::os::fd::OwnedFd;
-use std::process::{Child, Command, ExitStatus};
-
-fn size(rows: u16, columns: u16) -> (NonZeroU16, NonZeroU16) {
-    let side = |n| NonZeroU16::new(n).expect("a size");
-    (side(rows), side(columns))
-}
-
-/// A terminal with a program on it.
-struct Terminal {
-    child: Child,
-    keyboard: File,
-    /// This end of it stays open, so that its settings can be asked for afterwards.
-    line: OwnedFd,
-    before: Termios,
-    screen: vt100::Parser,
-}
-
-impl Terminal {
-    /// `proprio top` in 100 columns and 50 rows.
-    fn start(command: &mut Command) -> Self {
-        let window = Winsize {
-            ws_row: 50,
-            ws_col: 100,
-            ws_xpixel: 0,
-            ws_ypixel: 0,
-        };
-        let pair = openpty(&window, None).expect("a pseudo-terminal");
-        let before = tcgetattr(&pair.slave).expect("its settings");
-        let line = || pair.slave.try_clone().expect("a file descriptor");
-        let child = (command.stdin(line()).stdout(line()).stderr(line()).spawn()).expect("it runs");
-        fcntl(&pair.master, FcntlArg::F_SETFL(OFlag::O_NONBLOCK)).expect("a flag");
-        let (rows, columns) = size(50, 100);
-        Self {
-            child,
-            keyboard: File::from(pair.master),
-            line: pair.slave,
-            before,
-            screen: vt100::Parser::new(rows, columns, 0),
-        }
-    }
-
-    fn press(&mut self, keys: &str) {
-        self.keyboard.write_all(keys.as_bytes()).expect("it reads");
-    }
-
-    /// What it shows now.
-    fn text(&mut self) -> String {
-        let mut bytes = [0; 4096];
-        while let Ok(count @ 1..) = self.keyboard.read(&mut bytes) {
-            self.screen.process(&bytes[..count]);
-        }
-        self.screen.screen().contents()
-    }
-
-    /// Waits until it shows what is expected.
-    fn wait(&mut self, what: &str, mut shows: impl FnMut(&str) -> bool) -> String {
-        let found = until(PATIENCE, || {
-            let text = self.text();
-            shows(&text).then_some(text)
-        });
-        found.unwrap_or_else(|| panic!("never {what}:\n{}", self.text()))
-    }
-
-    /// Waits until it ends, which leaves the terminal as it was.
-    fn ended(&mut self) -> ExitStatus {
-        let ended = until(PATIENCE, || {
-            self.text();
-            self.child.try_wait().expect("a child")
-        });
-        let text = self.text();
-        let screen = self.screen.screen();
-        assert!(
-            !screen.alternate_screen() && !screen.hide_cursor(),
-            "{text}"
-        );
-        assert!(tcgetattr(&self.line).expect("its settings") == self.before);
-        ended.unwrap_or_else(|| panic!("it does not end:\n{text}"))
-    }
-
-    fn has_colours(&self) -> bool {
-        let screen = self.screen.screen();
-        let mut cells = (0..50).flat_map(|row| (0..100).filter_map(move |at| screen.cell(row, at)));
-        cells.any(|cell| cell.fgcolor() != vt100::Color::Default)
-    }
-}
-
-impl Drop for Terminal {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
+use std::fs;
+use std::process::Command;
 
 fn all_valid(text: &str) -> bool {
     text.contains("TORQUES  7 of 7 valid")
@@ -167,9 +71,7 @@ fn a_robot_is_followed_whatever_comes_and_goes() {
     let mut stty = Command::new("stty");
     stty.arg("-F").arg(path).args(["cols", "40", "rows", "10"]);
     assert!(stty.status().expect("stty runs").success());
-    let (rows, columns) = size(10, 40);
-    top.screen = vt100::Parser::new(rows, columns, 0);
-    top.screen.process(b"\x1b[?1049h\x1b[?25l");
+    top.resized(10, 40);
     top.wait("a small screen", |text| {
         text.contains("TORQUES") && text.lines().last() == Some("q quit  ? keys")
     });

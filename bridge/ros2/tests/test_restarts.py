@@ -1,11 +1,18 @@
-"""Killed daemons, and a bridge that is there before them."""
+"""Killed daemons, a damaged domain, and a bridge that is there before all of them."""
 
 import math
+import sys
 import time
+from pathlib import Path
 
-from conftest import DOMAIN, ROBOT, Diagnostics, Subscription, until
-from cyclonedds.domain import DomainParticipant
-from messages import ERROR, OK, STALE, DiagnosticArray, JointState
+import pytest
+
+sys.path.append(str(Path(__file__).parents[2] / "tests"))
+
+from conftest import DOMAIN, ROBOT, Diagnostics, Subscription, until  # noqa: E402
+from cyclonedds.domain import DomainParticipant  # noqa: E402
+from damage import DAMAGES  # noqa: E402
+from messages import ERROR, OK, STALE, DiagnosticArray, JointState  # noqa: E402
 
 
 def torques(states):
@@ -42,6 +49,27 @@ def test_a_killed_gateway(robot, subscribe, diagnostics):
     states = subscribe("rt/joint_states", JointState)
     killed(robot, states, diagnostics, "gateway")
     assert diagnostics.level("device l_arm_ft_sensor") == OK
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_robot(robot, subscribe, damage):
+    states = subscribe("rt/joint_states", JointState)
+    until("torques", lambda: torques(states))
+    daemons = ("estimator", "gateway")
+    running = robot.running
+    damage(robot.folder / robot.folder.name, running["bridge"], [running[it] for it in daemons])
+    since = time.time() + 0.3
+
+    def is_new(state):
+        stamp = state.header.stamp
+        return stamp.sec + 1e-9 * stamp.nanosec > since and not any(map(math.isnan, state.effort))
+
+    def torques_again():
+        robot.start(*(it for it in daemons if running[it].poll() is not None))
+        return any(map(is_new, states.take()))
+
+    until("torques again", torques_again)
+    assert running["bridge"].poll() is None and "panicked" not in robot.said("bridge")
 
 
 def test_the_bridge_may_be_first(other_robot):

@@ -2,13 +2,18 @@
 
 import json
 import math
+import sys
 import time
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
+from pathlib import Path
 
 import pytest
 from client import Client
 from robot import PROPRIO, ROOT, VIEW, Robot
+
+sys.path.append(str(Path(__file__).parents[2] / "tests"))
+from damage import DAMAGES  # noqa: E402
 
 JOINTS = [
     "l_shoulder_pitch", "l_shoulder_roll", "l_shoulder_yaw", "l_elbow",
@@ -33,7 +38,7 @@ def robot():
         time.sleep(1.2)
         assert robot.viewer.log.read_text().count("waiting") == 1
         robot.simulate()
-        robot.gateway()
+        robot.nerves = robot.gateway()
         robot.brain = robot.estimator()
         robot.said(robot.viewer, "showing icub_left_arm", 20.0)
         yield robot
@@ -312,6 +317,25 @@ def test_a_killed_estimator_is_told_and_its_torques_return(robot, client):
     client.wait("/torques", 10.0, lambda it: all(it.valid))
     client.wait("/diagnostics", 3.0, lambda it: estimator(it) == OK)
     assert client.wait("/torque/l_elbow", 1.0).message.valid
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_robot_is_shown_again(robot, client, damage):
+    damage(robot.folder / robot.domain, robot.viewer, [robot.brain, robot.nerves])
+    since, end = time.monotonic_ns() + 300_000_000, time.monotonic() + 60
+    client.subscribe("/torques")
+    while time.monotonic() < end:
+        if robot.brain.poll() is not None:
+            robot.brain = robot.estimator()
+        if robot.nerves.poll() is not None:
+            robot.nerves = robot.gateway()
+        one = client.receive(0.1)
+        if one and one.topic == "/torques" and one.message.acquired > since:
+            if all(one.message.valid):
+                break
+    else:
+        raise AssertionError("no torques any more")
+    assert "panicked" not in robot.viewer.log.read_text()
 
 
 def test_a_client_that_does_not_read_costs_nothing(robot):
