@@ -11,7 +11,7 @@ sys.path.append(str(Path(__file__).parents[2] / "tests"))
 
 from conftest import DOMAIN, ROBOT, Diagnostics, Subscription, until  # noqa: E402
 from cyclonedds.domain import DomainParticipant  # noqa: E402
-from damage import DAMAGES  # noqa: E402
+from damage import DAMAGES, segments  # noqa: E402
 from messages import ERROR, OK, STALE, DiagnosticArray, JointState  # noqa: E402
 
 
@@ -69,6 +69,7 @@ def test_a_damaged_robot(robot, subscribe, damage):
         return any(map(is_new, states.take()))
 
     until("torques again", torques_again)
+    until("the old memory", lambda: not segments(running["bridge"], is_deleted=True))
     assert running["bridge"].poll() is None and "panicked" not in robot.said("bridge")
 
 
