@@ -11,10 +11,14 @@ const SILENCE: Nanos = Nanos::from_millis(1000);
 
 /// How bad something is; the number is that of `DiagnosticStatus`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Level {
+pub enum Level {
+    /// All is well.
     Ok = 0,
+    /// It works, but something is not as it should be.
     Warn = 1,
+    /// It does not work.
     Error = 2,
+    /// How it is now is not known.
     Stale = 3,
 }
 
@@ -106,7 +110,9 @@ fn daemon(robot: &str, what: &str, published: Option<Nanos>, now: Nanos) -> Stat
     }
 }
 
-fn bus(robot: &str, bus: &BusHealth) -> Status {
+/// How a bus is, and that in words.
+#[must_use]
+pub fn bus_state(bus: &BusHealth) -> (Level, String) {
     let link = bus.link.get();
     let controller = bus.interface.controller.get().unwrap_or_default();
     let level = match (link, controller) {
@@ -118,6 +124,11 @@ fn bus(robot: &str, bus: &BusHealth) -> Status {
     if controller != Controller::Unknown {
         message = format!("{message}, controller {}", controller.word());
     }
+    (level, message)
+}
+
+fn bus(robot: &str, bus: &BusHealth) -> Status {
+    let (level, message) = bus_state(bus);
     let load = match bus.load.is_nan() {
         true => "unknown".to_owned(),
         false => format!("{:.1} %", bus.load * 100.0),
@@ -138,7 +149,9 @@ fn bus(robot: &str, bus: &BusHealth) -> Status {
     }
 }
 
-fn device(robot: &str, device: &DeviceHealth) -> Status {
+/// How a device is, and that in words.
+#[must_use]
+pub fn device_state(device: &DeviceHealth) -> (Level, String) {
     let state = device.state.get();
     let level = match state {
         Some(DeviceState::Streaming) if device.frozen_axes != 0 => Level::Warn,
@@ -153,6 +166,11 @@ fn device(robot: &str, device: &DeviceHealth) -> Status {
     if device.frozen_axes != 0 {
         message = format!("{message}; {} frozen", axes(device.frozen_axes));
     }
+    (level, message)
+}
+
+fn device(robot: &str, device: &DeviceHealth) -> Status {
+    let (level, message) = device_state(device);
     let counts = Counter::ALL.into_iter().zip(device.counters);
     Status {
         level,

@@ -35,5 +35,6 @@ mod listener;
 mod messages;
 
 pub use described::{Described, first_of, next};
+pub use diagnostics::{Level, bus_state, device_state};
 pub use listener::{Event, Heard, ListenError, Listener, one_robot, open};
 pub use messages::{Messages, Sink};

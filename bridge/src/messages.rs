@@ -422,7 +422,7 @@ impl<S: Sink> Messages<S> {
             message.count(estimate.contacts().len());
             for (contact, number) in estimate.contacts().iter().zip(0..) {
                 message.text(entry(number).map_or("", |entry| entry.name.as_str()));
-                message.text(entry(number).map_or("", |entry| entry.frame.as_str()));
+                message.text(entry(number).map_or("", |entry| entry.origin.as_str()));
                 message.f64s(&contact.force);
                 message.f64s(&contact.torque);
                 message.f64s(&contact.standard_deviation);
@@ -466,7 +466,7 @@ impl<S: Sink> Messages<S> {
     ) -> Result<(), S::Error> {
         let topic = format!("/{what}/{}", entry.name.as_str());
         self.send(&topic, definitions::wrench_stamped, t, |wall| {
-            wrench_stamped(wall, entry.frame.as_str(), &Wrench { force, torque })
+            wrench_stamped(wall, entry.origin.as_str(), &Wrench { force, torque })
         })
     }
 
@@ -616,7 +616,7 @@ mod tests {
     fn entry(role: Role, index: u32, name: &str) -> Entry {
         Entry {
             name: Name::new(name).unwrap_or(Name::EMPTY),
-            frame: Name::new(name).unwrap_or(Name::EMPTY),
+            origin: Name::new(name).unwrap_or(Name::EMPTY),
             role: role.in_memory(),
             index,
             ..Entry::NONE

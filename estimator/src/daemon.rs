@@ -23,8 +23,8 @@ use proprio_topics::ipc::{
 };
 use proprio_topics::{
     ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
-    IdentificationHealth, InertiaEstimate, Nanos, Publisher, Role, Sample, TorqueEstimate,
-    realtime,
+    IdentificationHealth, InertiaEstimate, Nanos, Publisher, Role, Sample, TorqueBudget,
+    TorqueEstimate, realtime,
 };
 use sd_notify::NotifyState;
 use std::io::Write as _;
@@ -39,6 +39,9 @@ use tokio::signal::unix::{SignalKind, signal};
 const CONNECT_PERIOD: Nanos = Nanos::from_millis(50);
 /// How often the health message is published.
 const HEALTH_PERIOD: Nanos = Nanos::from_millis(100);
+/// How often the budget of a torque is published while somebody reads them, of one joint after
+/// another.
+const BUDGET_PERIOD: Nanos = Nanos::from_millis(10);
 /// A missing temperature is reported after this number of health periods: boards send it every few
 /// seconds at best.
 const MISSING_TEMPERATURE: u32 = 100;
@@ -227,6 +230,7 @@ struct Ports {
     declarations: Reader<ContactDeclaration>,
     torques: Writer<TorqueEstimate>,
     contacts: Writer<ContactEstimate>,
+    budgets: Writer<TorqueBudget>,
     /// The identified parameters; none if identification is off.
     inertias: Option<Writer<InertiaEstimate>>,
     health: Writer<EstimatorHealth>,
@@ -251,6 +255,7 @@ impl Ports {
             declarations,
             torques: Writer::create(&domain, robot, epoch)?,
             contacts: Writer::create(&domain, robot, epoch)?,
+            budgets: Writer::create(&domain, robot, epoch)?,
             inertias: match identifies {
                 true => Some(Writer::create(&domain, robot, epoch)?),
                 false => None,
@@ -287,6 +292,8 @@ struct DataPlane {
     first_look: FirstLook,
     next_connect: Nanos,
     next_health: Nanos,
+    /// When the next budget is due, and the joint that it is of.
+    next_budget: (Nanos, usize),
     shared: Shared,
 }
 
@@ -335,6 +342,7 @@ impl DataPlane {
             },
             next_connect: Nanos::ZERO,
             next_health: Nanos::ZERO,
+            next_budget: (Nanos::ZERO, 0),
             shared,
         })
     }
@@ -503,6 +511,28 @@ impl DataPlane {
                 // reported elsewhere.
                 let _ = jobs.try_send(job);
             }
+            self.publish_budget(now);
+        }
+    }
+
+    /// Publishes the budget of the next joint of the last estimate, if it is due and anybody reads
+    /// it.
+    fn publish_budget(&mut self, now: Nanos) {
+        let (due, joint) = self.next_budget;
+        if now < due {
+            return;
+        }
+        self.next_budget = (now + BUDGET_PERIOD, joint);
+        if self.ports.budgets.readers() == 0 {
+            return;
+        }
+        match self.pipeline.budget(joint) {
+            Some(budget) => {
+                let sent = self.ports.budgets.send(budget, now);
+                self.health.publish_failures += u64::from(sent.is_err());
+                self.next_budget.1 = joint + 1;
+            }
+            None => self.next_budget.1 = 0,
         }
     }
 
@@ -581,7 +611,7 @@ impl DataPlane {
         self.report_temperatures();
         for (number, channel) in self.shared.channels.iter().enumerate() {
             let newest = self.first_look.newest(number);
-            if let Some(t) = newest.or_else(|| self.pipeline.newest_of_skin(number)) {
+            if let Some(t) = newest.or_else(|| self.pipeline.newest(number)) {
                 channel.set_newest(t);
             }
         }

@@ -212,14 +212,14 @@ impl Setup {
         });
         let contacts = self.robot.contacts.iter().map(|c| Entry {
             name: name(&c.name),
-            frame: name(&c.frame),
+            origin: name(&c.frame),
             role: Role::Contact.in_memory(),
             kind: Kind::Wrench.in_memory(),
             ..Entry::NONE
         });
         let subtrees = self.robot.subtree_names().map(|top| Entry {
             name: name(top),
-            frame: name(top),
+            origin: name(top),
             role: Role::SubTree.in_memory(),
             kind: Kind::Wrench.in_memory(),
             ..Entry::NONE

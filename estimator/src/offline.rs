@@ -35,6 +35,7 @@ use proprio_topics::csv::{Item, Reader, Report, Row, Value, What};
 use proprio_topics::{ContactWrench, JointTorque, Kind, NO_CAUSE, Nanos, Reason, Residual};
 use std::collections::BTreeMap;
 use std::io::{self, Read, Write};
+use std::ops::ControlFlow;
 
 /// Why a log cannot be estimated.
 #[derive(Debug, thiserror::Error)]
@@ -113,6 +114,43 @@ pub fn estimate(
     out: impl Write,
     mut assessor: Option<&mut Assessor>,
 ) -> Result<EstimateReport, OfflineError> {
+    let mut table = None;
+    let mut out = Some(out);
+    let (mut report, pipeline) = follow(setup, log, |pipeline, is_stamped| {
+        if let Some(out) = out.take() {
+            table = Some(Table::new(out, pipeline.setup())?);
+        }
+        if let Some(table) = &mut table {
+            table.write(pipeline.last_estimate(), is_stamped)?;
+        }
+        if let Some(assessor) = &mut assessor {
+            let t = pipeline.last_estimate().t;
+            assessor.estimate(pipeline.last_estimate());
+            assessor.parameters(t, pipeline);
+        }
+        Ok(ControlFlow::Continue(()))
+    })?;
+    let mut table = match (table, out) {
+        (Some(table), _) => table,
+        (None, Some(out)) => Table::new(out, pipeline.setup())?,
+        (None, None) => return Ok(report),
+    };
+    table.out.flush()?;
+    (report.estimates, report.withheld) = (table.rows, table.withheld);
+    Ok(report)
+}
+
+/// Runs the estimator on a log. `each` is called after each estimate, and may end the run; the
+/// second argument is whether the log has stamps. Returns what there is to remark on the log, and
+/// the pipeline after the last estimate.
+///
+/// # Errors
+/// As for [`estimate`]; and those of `each`.
+pub fn follow(
+    setup: Setup,
+    log: impl Read,
+    mut each: impl FnMut(&mut Pipeline, bool) -> Result<ControlFlow<()>, OfflineError>,
+) -> Result<(EstimateReport, Pipeline), OfflineError> {
     let mut reader = Reader::new(log)?;
     let mut report = EstimateReport::default();
     let mut pipeline = Pipeline::new(setup);
@@ -133,26 +171,23 @@ pub fn estimate(
             report.unused_channels.push(series.name.clone());
         }
     }
-    let mut table = Table::new(out, pipeline.setup())?;
     // Rows of a log without stamps are spaced so far that none affects the next.
     let spacing =
         pipeline.setup().robot.max_silence + pipeline.setup().robot.max_silence + Nanos(1);
     let (mut row, mut pseudo) = (Row::default(), Nanos::ZERO);
     let (mut stamped, mut newest) = (true, Nanos::MIN);
     let mut likelier = Vec::new();
-    let mut write = |pipeline: &mut Pipeline, stamped: bool| -> Result<(), OfflineError> {
-        while let Some(estimate) = pipeline.poll() {
-            let t = estimate.t;
-            table.write(estimate, stamped)?;
-            if let Some(assessor) = &mut assessor {
-                assessor.estimate(estimate);
-                assessor.parameters(t, pipeline);
+    let mut make = |pipeline: &mut Pipeline, stamped: bool| -> Result<_, OfflineError> {
+        while let Some(t) = pipeline.poll().map(|estimate| estimate.t) {
+            if each(pipeline, stamped)?.is_break() {
+                return Ok(ControlFlow::Break(()));
             }
             run_due_job(pipeline, t, &mut likelier);
         }
-        Ok(())
+        Ok(ControlFlow::Continue(()))
     };
-    while reader.next_row(&mut row)? {
+    let mut is_ended = false;
+    while !is_ended && reader.next_row(&mut row)? {
         let t = row.t.unwrap_or_else(|| {
             stamped = false;
             pseudo += spacing;
@@ -177,21 +212,21 @@ pub fn estimate(
             report.step_back.get_or_insert((row.line, newest, t));
         }
         newest = newest.max(t);
-        write(&mut pipeline, stamped)?;
+        is_ended = make(&mut pipeline, stamped)?.is_break();
     }
-    pipeline.finish();
-    write(&mut pipeline, stamped)?;
+    if !is_ended {
+        pipeline.finish();
+        let _ = make(&mut pipeline, stamped)?;
+    }
     let robot = &pipeline.setup().robot;
     let described = likelier
         .into_iter()
         .map(|(t, found)| (t, found.describe(robot).to_string()));
     report.likelier = described.collect();
-    (report.estimates, report.withheld) = (table.rows, table.withheld);
-    table.out.flush()?;
     let counts = pipeline.counts();
     report.dropped = [counts.late, counts.backward, counts.not_finite];
     report.log = reader.report().clone();
-    Ok(report)
+    Ok((report, pipeline))
 }
 
 /// Writes estimates row by row.

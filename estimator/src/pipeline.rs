@@ -18,7 +18,8 @@
 //!    Where it can not be tested because of a fault, what rests on the absence of a possible
 //!    contact is not valid either.
 //! 6. Every torque and contact wrench is written with its validity and reason (`validity`,
-//!    `estimate`).
+//!    `estimate`). Who asks, hears what a torque rests on, and how much of its variance each of
+//!    these inputs causes (`budget`).
 //!
 //! # Alignment
 //! Each stamp `t` of the trigger channel gives exactly one estimate, in order. What follows is
@@ -61,6 +62,7 @@
 //! the base's proper acceleration (`motion`), and that of the places of declared and touched
 //! contacts ([`PlaceErrors`]). They do not contain the errors of velocities.
 
+mod budget;
 mod buffers;
 mod channels;
 mod contacts;
@@ -97,7 +99,7 @@ use proprio_dynamics::{
 use proprio_identification::online::state::StateError;
 use proprio_identification::online::{Online, OnlineError};
 use proprio_identification::robot::{BaseMotion, ChannelRole};
-use proprio_topics::{InertiaEstimate, Nanos, Quality, Reason};
+use proprio_topics::{InertiaEstimate, Nanos, Quality, Reason, TorqueBudget};
 use residuals::ResidualMonitor;
 use std::collections::VecDeque;
 use steps::StepCover;
@@ -138,6 +140,8 @@ pub struct Pipeline {
     /// What else the residuals may be.
     steps: StepCover,
     position: Vec<f64>,
+    /// Per degree of freedom, the least and the greatest position so far.
+    travel: Vec<[f64; 2]>,
     velocity: Vec<f64>,
     acceleration: Vec<f64>,
     /// Per degree of freedom, the standard deviation of the encoder offset \[rad or m\].
@@ -156,6 +160,7 @@ pub struct Pipeline {
     /// Why on-line identification was requested but is not available.
     refusal: Option<OnlineError>,
     estimate: Box<Estimate>,
+    budget: Box<TorqueBudget>,
 }
 
 impl Pipeline {
@@ -249,6 +254,7 @@ impl Pipeline {
             residuals: ResidualMonitor::new(&setup.robot.structure),
             steps: StepCover::new(&setup.robot.structure, dofs),
             position: setup.robot.position_without_samples(),
+            travel: vec![[f64::INFINITY, f64::NEG_INFINITY]; dofs],
             velocity: vec![0.0; dofs],
             acceleration: vec![0.0; dofs],
             encoder_offset_std: encoder_offset_std(&setup.state.model),
@@ -265,6 +271,7 @@ impl Pipeline {
             identification,
             refusal,
             estimate,
+            budget: Box::default(),
             setup,
         }
     }
@@ -384,6 +391,12 @@ impl Pipeline {
         Some(&self.estimate)
     }
 
+    /// The last estimate.
+    #[must_use]
+    pub fn last_estimate(&self) -> &Estimate {
+        &self.estimate
+    }
+
     /// Feeds identification, and puts a new solution in use when it is due.
     fn identify(&mut self, t: Nanos) {
         let Some(mut identification) = self.identification.take() else {
@@ -475,6 +488,9 @@ impl Pipeline {
                             );
                             if let (Some(q), Some(dq), Some(ddq)) = places {
                                 [*q, *dq, *ddq] = state;
+                            }
+                            if let Some([least, most]) = self.travel.get_mut(dof) {
+                                (*least, *most) = (least.min(state[0]), most.max(state[0]));
                             }
                             Reason::of_quality(sample.quality, Quality::UNTRUSTED_ENCODER)
                                 .or(reason)

@@ -50,6 +50,7 @@
 //! | all 426 columns correlated | 15.6 | 17.1 |
 
 mod covariance;
+mod shares;
 mod vectors;
 
 pub use covariance::Covariance;
@@ -82,6 +83,10 @@ pub struct Propagation {
     drifts: Vec<Drift>,
     /// Per sensor, the additional variance of each channel [torque; force] at present.
     extra: Vec<[f64; 6]>,
+    /// Per sensor, the variance of what is uncertain in its reading, of each channel.
+    readings: Vec<[f64; 6]>,
+    /// Memory for the shares of a torque: one number per row.
+    sum: Vec<f32>,
     /// The first instant of this run.
     run_start: Option<Nanos>,
     /// The period, and the base, that the wrenches are of.
@@ -152,10 +157,15 @@ impl Propagation {
             covariance.sensors.len(),
             structure.sensors().len(),
         )?;
+        let subtrees = 0..structure.subtrees().len();
+        let subtrees: Vec<SubtreeRoot> = subtrees
+            .map(|number| SubtreeRoot::new(structure, number, covariance))
+            .collect();
+        let rows = subtrees.iter().map(|part| part.rows).max().unwrap_or(0);
         Ok(Self {
-            subtrees: (0..structure.subtrees().len())
-                .map(|number| SubtreeRoot::new(structure, number, covariance))
-                .collect(),
+            subtrees,
+            readings: vec![[0.0; 6]; covariance.drifts.len()],
+            sum: vec![0.0; LANES * rows],
             drifts: covariance.drifts.clone(),
             extra: vec![[0.0; 6]; covariance.drifts.len()],
             run_start: None,
@@ -282,12 +292,17 @@ impl WithSimd for Update<'_> {
             subtrees,
             drifts,
             extra,
+            readings,
             torque,
             contacts,
             imbalances,
             ..
         } = propagation;
         torque.fill(0.0);
+        for (variance, (drift, extra)) in readings.iter_mut().zip(drifts.iter().zip(extra)) {
+            let seconds = drift.known.elapsed(times.0, times.1);
+            *variance = std::array::from_fn(|i| seconds * drift.rate[i] + extra[i]);
+        }
         for ((part, subtree), imbalance) in subtrees
             .iter_mut()
             .zip(structure.subtrees())
@@ -296,11 +311,7 @@ impl WithSimd for Update<'_> {
             if is_due {
                 part.update(simd, solver, kinematics);
             }
-            part.add_readings(solver, |sensor| {
-                let (drift, extra) = (&drifts[sensor], &extra[sensor]);
-                let seconds = drift.known.elapsed(times.0, times.1);
-                std::array::from_fn(|i| seconds * drift.rate[i] + extra[i])
-            });
+            part.add_readings(solver, readings);
             if !part.ends.is_empty() {
                 *imbalance = part.covariance_of_all(simd);
             }
@@ -481,10 +492,10 @@ impl SubtreeRoot {
 
     /// Adds what is uncertain in the readings, given the variances of each sensor's channels.
     #[inline(always)]
-    fn add_readings(&mut self, solver: &Solver, variances: impl Fn(usize) -> [f64; 6]) {
+    fn add_readings(&mut self, solver: &Solver, readings: &[[f64; 6]]) {
         self.below.copy_from_slice(&self.below_alone);
         for end in &self.ends {
-            let variances = variances(end.sensor);
+            let variances = readings[end.sensor];
             if variances == [0.0; 6] {
                 continue;
             }

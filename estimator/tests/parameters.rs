@@ -24,7 +24,7 @@ use proprio_estimator::parameters::{
 use proprio_estimator::propagation::{Covariance, Propagation};
 use proprio_estimator::setup::Setup;
 use proprio_identification::prior::cad_root;
-use proprio_topics::Nanos;
+use proprio_topics::{Nanos, Source};
 use proptest::prelude::*;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -126,6 +126,31 @@ proptest! {
                 (got - variance).abs() < 1e-5 * variance + 1e-10 * (1.0 + scale),
                 "dof {}: {} not {}", dof, got, variance
             );
+            // The share of an input is the covariance of its error with that of the torque.
+            let mut row = vec![0.0; rows.stacked_column_count()];
+            let subtree = rows.torque_subtree(dof).unwrap();
+            let mut own = vec![0.0; rows.column_count(subtree).unwrap()];
+            rows.torque_row(dof, &mut own).unwrap();
+            rows.expand(subtree, &own, &mut row).unwrap();
+            let with_all = &all * DVector::from_column_slice(&row);
+            let links = 10 * model.link_count();
+            let mut shares = vec![0.0; model.link_count() + sensors.len()];
+            let solution = (&solver, &kinematics);
+            propagation.torque_shares(&structure, solution, dof, |source, number, own| {
+                let place = number + if source == Source::Link { 0 } else { model.link_count() };
+                shares[place] += own;
+            });
+            for (place, got) in shares.into_iter().enumerate() {
+                let columns = match place.checked_sub(model.link_count()) {
+                    None => 10 * place..10 * place + 10,
+                    Some(sensor) => links + 6 * sensor..links + 6 * sensor + 6,
+                };
+                let want: f64 = columns.map(|column| row[column] * with_all[column]).sum();
+                prop_assert!(
+                    (got - want).abs() < 1e-4 * (variance + want.abs()) + 1e-8 * (1.0 + scale),
+                    "dof {}, part {}: {} not {} of {}", dof, place, got, want, variance
+                );
+            }
         }
         for contact in 0..contacts.len() {
             let components = [3, 4, 5, 0, 1, 2];
@@ -215,6 +240,25 @@ proptest! {
             propagation.update(&structure, &solver, &kinematics, Nanos::ZERO).unwrap();
         }
         let most = want.torque_std().iter().fold(0.0, |most: f64, x| most.max(*x));
+        for dof in 0..model.dof_count() {
+            let shares = |propagation: &mut Propagation| {
+                let mut sums = [0.0; 3];
+                let solution = (&solver, &kinematics);
+                propagation.torque_shares(&structure, solution, dof, |source, _, own| {
+                    let sources = [Source::Link, Source::Offset, Source::Gain];
+                    let place = sources.iter().position(|other| *other == source);
+                    sums[place.unwrap_or(0)] += own;
+                });
+                sums
+            };
+            let [of_links, of_offsets, of_gains] = shares(&mut got);
+            let [links, offsets, none] = shares(&mut want);
+            prop_assert_eq!(none, 0.0);
+            let bound = 1e-3 * (links.abs() + offsets.abs() + most * most);
+            prop_assert!((of_links - links).abs() < bound, "{} not {}", of_links, links);
+            let together = of_offsets + of_gains;
+            prop_assert!((together - offsets).abs() < bound, "{} not {}", together, offsets);
+        }
         for (got, want) in got.torque_std().iter().zip(want.torque_std()) {
             prop_assert!((got - want).abs() <= 1e-4 * want + 1e-5 * most, "{} not {}", got, want);
         }

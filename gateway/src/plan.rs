@@ -250,8 +250,13 @@ impl Plan {
     /// The description of this plan's channels.
     #[must_use]
     pub fn description(&self) -> Box<Description> {
+        let device = |channel: &ChannelPlan| {
+            let bus = self.buses.get(channel.bus)?;
+            Name::new(&bus.devices.get(channel.device)?.name)
+        };
         let entries = self.channels.iter().zip(0..).map(|(channel, index)| Entry {
             name: Name::new(&channel.name).unwrap_or(Name::EMPTY),
+            origin: device(channel).unwrap_or(Name::EMPTY),
             max_silence: channel.max_silence,
             role: Role::Channel.in_memory(),
             index,

@@ -8,9 +8,11 @@
 //! | `saturate:BOARD@5..5.5` | a gauge is at its upper end: flagged, values frozen |
 //! | `freeze:BOARD@5..6` | the board repeats its last reading, and does not say so |
 //! | `spike:BOARD@6` | one reading is wrong by 200 N and 5 Nm on every axis |
+//! | `late:BOARD=0.02@2..` | the board sends what it measured 0.02 s before, as if it were new |
 //! | `late_half:BOARD@2..8` | second halves of about one reading in ten are late |
 //! | `push:l_forearm=20@8..9` | an undeclared force of 20 N pushes this link of the URDF |
 //! | `push:l_forearm=20:0.03,-0.07,0:-1,0,0@8..9` | the same, at this point and in this direction |
+//! | `still:l_elbow` | this joint of the URDF does not move |
 //!
 //! A late half follows just after the next reading's first half; `late_half:BOARD@6` delays one
 //! reading. A push acts at the origin of the link's frame along its x axis, or at the point \[m\]
@@ -67,6 +69,15 @@ pub enum Fault {
         /// When \[s\].
         at: f64,
     },
+    /// A board sends old readings as new ones.
+    Late {
+        /// Whose.
+        device: String,
+        /// How old they are \[s\].
+        age: f64,
+        /// When.
+        window: Window,
+    },
     /// Second halves of readings are late.
     LateHalf {
         /// Whose.
@@ -88,6 +99,11 @@ pub enum Fault {
         along: Option<[f64; 3]>,
         /// When.
         window: Window,
+    },
+    /// A joint does not move.
+    Still {
+        /// The joint of the URDF.
+        joint: String,
     },
 }
 
@@ -129,7 +145,7 @@ pub enum FaultError {
     /// The kind of fault is not known.
     #[error(
         "fault {text:?}: {kind:?} is not known; known are lost, silent, reboot, saturate, \
-         freeze, spike, late_half, push; for example {EXAMPLES}"
+         freeze, spike, late, late_half, push, still; for example {EXAMPLES}"
     )]
     Kind {
         /// What was typed.
@@ -184,9 +200,11 @@ impl Fault {
             | Self::Silent { window, .. }
             | Self::Saturate { window, .. }
             | Self::Freeze { window, .. }
+            | Self::Late { window, .. }
             | Self::LateHalf { window, .. }
             | Self::Push { window, .. } => window.from,
             Self::Reboot { at, .. } | Self::Spike { at, .. } => *at,
+            Self::Still { .. } => 0.0,
         }
     }
 
@@ -194,12 +212,13 @@ impl Fault {
     #[must_use]
     pub fn device(&self) -> Option<&str> {
         match self {
-            Self::Lost { .. } | Self::Push { .. } => None,
+            Self::Lost { .. } | Self::Push { .. } | Self::Still { .. } => None,
             Self::Silent { device, .. }
             | Self::Reboot { device, .. }
             | Self::Saturate { device, .. }
             | Self::Freeze { device, .. }
             | Self::Spike { device, .. }
+            | Self::Late { device, .. }
             | Self::LateHalf { device, .. } => Some(device),
         }
     }
@@ -295,6 +314,24 @@ impl FromStr for Fault {
             "spike" => moment
                 .map(|at| Self::Spike { device, at })
                 .ok_or_else(|| form("spike:BOARD@TIME", "\"spike:l_arm_ft_sensor@6\"")),
+            "late" => {
+                let (device, age) = what.split_once('=').unwrap_or_default();
+                let age = age.trim().parse().ok();
+                let age = age.filter(|age: &f64| age.is_finite() && *age > 0.0);
+                match (age, span) {
+                    (Some(age), Some(window)) if !device.is_empty() => Ok(Self::Late {
+                        device: device.to_owned(),
+                        age,
+                        window,
+                    }),
+                    _ => Err(form(
+                        "late:BOARD=SECONDS@FROM..UNTIL",
+                        "\"late:l_arm_ft_sensor=0.02@5..8\"",
+                    )),
+                }
+            }
+            "still" if named && when.is_none() => Ok(Self::Still { joint: device }),
+            "still" => Err(form("still:JOINT", "\"still:l_elbow\"")),
             "late_half" => match (span, moment) {
                 (Some(window), _) => Ok(Self::LateHalf {
                     device,
@@ -373,6 +410,12 @@ impl fmt::Display for Fault {
             Self::Saturate { device, window } => write!(f, "saturate:{device}@{window}"),
             Self::Freeze { device, window } => write!(f, "freeze:{device}@{window}"),
             Self::Spike { device, at } => write!(f, "spike:{device}@{at}"),
+            Self::Late {
+                device,
+                age,
+                window,
+            } => write!(f, "late:{device}={age}@{window}"),
+            Self::Still { joint } => write!(f, "still:{joint}"),
             Self::LateHalf {
                 device,
                 window,
@@ -415,6 +458,8 @@ mod tests {
             "saturate:l_arm_ft_sensor@5..5.5",
             "freeze:l_arm_ft_sensor@5..6",
             "spike:l_arm_ft_sensor@6",
+            "late:l_arm_ft_sensor=0.02@2..8",
+            "still:l_elbow",
             "late_half:l_arm_ft_sensor@2..8",
             "late_half:l_arm_ft_sensor@2.5",
             "push:l_forearm=20@8..9",
@@ -447,6 +492,12 @@ mod tests {
             ("reboot:ft@1..2", "reboot:BOARD@TIME"),
             ("saturate:ft@inf..", "saturate:BOARD@FROM..UNTIL"),
             ("freeze:ft@5", "freeze:BOARD@FROM..UNTIL"),
+            ("late:ft@2..8", "late:BOARD=SECONDS@FROM..UNTIL"),
+            ("late:=0.1@2..8", "late:BOARD=SECONDS@FROM..UNTIL"),
+            ("late:ft=-1@2..8", "late:BOARD=SECONDS@FROM..UNTIL"),
+            ("late:ft=0.1", "late:BOARD=SECONDS@FROM..UNTIL"),
+            ("still:", "still:JOINT"),
+            ("still:l_elbow@3..", "still:JOINT"),
             ("late_half:ft", "late_half:BOARD@FROM..UNTIL or"),
             (
                 "push:hand@1..2",

@@ -199,7 +199,7 @@ impl Simulator {
             })
         };
         match fault {
-            Fault::Lost { .. } | Fault::Push { .. } => {}
+            Fault::Lost { .. } | Fault::Push { .. } | Fault::Still { .. } => {}
             Fault::Silent { window, .. } => node.silences.push(*window),
             Fault::Reboot { at, .. } => {
                 node.silences.push(Window {
@@ -217,6 +217,7 @@ impl Simulator {
                 possible(node.measures(Kind::Wrench), "an F/T sensor")?;
                 node.spikes.push(*at);
             }
+            Fault::Late { age, window, .. } => node.ages.push((*window, *age)),
             Fault::LateHalf { window, once, .. } => {
                 possible(
                     node.measures(Kind::Wrench) || node.measures(Kind::Imu),
@@ -399,6 +400,8 @@ struct Node {
     frozen: Option<Vec<(u8, Reading)>>,
     spikes: Vec<f64>,
     reboots: Vec<Nanos>,
+    /// When it sends old readings, and how old they are \[s\].
+    ages: Vec<(Window, f64)>,
     late: Vec<(Window, bool)>,
     /// The half that is held back.
     held: Frames,
@@ -442,6 +445,7 @@ impl Node {
             frozen: None,
             spikes: Vec::new(),
             reboots: Vec::new(),
+            ages: Vec::new(),
             late: Vec::new(),
             held: Frames::new(),
         };
@@ -523,7 +527,9 @@ impl Node {
         self.spikes.retain(|at| *at > t);
         let spike = self.spikes.len() < spikes;
         let noise = self.noise.then_some(&mut self.random);
-        let readings = measure(&self.outputs, simulation, t, spike, noise);
+        let age = self.ages.iter().find(|(window, _)| window.contains(t));
+        let measured = t - age.map_or(0.0, |(_, age)| *age);
+        let readings = measure(&self.outputs, simulation, measured, spike, noise);
         for (output, reading) in self.frozen_at(t, readings) {
             refused += u64::from(
                 self.board

@@ -92,6 +92,16 @@ impl Trajectory {
         }
     }
 
+    /// Lets joint `joint` rest for good.
+    pub fn rest(&mut self, joint: usize) {
+        if let Some(motion) = self.joints.get_mut(joint) {
+            motion
+                .sines
+                .iter_mut()
+                .for_each(|sine| sine.amplitude = 0.0);
+        }
+    }
+
     /// Joint `joint` at `t` seconds; `None` if there is no such joint.
     #[must_use]
     pub fn at(&self, joint: usize, t: f64) -> Option<Point> {

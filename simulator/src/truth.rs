@@ -343,7 +343,18 @@ impl Simulation {
         let ranges: Vec<_> = (0..dofs)
             .map(|dof| model.limits(model.dof_joint(dof)?))
             .collect();
-        let trajectory = Trajectory::new(&ranges, settings.seed, settings.still);
+        let mut trajectory = Trajectory::new(&ranges, settings.seed, settings.still);
+        for fault in &settings.faults {
+            if let Fault::Still { joint } = fault {
+                let number = joint_names.iter().position(|name| name == joint);
+                let number = number.ok_or_else(|| {
+                    robot.mismatch(format!(
+                        "fault {fault}: the URDF has no moving joint {joint:?}"
+                    ))
+                })?;
+                trajectory.rest(number);
+            }
+        }
         let standing =
             joint_names
                 .iter()

@@ -505,6 +505,7 @@ fn identification_in_the_pipeline_allocates_nothing_but_in_its_jobs() {
             while pipeline.poll().is_some() {
                 told += u32::from(pipeline.inertia().is_some());
                 job = pipeline.take_job().or(job.take());
+                assert!(pipeline.budget(number % 7).is_some());
             }
         });
         allocated = (allocated.0 + one.0, allocated.1 + one.1);
@@ -610,6 +611,7 @@ fn the_pipeline_allocates_nothing_once_it_runs() {
             while let Some(estimate) = pipeline.poll() {
                 estimates += 1;
                 withheld += u64::from(estimate.torques.joints().iter().any(|j| j.valid != 1));
+                assert!(pipeline.budget(0).is_some());
             }
         }
         (estimates, withheld)

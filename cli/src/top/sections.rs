@@ -194,8 +194,8 @@ fn contacts(snapshot: &Snapshot, now: Nanos) -> Section {
                 cells.extend(vector(contact.torque, of_torque, 2));
                 let [x, y, z] = contact.position;
                 cells.push(match contact.located {
-                    1 => Span::raw(format!("{x:.3} {y:.3} {z:.3} in {}", entry.frame)),
-                    _ => Span::styled(format!("as configured, in {}", entry.frame), faint()),
+                    1 => Span::raw(format!("{x:.3} {y:.3} {z:.3} in {}", entry.origin)),
+                    _ => Span::styled(format!("as configured, in {}", entry.origin), faint()),
                 });
                 cells
             }

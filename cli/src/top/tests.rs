@@ -37,7 +37,7 @@ fn name(text: &str) -> Name {
 fn names(publisher: Publisher, epoch: u64, entries: &[(Role, &str)]) -> Description {
     let numbered = entries.iter().enumerate().map(|(at, (role, text))| Entry {
         name: name(text),
-        frame: name("hand_frame"),
+        origin: name("hand_frame"),
         role: role.in_memory(),
         index: (entries[..at].iter())
             .filter(|(other, _)| other == role)

@@ -98,10 +98,7 @@ impl PlaceErrors {
         covariance: &Matrix6<f64>,
     ) {
         let frame = &structure.contacts()[contact].frame;
-        let variance = |motion: &Motion| {
-            let m = stack(&motion.angular, &motion.linear);
-            (covariance * m).dot(&m).max(0.0)
-        };
+        let variance = |motion: &Motion| variance(covariance, motion);
         let Some(number) = structure.subtree_of(frame.link) else {
             return;
         };
@@ -110,17 +107,12 @@ impl PlaceErrors {
             let Some(dof) = structure.dof_of(link) else {
                 continue;
             };
-            // The joint above the top link belongs to no sub-tree: it is a sensor's, and fixed.
-            let (axis, response) = solver.torque_rows(link);
-            let motion = match structure.below(link).contains(&frame.link) {
-                true => *axis - *response,
-                false => -*response,
-            };
+            let variance = variance(&torque_motion(structure, solver, link, frame.link));
             if let [_] = structure.moved_by(dof) {
-                self.torque[dof] += variance(&motion);
+                self.torque[dof] += variance;
             } else {
                 // The deviation of the sum of their torques is at most that of each together.
-                let sum = self.torque[dof].sqrt() + variance(&motion).sqrt();
+                let sum = self.torque[dof].sqrt() + variance.sqrt();
                 self.torque[dof] = sum * sum;
             }
         }
@@ -138,6 +130,29 @@ impl PlaceErrors {
         }
     }
 
+    /// The variance of a torque from the place of one contact, as [`Self::update`] adds it up: for
+    /// the solver's last solution [Nm^2 or N^2].
+    pub fn torque_variance(
+        structure: &Structure,
+        solver: &Solver,
+        kinematics: &Kinematics,
+        dof: usize,
+        (contact, std): (usize, PlaceStd),
+    ) -> f64 {
+        let link = structure.contacts()[contact].frame.link;
+        let number = structure.subtree_of(link);
+        let Some(covariance) = covariance(structure, solver, kinematics, contact, std) else {
+            return 0.0;
+        };
+        let moved = structure.moved_by(dof).iter();
+        let own = moved.filter(|moved| structure.subtree_of(**moved) == number);
+        let of_link = |moved: &usize| {
+            variance(&covariance, &torque_motion(structure, solver, *moved, link)).sqrt()
+        };
+        let sum: f64 = own.map(of_link).sum();
+        sum * sum
+    }
+
     /// Standard deviation of each torque [Nm or N], by degree of freedom.
     pub fn torque_std(&self) -> &[f64] {
         &self.torque
@@ -153,6 +168,22 @@ impl PlaceErrors {
     pub fn imbalance_covariances(&self) -> &[Matrix6<f64>] {
         &self.imbalances
     }
+}
+
+/// `[contact below j] s_j - h_j`, of the joint above `link`.
+fn torque_motion(structure: &Structure, solver: &Solver, link: usize, touched: usize) -> Motion {
+    // The joint above the top link belongs to no sub-tree: it is a sensor's, and fixed.
+    let (axis, response) = solver.torque_rows(link);
+    match structure.below(link).contains(&touched) {
+        true => *axis - *response,
+        false => -*response,
+    }
+}
+
+/// The variance of `motion . w`.
+fn variance(covariance: &Matrix6<f64>, motion: &Motion) -> f64 {
+    let m = stack(&motion.angular, &motion.linear);
+    (covariance * m).dot(&m).max(0.0)
 }
 
 /// Covariance of `w`; none for a full wrench.

@@ -474,43 +474,22 @@ impl Solver {
     /// The structure is not the one that was solved.
     pub fn update_deviations(&mut self, structure: &Structure) -> Result<(), DynamicsError> {
         self.check_structure(structure)?;
+        for dof in 0..self.torque_deviation.len() {
+            let sensors = 0..structure.sensors().len();
+            let sum: f64 = sensors
+                .map(|sensor| self.torque_noise(structure, dof, sensor))
+                .sum();
+            self.torque_deviation[dof] = sum.sqrt();
+        }
         let Self {
             sensor_poses,
-            axes,
-            torque_rows,
             contact_rows,
-            torque_deviation,
             contacts,
             ..
         } = self;
         let variance = |sensor: usize, motion: &Motion| {
             variance(structure, sensor, &sensor_poses[sensor], motion)
         };
-        for (dof, deviation) in torque_deviation.iter_mut().enumerate() {
-            let of_sensor = |sensor: usize| {
-                let child = structure.sensors()[sensor].joint() + 1;
-                let mut motion = None::<Motion>;
-                for &link in structure.moved_by(dof) {
-                    let place = &structure.places[link];
-                    if !structure.subtrees()[place.subtree].sensors.contains(sensor) {
-                        continue;
-                    }
-                    let (s, h) = (axes[link], torque_rows[link]);
-                    let own = if place.sensors_below.contains(sensor) {
-                        h - s
-                    } else {
-                        h
-                    };
-                    // What the sensor transmits has opposite signs on its two sides.
-                    let is_beyond = structure.places[child].subtree == place.subtree;
-                    let own = if is_beyond { -own } else { own };
-                    motion = Some(motion.map_or(own, |sum| sum + own));
-                }
-                motion.map_or(0.0, |motion| variance(sensor, &motion))
-            };
-            let sum: f64 = (0..structure.sensors().len()).map(of_sensor).sum();
-            *deviation = sum.sqrt();
-        }
         for subtree in structure.subtrees() {
             for contact in subtree.contacts.iter() {
                 let rows = &contact_rows[contact];
@@ -525,6 +504,33 @@ impl Solver {
             }
         }
         Ok(())
+    }
+
+    /// The variance of a torque from the noise of one F/T sensor, for the last solution [Nm^2 or
+    /// N^2].
+    #[inline]
+    pub fn torque_noise(&self, structure: &Structure, dof: usize, sensor: usize) -> f64 {
+        let child = structure.sensors()[sensor].joint() + 1;
+        let mut motion = None::<Motion>;
+        for &link in structure.moved_by(dof) {
+            let place = &structure.places[link];
+            if !structure.subtrees()[place.subtree].sensors.contains(sensor) {
+                continue;
+            }
+            let (s, h) = (self.axes[link], self.torque_rows[link]);
+            let own = if place.sensors_below.contains(sensor) {
+                h - s
+            } else {
+                h
+            };
+            // What the sensor transmits has opposite signs on its two sides.
+            let is_beyond = structure.places[child].subtree == place.subtree;
+            let own = if is_beyond { -own } else { own };
+            motion = Some(motion.map_or(own, |sum| sum + own));
+        }
+        motion.map_or(0.0, |motion| {
+            variance(structure, sensor, &self.sensor_poses[sensor], &motion)
+        })
     }
 
     /// The torque of a degree of freedom from either side of its joint, in the last solution:

@@ -884,6 +884,12 @@ proptest! {
                 }
             }
             let mut claimed = stated.torque_std().to_vec();
+            for (dof, std_of_torque) in claimed.iter().enumerate() {
+                let at = (which, std);
+                let alone =
+                    PlaceErrors::torque_variance(&structure, &before, &kinematics, dof, at).sqrt();
+                prop_assert!((alone - std_of_torque).abs() <= 1e-12 * std_of_torque);
+            }
             claimed.extend(stated.contact_std().iter().flatten());
             if spec.kind == ContactKind::Wrench {
                 prop_assert!(claimed.iter().all(|std| *std == 0.0));

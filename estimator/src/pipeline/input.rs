@@ -198,10 +198,14 @@ impl Pipeline {
         self.counts.not_finite += u64::from(!is_good);
     }
 
-    /// The stamp of the newest sample of channel number `channel`, if that is a skin.
+    /// The stamp of the newest sample of channel number `channel`, of a skin too.
     #[must_use]
-    pub fn newest_of_skin(&self, channel: usize) -> Option<Nanos> {
-        self.contacts
-            .newest(channel.checked_sub(self.buffers.len())?)
+    pub fn newest(&self, channel: usize) -> Option<Nanos> {
+        match self.buffers.get(channel) {
+            Some(buffer) => buffer.newest(),
+            None => self
+                .contacts
+                .newest(channel.checked_sub(self.buffers.len())?),
+        }
     }
 }

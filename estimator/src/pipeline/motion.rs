@@ -26,7 +26,7 @@ use proprio_dynamics::{
     ContactKind, ContactSet, ContactSpec, DynamicsError, FrameMotion, JointState, Kinematics,
     Solver, Structure,
 };
-use proprio_topics::Nanos;
+use proprio_topics::{Nanos, Source};
 use pulp::{Arch, Simd, WithSimd};
 
 /// How long sensitivities are used before they are computed again.
@@ -293,6 +293,24 @@ impl MotionErrors {
             *known = true;
         }
         Ok(())
+    }
+
+    /// Gives the shares of joints and base in the variance of a torque at the last instant: the
+    /// number of the joint, zero for the base.
+    pub(super) fn torque_shares(&self, dof: usize, mut share: impl FnMut(Source, usize, f64)) {
+        let columns = self.sensitivity.chunks_exact(self.rows).zip(&self.sigma);
+        for (number, (column, sigma)) in columns.enumerate() {
+            let error = column.get(dof).map_or(0.0, |s| s * sigma);
+            let (source, number) = match number.checked_sub(2 * self.dofs) {
+                None if number < self.dofs => (Source::Acceleration, number),
+                None => (Source::Position, number - self.dofs),
+                Some(0..3) => (Source::Base, 0),
+                Some(_) => (Source::Rotation, 0),
+            };
+            if *sigma > 0.0 {
+                share(source, number, error * error);
+            }
+        }
     }
 
     /// Standard deviation of each torque [Nm or N].

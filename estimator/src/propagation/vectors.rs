@@ -247,6 +247,14 @@ pub(crate) struct ColumnBlock {
 }
 
 impl ColumnBlock {
+    /// Its columns one by one; `columns` are its own, or as many others of the same rows.
+    pub(crate) fn columns_of<'a>(
+        &self,
+        columns: &'a [Lanes],
+    ) -> impl Iterator<Item = &'a [Lanes]> + use<'a> {
+        columns.chunks_exact(self.rows.len().max(1))
+    }
+
     /// Combines the columns of offset and calibration: an unknown of the calibration acts like an
     /// offset, with a factor that depends on the reading.
     pub(crate) fn set_calibration_point(&mut self, corrected: &[f64; 6], kelvin: f64) {

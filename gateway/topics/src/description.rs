@@ -102,9 +102,9 @@ coded!(Role {
 pub struct Entry {
     /// Its name.
     pub name: Name,
-    /// For a contact or a sub-tree, the frame its wrench is expressed in: axes and point. Otherwise
-    /// empty.
-    pub frame: Name,
+    /// What it belongs to: for a contact or a sub-tree, the frame its wrench is expressed in (axes
+    /// and point); for a channel of the gateway, its device. Otherwise empty.
+    pub origin: Name,
     /// Maximum silence: the longest normal time between two samples \[ns\]; 0 where it has no
     /// meaning.
     pub max_silence: Nanos,
@@ -138,7 +138,7 @@ impl Entry {
     /// An unused entry.
     pub const NONE: Self = Self {
         name: Name::EMPTY,
-        frame: Name::EMPTY,
+        origin: Name::EMPTY,
         max_silence: Nanos::ZERO,
         role: Role::Channel.in_memory(),
         index: 0,

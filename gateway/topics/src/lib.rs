@@ -7,6 +7,7 @@
 //!   sequence number).
 //! - [`estimate`]: joint torques and contact wrenches, each with a validity flag and, if it is not
 //!   valid, the reason.
+//! - [`budget`]: what a torque rests on, and how much of its variance each input causes.
 //! - [`inertia`]: identified inertial parameters and F/T offsets, with their standard deviations
 //!   and the amount of data they come from.
 //! - [`description`]: what the channel, joint and contact numbers mean.
@@ -31,6 +32,7 @@
 #[cfg(any(feature = "std", test))]
 extern crate std;
 
+pub mod budget;
 pub mod code;
 #[cfg(feature = "csv")]
 pub mod csv;
@@ -49,6 +51,7 @@ pub mod sample;
 pub mod sanity;
 pub mod time;
 
+pub use budget::{BudgetPart, Line, Source, TorqueBudget};
 pub use code::{Code, Coded};
 pub use description::{Description, Entry, Name, Publisher, ROBOT_NAME, Role, is_robot_name};
 pub use estimate::{

@@ -40,7 +40,7 @@ fn sample(channel: u32) -> Sample {
 fn description(publisher: Publisher, entries: &[(&str, Role, u32)]) -> Description {
     let none = Entry {
         name: Name::EMPTY,
-        frame: Name::EMPTY,
+        origin: Name::EMPTY,
         max_silence: Nanos::ZERO,
         role: Role::Channel.in_memory(),
         index: 0,

@@ -11,7 +11,7 @@ use super::{DomainError, Topic};
 use crate::maps::{self, Mapping};
 use crate::{
     ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
-    InertiaEstimate, Sample, TorqueEstimate,
+    InertiaEstimate, Sample, TorqueBudget, TorqueEstimate,
 };
 use nix::fcntl::posix_fallocate;
 use nix::libc;
@@ -58,6 +58,7 @@ pub fn memory_needed() -> ([u64; 2], u64) {
         + needed::<TorqueEstimate>()
         + needed::<ContactEstimate>()
         + needed::<InertiaEstimate>()
+        + needed::<TorqueBudget>()
         + needed::<ContactDeclaration>();
     ([robot, needed::<Sample>()], free())
 }

@@ -2,7 +2,7 @@
 
 use crate::{
     ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth, Header,
-    InertiaEstimate, Sample, TorqueEstimate,
+    InertiaEstimate, Sample, TorqueBudget, TorqueEstimate,
 };
 use core::fmt::Debug;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
@@ -161,6 +161,23 @@ topic!(
         nodes: NODES,
         buffer: 4,
         history: 1
+    }
+);
+// Of one joint after another, for a person who asks: who misses some sees the next round.
+topic!(
+    TorqueBudget,
+    "estimate/budget",
+    |b| {
+        within(b.count, &b.parts)
+            && b.torque.reason.get().is_some()
+            && b.parts().iter().all(|part| part.source.get().is_some())
+    },
+    QualityOfService {
+        publishers: 1,
+        subscribers: 4,
+        nodes: NODES,
+        buffer: 8,
+        history: 0
     }
 );
 topic!(

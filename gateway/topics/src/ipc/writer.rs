@@ -345,7 +345,7 @@ mod tests {
     use crate::ipc::DomainConfig;
     use crate::{
         ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
-        InertiaEstimate, Sample, TorqueEstimate,
+        InertiaEstimate, Sample, TorqueBudget, TorqueEstimate,
     };
     use std::fs;
 
@@ -378,6 +378,7 @@ mod tests {
             compared::<TorqueEstimate>(),
             compared::<ContactEstimate>(),
             compared::<InertiaEstimate>(),
+            compared::<TorqueBudget>(),
             compared::<ContactDeclaration>(),
             compared::<GatewayHealth>(),
             compared::<EstimatorHealth>(),
