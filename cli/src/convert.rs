@@ -425,34 +425,64 @@ pub(crate) fn check_columns(
 }
 
 /// The error that the configuration does not match the log.
-fn unfit(config: &Path, log: &Path, error: &dyn std::error::Error) -> ConfigError {
+pub(crate) fn unfit(config: &Path, log: &Path, error: &dyn std::error::Error) -> ConfigError {
     ConfigError {
         file: config.to_owned(),
         problem: format!("{}: {error}", log.display()),
     }
 }
 
+/// The estimator's configuration for a log.
+pub(crate) struct Configured {
+    /// The file.
+    pub(crate) config: PathBuf,
+    pub(crate) setup: Setup,
+    /// The files that a recording has taken along.
+    pub(crate) folder: Option<tempfile::TempDir>,
+}
+
+impl Configured {
+    /// The one that is given, or the one that the recording has taken along; with other identified
+    /// parameters, if they are given.
+    pub(crate) fn new(
+        config: Option<&Path>,
+        parameters: Option<&Path>,
+        samples: &Path,
+    ) -> anyhow::Result<Self> {
+        let folder = match is_file(samples) {
+            true => samples::files_in(samples)?,
+            false => None,
+        };
+        let in_folder = folder.as_ref();
+        let taken_along = in_folder.map(|folder| folder.path().join("estimator.toml"));
+        let taken_along = taken_along.filter(|config| config.is_file());
+        let Some(config) = config.map(Path::to_owned).or(taken_along) else {
+            let text = "give --config estimator.toml: only a recording made with `record \
+                        --config` has its own\n";
+            clap::Error::raw(ErrorKind::MissingRequiredArgument, text).exit();
+        };
+        let (_, setup) = proprio_estimator::daemon::load(&config, |config| {
+            // The command line overrides the configuration.
+            if let Some(parameters) = parameters {
+                config.parameters = Some(parameters.to_owned());
+            }
+        })?;
+        Ok(Self {
+            config,
+            setup,
+            folder,
+        })
+    }
+}
+
 /// Estimates from a table.
 pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
-    let folder = match args.config.is_none() && is_file(&args.samples) {
-        true => samples::files_in(&args.samples)?,
-        false => None,
-    };
-    let taken_along = folder
-        .as_ref()
-        .map(|folder| folder.path().join("estimator.toml"));
-    let taken_along = taken_along.filter(|config| config.is_file());
-    let Some(config) = args.config.as_ref().or(taken_along.as_ref()) else {
-        let text = "give --config estimator.toml: only a recording made with `record --config` \
-                    has its own\n";
-        clap::Error::raw(ErrorKind::MissingRequiredArgument, text).exit();
-    };
-    let (_, setup) = proprio_estimator::daemon::load(config, |config| {
-        // The command line overrides the configuration.
-        if let Some(parameters) = &args.parameters {
-            config.parameters = Some(parameters.clone());
-        }
-    })?;
+    let configured = Configured::new(
+        args.config.as_deref(),
+        args.parameters.as_deref(),
+        &args.samples,
+    )?;
+    let (config, setup) = (&configured.config, configured.setup);
     warn_of_implausible(args, &setup);
     let mut assessor = args
         .assess

@@ -23,6 +23,7 @@ mod simulate;
 mod status;
 mod table;
 mod top;
+mod why;
 
 use clap::{Parser, Subcommand};
 use proprio_topics::ipc::DomainConfig;
@@ -72,6 +73,9 @@ enum Verb {
     Status(status::Status),
     /// Show a running robot on the whole terminal: torques, contacts, channels, buses
     Top(top::Top),
+    /// Say why a torque is what it is: what it rests on, what its deviation is made of, and why it
+    /// is withheld
+    Why(why::Args),
     /// Print the samples of a channel, the torques or the contacts as they come
     Echo(echo::Echo),
     /// Record what a robot measures and feels: a table, a recording, a black box
@@ -117,6 +121,7 @@ fn main() -> ExitCode {
         Verb::Decode(args) => convert::decode(&args),
         Verb::Encode(args) => convert::encode(&args),
         Verb::Table(args) => table::run(&args),
+        Verb::Why(args) => why::run(&args, &domain),
         Verb::Estimate(args) => convert::estimate(&args),
         Verb::Identify(args) => identify::run(&args),
         Verb::Status(args) => status::run(&args, &domain),

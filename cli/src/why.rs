@@ -1,0 +1,197 @@
+//! `proprio why`: why a torque is what it is: what it rests on, what its deviation is made of, and,
+//! if it is withheld, why and what to do.
+//!
+//! A running estimator publishes the budgets of its torques while somebody reads them
+//! (`<robot>/estimate/budget`); for a log or a recording, the estimator runs on it up to the
+//! instant in question.
+
+mod live;
+mod log;
+mod story;
+
+use crate::convert::Configured;
+use log::Spell;
+use proprio_topics::ipc::DomainConfig;
+use proprio_topics::{Nanos, Reason, Source, TorqueBudget};
+use serde_json::json;
+use std::path::PathBuf;
+use story::{Known, Story, digits, names, percent, shares};
+
+/// `proprio why`.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    /// The joint
+    joint: String,
+    /// The robot; default: the only one in the domain
+    #[arg(long, value_name = "NAME", conflicts_with = "samples")]
+    robot: Option<String>,
+    /// Ask a table of samples or a recording (a black box) instead of a running system
+    #[arg(long, alias = "log", value_name = "FILE")]
+    samples: Option<PathBuf>,
+    /// With --samples: estimator.toml; default: the one that a recording has taken along
+    #[arg(long, value_name = "FILE", requires = "samples")]
+    config: Option<PathBuf>,
+    /// With --samples: identified parameters (parameters.toml) to use
+    #[arg(long, value_name = "FILE", requires = "samples")]
+    parameters: Option<PathBuf>,
+    /// With --samples: the instant to look at, as in the log [s]; default: the end of the longest
+    /// time for which the torque was withheld after it had been valid
+    #[arg(long, value_name = "SECONDS", requires = "samples")]
+    at: Option<f64>,
+    /// Print everything as JSON, one object
+    #[arg(long)]
+    json: bool,
+}
+
+/// The most lines of a budget, and of the times of a log.
+const MOST: usize = 10;
+
+/// The least share that has a line of its own [%].
+const LEAST: f64 = 0.1;
+
+/// Says why.
+pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
+    let (known, at, spells) = match &args.samples {
+        None => (
+            live::know(domain, args.robot.as_deref(), &args.joint)?,
+            None,
+            Vec::new(),
+        ),
+        Some(samples) => {
+            let (config, parameters) = (args.config.as_deref(), args.parameters.as_deref());
+            let configured = Configured::new(config, parameters, samples)?;
+            let at = args.at.map(Nanos::from_seconds);
+            let (known, t, spells) = log::know(configured, samples, &args.joint, at)?;
+            (known, Some(t), spells)
+        }
+    };
+    let story = known.story();
+    if args.json {
+        print_line!("{}", in_json(&known, &story, at));
+        return Ok(());
+    }
+    let when = at.map_or(String::new(), |t| format!("at {t} s, "));
+    print_line!("{when}{}", story.head);
+    for cause in &story.because {
+        print_line!("  because: {cause}");
+    }
+    if !story.advice.is_empty() {
+        print_line!("  what to do: {}", story.advice);
+    }
+    if let Some(budget) = &known.budget {
+        print_budget(budget);
+    }
+    print_spells(&spells);
+    Ok(())
+}
+
+fn print_budget(budget: &TorqueBudget) {
+    let bound = match budget.bound.is_finite() {
+        true => format!(", the bound {} Nm", digits(budget.bound)),
+        false => String::new(),
+    };
+    match budget.deviation.is_finite() {
+        true => print_line!(
+            "\nits deviation is {} Nm{bound}; the variance is made of",
+            digits(budget.deviation)
+        ),
+        false => print_line!(
+            "\nits deviation is not known, because of what identification has not refuted{bound}; \
+             the rest of the variance is made of"
+        ),
+    }
+    let shares = shares(budget);
+    let matters = |share: &&story::Share| percent(share, budget) >= LEAST;
+    let count = shares.iter().take(MOST).take_while(matters).count();
+    let (shown, rest) = shares.split_at(count.max(1).min(shares.len()));
+    for share in shown {
+        let deviation = digits(share.variance.max(0.0).sqrt());
+        print_line!(
+            "  {:>5.1} %  {deviation:>8} Nm  {}",
+            percent(share, budget),
+            share.name
+        );
+    }
+    if !rest.is_empty() {
+        let sum: f64 = rest.iter().map(|share| percent(share, budget)).sum();
+        print_line!("  {sum:>5.1} %               {} further inputs", rest.len());
+    }
+    print_line!("\nit rests on");
+    for (what, source) in [
+        ("F/T sensors", Source::Noise),
+        ("encoders", Source::Position),
+        ("links", Source::Link),
+        ("contacts", Source::Present),
+        ("no contact at", Source::Absent),
+    ] {
+        let names = names(budget, source);
+        if !names.is_empty() {
+            print_line!("  {:<14} {}", format!("{what}:"), names.join(", "));
+        }
+    }
+    if !names(budget, Source::Base).is_empty() {
+        print_line!("  the motion of the base");
+    }
+}
+
+fn print_spells(spells: &[Spell]) {
+    if spells.is_empty() {
+        return;
+    }
+    print_line!("\nin this log");
+    // Short times between others are left out first.
+    let mut longest: Vec<usize> = (0..spells.len()).collect();
+    longest.sort_by_key(|&place| {
+        let spell = spells.get(place);
+        std::cmp::Reverse(spell.map(|spell| spell.end - spell.begin))
+    });
+    longest.truncate(MOST);
+    longest.sort_unstable();
+    for spell in longest.iter().filter_map(|&place| spells.get(place)) {
+        let cause = spell
+            .cause
+            .as_ref()
+            .map_or(String::new(), |name| format!(" ({name})"));
+        let what = match spell.reason {
+            Reason::None => "valid",
+            _ if spell.is_gap => "no estimates",
+            reason => reason.word(),
+        };
+        print_line!(
+            "  {:>10.3} s to {:>10.3} s: {what}{cause}",
+            spell.begin.seconds(),
+            spell.end.seconds()
+        );
+    }
+    if longest.len() < spells.len() {
+        print_line!("  and {} shorter times", spells.len() - longest.len());
+    }
+}
+
+fn in_json(known: &Known, story: &Story, at: Option<Nanos>) -> serde_json::Value {
+    let finite = |value: f64| value.is_finite().then_some(value);
+    let at = at.or_else(|| Some(known.budget.as_ref()?.header.acquired));
+    let budget = known.budget.as_ref().map(|budget| {
+        let parts = budget.parts().iter().map(|part| {
+            json!({
+                "source": part.source.get().map(Source::word), "name": part.name.as_str(),
+                "variance": finite(part.variance),
+                "travel": (part.source == Source::Position).then_some(part.travel),
+            })
+        });
+        json!({
+            "valid": budget.torque.valid == 1,
+            "torque": finite(budget.torque.torque),
+            "deviation": finite(budget.deviation),
+            "bound": finite(budget.bound),
+            "reason": budget.torque.reason.get().map(Reason::word),
+            "likelier": budget.likelier.as_str(),
+            "unexplained": budget.unexplained.as_str(),
+            "parts": parts.collect::<Vec<_>>(),
+        })
+    });
+    json!({
+        "joint": known.joint, "t": at.map(Nanos::seconds), "why": story.head,
+        "because": story.because, "advice": story.advice, "cause": known.cause, "budget": budget,
+    })
+}

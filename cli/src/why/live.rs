@@ -1,0 +1,162 @@
+//! What a running system says of a torque: its budget, and the state of boards and buses.
+
+use super::story::{Channel, Known, Part, System};
+use anyhow::{anyhow, bail};
+use proprio_bridge::{Described, Level, bus_state, device_state, first_of, next, one_robot, open};
+use proprio_estimator::setup::nearest;
+use proprio_topics::ipc::{Domain, DomainConfig, PortError, Presence, Reader, monotonic};
+use proprio_topics::{
+    Description, EstimatorHealth, GatewayHealth, Nanos, Publisher, Reason, Role, TorqueBudget,
+};
+
+/// For how long budgets are listened to: the last one that tells of a withheld torque counts.
+const LISTEN: Nanos = Nanos::from_millis(500);
+/// How long to wait for the first one: a robot with many joints has one of each in a second.
+const PATIENCE: Nanos = Nanos::from_millis(3000);
+/// A channel without a maximum silence is silent after this time.
+const SILENCE: f64 = 1.0;
+
+/// What is known of a joint's torque now.
+pub(super) fn know(
+    config: &DomainConfig,
+    robot: Option<&str>,
+    joint: &str,
+) -> anyhow::Result<Known> {
+    let domain = open(config)?;
+    let robot = one_robot(&domain, robot)?;
+    // The estimator computes budgets while somebody reads them: from now on.
+    let mut budgets = match Reader::<TorqueBudget>::open(&domain, &robot) {
+        Ok(reader) => Some(reader),
+        Err(PortError::NotYet { .. }) => None,
+        Err(error) => return Err(error.into()),
+    };
+    let presence = domain.robots().into_iter().find(|own| own.name == robot);
+    let presence = presence.ok_or_else(|| anyhow!("robot {robot} has ended meanwhile"))?;
+    let names = Described::by(&domain, &robot, Publisher::Estimator)?;
+    let names = names.map(|described| *described.newest());
+    let number = match &names {
+        Some(names) => Some(number(names, joint)?),
+        None => None,
+    };
+    let trouble = [
+        ("estimator", presence.estimator),
+        ("gateway", presence.gateway),
+    ]
+    .into_iter()
+    .find(|(_, own)| *own != Presence::Running)
+    .map(|(daemon, own)| format!("the {daemon} {own}"));
+    let budget = match (&mut budgets, number) {
+        (Some(budgets), Some(number)) if presence.estimator == Presence::Running => {
+            listen(budgets, number)
+        }
+        _ => None,
+    };
+    let cause = budget.as_ref().and_then(|budget| {
+        let entry = names.as_ref()?.find(Role::Channel, budget.torque.cause)?;
+        Some(entry.name.as_str().to_owned())
+    });
+    let health = first_of(&domain, &robot, |reader: &mut Reader<EstimatorHealth>| {
+        reader.latest().ok()?
+    })?;
+    Ok(Known {
+        joint: joint.to_owned(),
+        budget,
+        cause,
+        identifies: health.is_some_and(|(_, health)| health.identification.groups > 0),
+        system: System {
+            trouble,
+            ..system(&domain, &robot, names.as_ref())?
+        },
+    })
+}
+
+/// The number of a joint.
+fn number(names: &Description, joint: &str) -> anyhow::Result<u32> {
+    names.index(Role::Joint, joint).map_or_else(
+        || {
+            let joints = names.entries().iter().filter(|own| own.role == Role::Joint);
+            let hint = nearest(joint, joints.map(|own| own.name.as_str()));
+            bail!("the estimator has no joint {joint:?}{hint}")
+        },
+        Ok,
+    )
+}
+
+/// The budget of a joint: the last one that tells of a withheld torque, else the last one.
+fn listen(budgets: &mut Reader<TorqueBudget>, joint: u32) -> Option<TorqueBudget> {
+    let (mut found, begin) = (None::<TorqueBudget>, monotonic());
+    loop {
+        while let Ok(Some(budget)) = next(budgets) {
+            let tells = |found: &TorqueBudget| {
+                budget.torque.valid != 1 || found.torque.reason == Reason::None
+            };
+            if budget.joint == joint && found.as_ref().is_none_or(tells) {
+                found = Some(budget);
+            }
+        }
+        let now = monotonic();
+        let deadline = match found {
+            Some(_) => begin + LISTEN,
+            None => begin + PATIENCE,
+        };
+        if now >= deadline {
+            return found;
+        }
+        budgets.wait(deadline);
+    }
+}
+
+/// The state of channels, boards and buses; those first that the estimator reads.
+fn system(domain: &Domain, robot: &str, read: Option<&Description>) -> anyhow::Result<System> {
+    let health = first_of(domain, robot, |reader: &mut Reader<GatewayHealth>| {
+        reader.latest().ok()?
+    })?;
+    let names = Described::by(domain, robot, Publisher::Gateway)?;
+    let (Some((_, health)), Some(names)) = (health, names) else {
+        return Ok(System::default());
+    };
+    let bus = |number: u32| {
+        let bus = health.buses().get(number as usize);
+        bus.map_or("", |bus| bus.name.as_str()).to_owned()
+    };
+    let entries = names.newest().entries().iter();
+    let mut channels: Vec<Channel> = entries
+        .filter(|entry| entry.role == Role::Channel)
+        .map(|entry| {
+            let newest = health.newest.get(entry.index as usize);
+            let newest = newest.filter(|newest| **newest > Nanos::MIN);
+            let age = newest.map(|newest| {
+                let age = health.header.published.saturating_sub(*newest);
+                age.seconds().max(0.0)
+            });
+            let most = entry.max_silence.seconds();
+            Channel {
+                name: entry.name.as_str().to_owned(),
+                device: entry.origin.as_str().to_owned(),
+                bus: bus(entry.bus),
+                age,
+                is_silent: age.is_none_or(|age| age > if most > 0.0 { most } else { SILENCE }),
+            }
+        })
+        .collect();
+    let is_read = |channel: &Channel| {
+        read.is_none_or(|read| read.index(Role::Channel, &channel.name).is_some())
+    };
+    channels.sort_by_key(|channel| !is_read(channel));
+    let part = |name: &str, bus: String, (level, state): (Level, String)| Part {
+        name: name.to_owned(),
+        bus,
+        state,
+        is_well: level == Level::Ok,
+    };
+    let devices = health.devices().iter();
+    let devices = devices.map(|own| part(own.name.as_str(), bus(own.bus), device_state(own)));
+    let buses = health.buses().iter();
+    let buses = buses.map(|own| part(own.name.as_str(), String::new(), bus_state(own)));
+    Ok(System {
+        trouble: None,
+        channels,
+        devices: devices.collect(),
+        buses: buses.collect(),
+    })
+}

@@ -1,0 +1,509 @@
+//! What is known of a torque, and what follows from it for a person: what it is, why, and what to
+//! do. Without input and output.
+
+use proprio_topics::{BudgetPart, Reason, Source, TorqueBudget};
+use std::collections::BTreeSet;
+
+/// A channel of the system.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct Channel {
+    pub(super) name: String,
+    /// Its board, and the bus of that; empty if they are not known.
+    pub(super) device: String,
+    pub(super) bus: String,
+    /// Time since its last sample \[s\]; none if it has sent none.
+    pub(super) age: Option<f64>,
+    /// Whether this is longer than it should be.
+    pub(super) is_silent: bool,
+}
+
+/// A board, or a bus.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct Part {
+    pub(super) name: String,
+    /// The bus of a board.
+    pub(super) bus: String,
+    /// How it is.
+    pub(super) state: String,
+    /// Whether that is as it should be.
+    pub(super) is_well: bool,
+}
+
+/// The system that a torque comes from, as far as it is known.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct System {
+    /// What is wrong with gateway or estimator.
+    pub(super) trouble: Option<String>,
+    pub(super) channels: Vec<Channel>,
+    pub(super) devices: Vec<Part>,
+    pub(super) buses: Vec<Part>,
+}
+
+/// What is known of a torque.
+#[derive(Debug, Clone)]
+pub(super) struct Known {
+    pub(super) joint: String,
+    /// None if there is no estimate.
+    pub(super) budget: Option<TorqueBudget>,
+    /// The channel that causes it to be withheld.
+    pub(super) cause: Option<String>,
+    pub(super) system: System,
+    /// Whether the estimator identifies.
+    pub(super) identifies: bool,
+}
+
+/// What follows.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct Story {
+    /// The first line.
+    pub(super) head: String,
+    /// The chain of causes, the nearest first.
+    pub(super) because: Vec<String>,
+    /// What to do.
+    pub(super) advice: String,
+}
+
+/// A part of a budget, as it is shown.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Share {
+    pub(super) name: String,
+    pub(super) variance: f64,
+}
+
+/// A joint that has moved less since the estimator's start \[rad or m\] shows little of what it
+/// moves: a tenth of the travel that one wants for an identification.
+const UNMOVED: f64 = 0.1;
+
+impl Known {
+    pub(super) fn story(&self) -> Story {
+        let Self { joint, budget, .. } = self;
+        let Some(budget) = budget else {
+            let mut story = self.no_estimate();
+            story.head = format!("{joint} has no torque: {}", story.head);
+            return story;
+        };
+        let reason = budget.torque.reason.get().unwrap_or_default();
+        if reason == Reason::None {
+            let largest = shares(budget).into_iter().next();
+            let because = largest.map(|own| {
+                format!(
+                    "the largest part of its variance, {:.0} %, is {}",
+                    percent(&own, budget),
+                    own.name
+                )
+            });
+            return Story {
+                head: format!(
+                    "{joint} is valid: {} +- {} Nm",
+                    digits(budget.torque.torque),
+                    digits(budget.deviation)
+                ),
+                because: because.into_iter().collect(),
+                advice: String::new(),
+            };
+        }
+        let mut story = self.withheld(budget, reason);
+        story.head = format!("{joint} is withheld: {}", story.head);
+        story
+    }
+
+    /// Why a torque is withheld.
+    fn withheld(&self, budget: &TorqueBudget, reason: Reason) -> Story {
+        let channel = self.cause.as_deref().unwrap_or("a channel");
+        let (likelier, residual) = (budget.likelier.as_str(), budget.unexplained.as_str());
+        let told = |head: String, because: &[&str], advice: &str| Story {
+            head,
+            because: because.iter().map(|text| (*text).to_owned()).collect(),
+            advice: advice.to_owned(),
+        };
+        let own = match reason {
+            Reason::NeverSeen | Reason::Stale => return self.silent(channel),
+            Reason::Saturated => told(
+                format!("{channel} is saturated"),
+                &["a reading at the end of its range says only that the load is at least that"],
+                "lessen the load; if this load is usual, use a larger range of the sensor",
+            ),
+            Reason::DeviceFault => told(
+                format!("the board of {channel} reports a fault"),
+                &[],
+                "its manual tells what its fault means and how to clear it; `proprio status` has \
+                 its counters",
+            ),
+            Reason::Frozen => told(
+                format!("{channel} is frozen: it repeats its readings instead of measuring"),
+                &[],
+                "switch its board off and on; if it freezes again, its firmware or its amplifier \
+                 is at fault",
+            ),
+            Reason::Implausible => told(
+                format!("{channel} sends readings that contradict the ones before and after"),
+                &[],
+                "look for loose connectors at the sensor, and for error frames on its bus \
+                 (`proprio status`)",
+            ),
+            Reason::Starting => told(
+                format!(
+                    "{channel} has too few samples without a gap for velocity and acceleration"
+                ),
+                &[],
+                "wait for some tens of samples; if it lasts, the channel loses samples or is slow",
+            ),
+            Reason::NoStance => told(
+                "no link is known to stand still".to_owned(),
+                &["the base moves, and no IMU measures how"],
+                "declare the foot that stands (<robot>/contact/declared), or configure an IMU",
+            ),
+            Reason::NotFinite => told(
+                "the result is no finite number".to_owned(),
+                &[],
+                "look for readings or parameters without sense: `proprio echo`, `proprio \
+                 estimator --check`",
+            ),
+            Reason::Undetermined => told(
+                format!(
+                    "the contacts that are present have more unknowns than the F/T sensors have \
+                     equations: {}",
+                    list(&names(budget, Source::Present))
+                ),
+                &[],
+                "declare absent which are not there (presence = \"possible\"), or give kind = \
+                 \"force\" to those that can not exert a torque",
+            ),
+            Reason::Uncertain => self.uncertain(budget),
+            Reason::Unexplained => told(
+                format!(
+                    "an undeclared contact or load, another F/T offset, or F/T readings that are \
+                     late: {residual}"
+                ),
+                &["neither the model nor a configured contact explains these F/T readings"],
+                "let go of the robot; if something may touch it there, configure a [[contact]]; \
+                 if nothing does, tare the sensor or identify again",
+            ),
+            Reason::Contradicted if !likelier.is_empty() => told(
+                format!("the readings contradict the configuration: {likelier}"),
+                &["this explains them far better than what is configured"],
+                "correct the configuration or the wiring, and restart the estimator",
+            ),
+            Reason::Contradicted => told(
+                format!(
+                    "the readings have contradicted the configuration since the start: {residual}"
+                ),
+                &[
+                    "a contact since the start, a wrong F/T offset, another mounting, or another \
+                   direction of gravity",
+                ],
+                "move the robot without a contact for some seconds; if it stays, check the F/T \
+                 offset, then base and mounting in estimator.toml",
+            ),
+            Reason::Absent | Reason::None => told(reason.word().to_owned(), &[], ""),
+        };
+        self.with_board(own)
+    }
+
+    /// The same, with the board and bus of the channel at fault.
+    fn with_board(&self, mut story: Story) -> Story {
+        let own = self
+            .cause
+            .as_deref()
+            .and_then(|name| self.system.channel(name));
+        if let Some(channel) = own.filter(|channel| !channel.device.is_empty()) {
+            story.because.insert(0, channel.comes_from());
+            story.because.extend(self.system.conspicuous(channel));
+        }
+        story
+    }
+
+    fn uncertain(&self, budget: &TorqueBudget) -> Story {
+        let unmoved: Vec<&str> = (budget.parts().iter())
+            .filter(|part| part.source == Source::Position && part.travel < UNMOVED)
+            .map(|part| part.name.as_str())
+            .collect();
+        let still = match unmoved.as_slice() {
+            [] => Vec::new(),
+            all => vec![format!(
+                "hardly moved since the estimator's start: {}",
+                list(all)
+            )],
+        };
+        let moving = |unmoved: &[&str]| match unmoved {
+            _ if !self.identifies => "identify the robot: `proprio identify` on a log of motion, \
+                                      or [identification] enabled = true"
+                .to_owned(),
+            [] => "move all joints that it rests on for some seconds, without a contact".to_owned(),
+            all => format!("move {}, without a contact", list(all)),
+        };
+        if let Some(channel) = &self.cause {
+            return Story {
+                head: format!("the zero of {channel} is a new one, so that its offset is unknown"),
+                because: vec!["its board was restarted or tared".to_owned()],
+                advice: moving(&unmoved),
+            };
+        }
+        if budget.deviation.is_infinite() {
+            return Story {
+                head: match unmoved.as_slice() {
+                    [] => "it is not known yet whether the setup is as configured".to_owned(),
+                    all => format!(
+                        "it is not known yet whether the setup is as configured: {} hardly moved",
+                        list_has(all)
+                    ),
+                },
+                because: vec![
+                    "identification compares the configured setup with others, such as a reversed \
+                     encoder or a turned sensor; that takes some seconds of motion"
+                        .to_owned(),
+                ],
+                advice: moving(&unmoved),
+            };
+        }
+        let largest = shares(budget).into_iter().next();
+        let advice = match budget.parts().first().and_then(|part| part.source.get()) {
+            Some(Source::Offset | Source::Drift) => {
+                "let the estimator identify the offset ([identification] enabled = true) and move \
+                 the robot without a contact; or state it (offset_n, offset_nm), or tare"
+                    .to_owned()
+            }
+            Some(Source::Link | Source::Gain | Source::Alternative | Source::Step) => {
+                moving(&unmoved)
+            }
+            Some(Source::Acceleration | Source::Position | Source::Rotation) => {
+                "move more slowly; or give the channel more samples, or an encoder with finer \
+                 steps"
+                    .to_owned()
+            }
+            _ => "raise the bound if so large a deviation does no harm".to_owned(),
+        };
+        let part = largest.map_or(String::new(), |own| {
+            format!(
+                "; {:.0} % of the variance is {}",
+                percent(&own, budget),
+                own.name
+            )
+        });
+        Story {
+            head: format!(
+                "its deviation of {} Nm exceeds the bound of {} Nm (output.max_torque_std_nm){part}",
+                digits(budget.deviation),
+                digits(budget.bound)
+            ),
+            because: still,
+            advice,
+        }
+    }
+}
+
+impl Known {
+    /// Why a channel is silent.
+    fn silent(&self, name: &str) -> Story {
+        let system = &self.system;
+        let own = system.channel(name);
+        let since = match own.and_then(|own| own.age) {
+            Some(age) => format!("no sample of {name} for {age:.1} s"),
+            None => format!("no sample of {name}"),
+        };
+        let Some(own) = own else {
+            return Story {
+                head: since,
+                because: Vec::new(),
+                advice: "see `proprio status` for its board".to_owned(),
+            };
+        };
+        let because = match own.device.is_empty() {
+            true => vec![since.clone()],
+            false => vec![since.clone(), own.comes_from()],
+        };
+        if let Some(trouble) = &system.trouble {
+            return Story {
+                head: trouble.clone(),
+                because,
+                advice: "start it again; its log says why it ended (journalctl -u proprio-gateway)"
+                    .to_owned(),
+            };
+        }
+        let bus = system.buses.iter().find(|bus| bus.name == own.bus);
+        let on_bus = || system.channels.iter().filter(|other| other.bus == own.bus);
+        let boards: BTreeSet<&str> = on_bus().map(|other| other.device.as_str()).collect();
+        let all_silent = !own.bus.is_empty() && on_bus().all(|other| other.is_silent);
+        let bus_advice =
+            "check its interface (ip -details link show), cable, power of the boards, \
+                          termination and bit rate"
+                .to_owned();
+        if let Some(bus) = bus.filter(|bus| !bus.is_well) {
+            return Story {
+                head: format!("bus {} is {}", bus.name, bus.state),
+                because,
+                advice: bus_advice,
+            };
+        }
+        if all_silent && boards.len() > 1 {
+            return Story {
+                head: format!("all {} boards of bus {} are silent", boards.len(), own.bus),
+                because,
+                advice: bus_advice,
+            };
+        }
+        let device = system.device(own);
+        let (head, because) = match device.filter(|device| !device.is_well) {
+            Some(device) => (
+                format!(
+                    "board {} on bus {} is {}",
+                    device.name, own.bus, device.state
+                ),
+                because,
+            ),
+            None if own.device.is_empty() => (since, because[1..].to_vec()),
+            None => (
+                format!("board {} on bus {} is silent", own.device, own.bus),
+                because,
+            ),
+        };
+        Story {
+            head,
+            because,
+            advice: "check its power, cable and address; other boards of the bus are heard"
+                .to_owned(),
+        }
+    }
+
+    /// Why there is no estimate.
+    fn no_estimate(&self) -> Story {
+        let system = &self.system;
+        if let Some(trouble) = &system.trouble {
+            return Story {
+                head: trouble.clone(),
+                because: Vec::new(),
+                advice: "start it: `systemctl status proprio-gateway proprio-estimator` and their \
+                         logs tell more"
+                    .to_owned(),
+            };
+        }
+        let known = self.cause.as_deref().and_then(|name| system.channel(name));
+        let silent = known.or_else(|| system.channels.iter().find(|channel| channel.is_silent));
+        match silent {
+            Some(channel) => {
+                let mut story = self.silent(&channel.name);
+                story.because.push(
+                    "an estimate is made for each sample of the trigger channel (output.trigger); \
+                     none comes"
+                        .to_owned(),
+                );
+                story
+            }
+            None => Story {
+                head: "the estimator makes no estimate".to_owned(),
+                because: Vec::new(),
+                advice: "its log tells which channels it lacks; `proprio estimator --check \
+                         --gateway` compares the two configurations"
+                    .to_owned(),
+            },
+        }
+    }
+}
+
+impl System {
+    fn channel(&self, name: &str) -> Option<&Channel> {
+        self.channels.iter().find(|channel| channel.name == name)
+    }
+
+    fn device(&self, channel: &Channel) -> Option<&Part> {
+        let mut devices = self.devices.iter();
+        devices.find(|device| device.name == channel.device && device.bus == channel.bus)
+    }
+
+    /// What is not as it should be with a channel's board and bus.
+    fn conspicuous(&self, channel: &Channel) -> impl Iterator<Item = String> {
+        let device = self.device(channel).filter(|device| !device.is_well);
+        let bus = self.buses.iter().find(|bus| bus.name == channel.bus);
+        let of_device = device.map(|device| format!("board {} is {}", device.name, device.state));
+        let bus = bus.filter(|bus| !bus.is_well);
+        let of_bus = bus.map(|bus| format!("bus {} is {}", bus.name, bus.state));
+        of_device.into_iter().chain(of_bus)
+    }
+}
+
+impl Channel {
+    fn comes_from(&self) -> String {
+        format!(
+            "{} comes from board {} on bus {}",
+            self.name, self.device, self.bus
+        )
+    }
+}
+
+/// The parts of a budget, the largest first; without those of no or of infinite variance. Parts that were
+/// identified together, of which one cancels a part of another, are one.
+pub(super) fn shares(budget: &TorqueBudget) -> Vec<Share> {
+    let matters = |part: &&BudgetPart| part.variance != 0.0 && part.variance.is_finite();
+    let parts = budget.parts().iter().filter(matters);
+    let mut all: Vec<Share> = parts
+        .map(|part| Share {
+            name: name(part),
+            variance: part.variance,
+        })
+        .collect();
+    while let Some(least) = all.iter().position(|own| own.variance < 0.0) {
+        let negative = all.swap_remove(least);
+        all.sort_by(|a, b| b.variance.total_cmp(&a.variance));
+        match all.first_mut() {
+            Some(first) => {
+                first.variance += negative.variance;
+                first.name = format!("{} and {}, correlated", first.name, negative.name)
+                    .replace(", correlated and", ",");
+            }
+            None => break,
+        }
+    }
+    all.sort_by(|a, b| b.variance.total_cmp(&a.variance));
+    all
+}
+
+/// The share of the sum of all that are finite [%].
+pub(super) fn percent(share: &Share, budget: &TorqueBudget) -> f64 {
+    let all = budget.parts().iter().map(|part| part.variance);
+    let sum: f64 = all.filter(|variance| variance.is_finite()).sum();
+    100.0 * share.variance / sum
+}
+
+/// A number with three digits.
+pub(super) fn digits(number: f64) -> String {
+    crate::report::number(number).replace('−', "-")
+}
+
+/// An input, for a person.
+pub(super) fn name(part: &BudgetPart) -> String {
+    let name = part.name.as_str();
+    match part.source.get().unwrap_or(Source::Others) {
+        Source::Noise => format!("the noise of {name}"),
+        Source::Offset => format!("the offset of {name}"),
+        Source::Gain => format!("the calibration of {name}"),
+        Source::Drift => format!("the drift of {name}"),
+        Source::Link => format!("the inertial parameters of {name}"),
+        Source::Position => format!("the encoder of {name} (zero and noise)"),
+        Source::Acceleration => format!("the acceleration of {name}"),
+        Source::Base => "the acceleration of the base".to_owned(),
+        Source::Rotation => "the angular acceleration of the base".to_owned(),
+        Source::Place => format!("the place of contact {name}"),
+        Source::Alternative => "what identification has not refuted".to_owned(),
+        Source::Step => "a jump of an offset, or a contact, that may have begun".to_owned(),
+        Source::Others => "further inputs".to_owned(),
+        Source::Present => format!("contact {name}"),
+        Source::Absent => format!("no contact at {name}"),
+    }
+}
+
+/// The names of the parts from a source, in the order of their names.
+pub(super) fn names(budget: &TorqueBudget, source: Source) -> Vec<&str> {
+    let own = budget.parts().iter().filter(|part| part.source == source);
+    let mut names: Vec<&str> = own.map(|part| part.name.as_str()).collect();
+    names.sort_unstable();
+    names
+}
+
+fn list(names: &[&str]) -> String {
+    names.join(", ")
+}
+
+fn list_has(names: &[&str]) -> String {
+    let verb = if names.len() == 1 { "has" } else { "have" };
+    format!("{} {verb}", names.join(", "))
+}
