@@ -27,12 +27,14 @@ fn setup() -> Setup {
     Setup::new(&config).unwrap()
 }
 
+/// Changes a reading of the channel of this name; true for the last one.
+type Alter<'a> = &'a dyn Fn(&str, bool, &mut Reading);
+
 /// What is changed about a run.
 #[derive(Default)]
 struct Change<'a> {
     setup: Option<&'a dyn Fn(&mut Setup)>,
-    /// Changes a reading of a channel: all of them, or (true) the last one.
-    reading: Option<&'a dyn Fn(&str, bool, &mut Reading)>,
+    reading: Option<Alter<'a>>,
 }
 
 /// The torques of the golden log's last row, and the budgets of all joints.
@@ -139,7 +141,7 @@ fn the_parts_sum_to_the_square_of_the_deviation() {
 #[test]
 fn each_part_is_what_an_error_of_its_input_does() {
     let (stated, budgets) = last(&Change::default());
-    let with_reading = |change: &dyn Fn(&str, bool, &mut Reading)| {
+    let with_reading = |change: Alter<'_>| {
         let change = Change {
             reading: Some(change),
             ..Change::default()

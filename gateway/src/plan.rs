@@ -262,7 +262,6 @@ impl Plan {
             index,
             kind: channel.kind.in_memory(),
             bus: u32::try_from(channel.bus).unwrap_or(u32::MAX),
-            ..Entry::NONE
         });
         Box::new(Description::new(Publisher::Gateway, entries))
     }

@@ -435,26 +435,26 @@ impl Channel {
 pub(super) fn shares(budget: &TorqueBudget) -> Vec<Share> {
     let matters = |part: &&BudgetPart| part.variance != 0.0 && part.variance.is_finite();
     let parts = budget.parts().iter().filter(matters);
-    let mut all: Vec<Share> = parts
-        .map(|part| Share {
-            name: name(part),
-            variance: part.variance,
-        })
+    let mut all: Vec<(Vec<String>, f64)> = parts
+        .map(|part| (vec![name(part)], part.variance))
         .collect();
-    while let Some(least) = all.iter().position(|own| own.variance < 0.0) {
-        let negative = all.swap_remove(least);
-        all.sort_by(|a, b| b.variance.total_cmp(&a.variance));
-        match all.first_mut() {
-            Some(first) => {
-                first.variance += negative.variance;
-                first.name = format!("{} and {}, correlated", first.name, negative.name)
-                    .replace(", correlated and", ",");
-            }
-            None => break,
-        }
+    while let Some(negative) = all.iter().position(|own| own.1 < 0.0) {
+        let (names, variance) = all.swap_remove(negative);
+        let Some(largest) = all.iter_mut().max_by(|a, b| a.1.total_cmp(&b.1)) else {
+            break;
+        };
+        largest.0.extend(names);
+        largest.1 += variance;
     }
-    all.sort_by(|a, b| b.variance.total_cmp(&a.variance));
-    all
+    all.sort_by(|a, b| b.1.total_cmp(&a.1));
+    let together = |(names, variance): (Vec<String>, f64)| Share {
+        name: match names.as_slice() {
+            [one] => one.clone(),
+            all => format!("{}, correlated", all.join(", ")),
+        },
+        variance,
+    };
+    all.into_iter().map(together).collect()
 }
 
 /// The share of the sum of all that are finite [%].
@@ -506,4 +506,210 @@ fn list(names: &[&str]) -> String {
 fn list_has(names: &[&str]) -> String {
     let verb = if names.len() == 1 { "has" } else { "have" };
     format!("{} {verb}", names.join(", "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proprio_topics::{JointTorque, Name};
+
+    fn budget(parts: &[(Source, &str, f64)]) -> TorqueBudget {
+        let mut budget = TorqueBudget::new();
+        for (source, name, variance) in parts {
+            budget.add(BudgetPart {
+                source: source.in_memory(),
+                name: Name::new(name).unwrap_or(Name::EMPTY),
+                variance: *variance,
+                ..BudgetPart::NONE
+            });
+        }
+        budget.sort();
+        budget.deviation = parts.iter().map(|own| own.2).sum::<f64>().sqrt();
+        budget
+    }
+
+    fn known(budget: Option<TorqueBudget>, cause: Option<&str>, system: System) -> Known {
+        Known {
+            joint: "elbow".to_owned(),
+            budget,
+            cause: cause.map(str::to_owned),
+            system,
+            identifies: true,
+        }
+    }
+
+    fn withheld(reason: Reason, mut budget: TorqueBudget) -> TorqueBudget {
+        budget.torque = JointTorque {
+            reason: reason.in_memory(),
+            ..JointTorque::ABSENT
+        };
+        budget
+    }
+
+    fn channel(name: &str, device: &str, bus: &str, is_silent: bool) -> Channel {
+        Channel {
+            name: name.to_owned(),
+            device: device.to_owned(),
+            bus: bus.to_owned(),
+            age: is_silent.then_some(2.0),
+            is_silent,
+        }
+    }
+
+    #[test]
+    fn parts_that_cancel_each_other_are_one() {
+        let budget = budget(&[
+            (Source::Offset, "ft", 5.0),
+            (Source::Link, "hand", 4.0),
+            (Source::Gain, "ft", -7.0),
+            (Source::Noise, "ft", 1.0),
+            (Source::Base, "", 0.0),
+        ]);
+        let shares = shares(&budget);
+        let parts: Vec<(&str, f64)> = (shares.iter())
+            .map(|own| (own.name.as_str(), own.variance))
+            .collect();
+        let together = "the inertial parameters of hand, the offset of ft, the calibration of ft, \
+                        correlated";
+        assert_eq!(parts, [(together, 2.0), ("the noise of ft", 1.0)]);
+        assert!((percent(&shares[0], &budget) - 200.0 / 3.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_silent_channel_is_traced_to_what_is_silent_as_a_whole() {
+        let one = channel("elbow", "motor_a", "can0", true);
+        let other = |is_silent| channel("wrist", "motor_b", "can0", is_silent);
+        let part = |name: &str, bus: &str, state: &str| Part {
+            name: name.to_owned(),
+            bus: bus.to_owned(),
+            state: state.to_owned(),
+            is_well: false,
+        };
+        let head = |system: System| {
+            let stale = withheld(Reason::Stale, TorqueBudget::new());
+            known(Some(stale), Some("elbow"), system).story().head
+        };
+        let channels = |others_silent| vec![one.clone(), other(others_silent)];
+        for (system, expected) in [
+            (
+                System {
+                    channels: channels(false),
+                    ..System::default()
+                },
+                "board motor_a on bus can0 is silent",
+            ),
+            (
+                System {
+                    channels: channels(false),
+                    devices: vec![part("motor_a", "can0", "refused: it does not answer")],
+                    ..System::default()
+                },
+                "board motor_a on bus can0 is refused: it does not answer",
+            ),
+            (
+                System {
+                    channels: channels(true),
+                    ..System::default()
+                },
+                "all 2 boards of bus can0 are silent",
+            ),
+            (
+                System {
+                    channels: channels(true),
+                    buses: vec![part("can0", "", "down")],
+                    ..System::default()
+                },
+                "bus can0 is down",
+            ),
+            (
+                System {
+                    channels: channels(true),
+                    trouble: Some("the gateway has ended".to_owned()),
+                    ..System::default()
+                },
+                "the gateway has ended",
+            ),
+            (
+                System {
+                    channels: vec![channel("elbow", "", "", true)],
+                    ..System::default()
+                },
+                "no sample of elbow for 2.0 s",
+            ),
+        ] {
+            assert_eq!(head(system), format!("elbow is withheld: {expected}"));
+        }
+    }
+
+    #[test]
+    fn every_reason_has_its_words() {
+        let heads: BTreeSet<String> = Reason::ALL
+            .into_iter()
+            .map(|reason| {
+                let own = withheld(reason, budget(&[(Source::Offset, "ft", 4.0)]));
+                let story = known(Some(own), Some("ft"), System::default()).story();
+                let needs_none = matches!(reason, Reason::None | Reason::Absent);
+                assert!(needs_none || !story.advice.is_empty(), "{reason}");
+                story.head
+            })
+            .collect();
+        // What has never come is silent, as what comes no longer.
+        assert_eq!(heads.len(), Reason::ALL.len() - 1, "{heads:#?}");
+    }
+
+    #[test]
+    fn what_is_uncertain_names_what_to_move() {
+        let mut own = withheld(Reason::Uncertain, budget(&[(Source::Link, "hand", 4.0)]));
+        own.bound = 1.0;
+        for (name, travel) in [("wrist", 0.01), ("elbow", 1.0)] {
+            own.add(BudgetPart {
+                source: Source::Position.in_memory(),
+                name: Name::new(name).unwrap_or(Name::EMPTY),
+                travel,
+                ..BudgetPart::NONE
+            });
+        }
+        let story = known(Some(own), None, System::default()).story();
+        assert!(
+            story.head.contains("2.00 Nm exceeds the bound of 1.00 Nm"),
+            "{story:?}"
+        );
+        assert!(
+            story
+                .head
+                .ends_with("100 % of the variance is the inertial parameters of hand")
+        );
+        assert_eq!(story.advice, "move wrist, without a contact");
+        own.deviation = f64::INFINITY;
+        let story = known(Some(own), None, System::default()).story();
+        assert!(
+            story
+                .head
+                .ends_with("as configured: wrist has hardly moved"),
+            "{story:?}"
+        );
+    }
+
+    #[test]
+    fn without_estimates_the_first_silent_channel_counts() {
+        let channels = vec![
+            channel("wrist", "motor_b", "can1", false),
+            channel("ft", "strain", "can0", true),
+            channel("imu", "imu", "can0", false),
+        ];
+        let system = System {
+            channels,
+            ..System::default()
+        };
+        let story = known(None, None, system).story();
+        assert_eq!(
+            story.head,
+            "elbow has no torque: board strain on bus can0 is silent"
+        );
+        let story = known(None, None, System::default()).story();
+        assert_eq!(
+            story.head,
+            "elbow has no torque: the estimator makes no estimate"
+        );
+    }
 }
