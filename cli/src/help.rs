@@ -4,8 +4,8 @@
 //! What can be asked for is in the pages themselves: words in backticks in a heading name its
 //! section. One of a page's parts has the part's name before its own, as `bus.device.address`.
 
-use anyhow::{Context as _, Result, bail};
 use clap::Command;
+use clap::error::ErrorKind;
 use proprio_gateway::plan::did_you_mean;
 use std::io::IsTerminal;
 
@@ -174,21 +174,25 @@ fn answer(words: &[String], program: &Command) -> Answer {
     }
 }
 
-/// Prints the help of a verb, as `--help` does.
-fn print_help_of(verb: &[String], mut program: Command) -> Result<()> {
+/// Prints the help of a verb, as `--help` does; a wrong command line if there is none.
+fn print_help_of(verb: &[String], mut program: Command) {
     program.build();
-    let mut at = &mut program;
     for word in verb {
-        let name = at.get_name().to_owned();
-        at = at.find_subcommand_mut(word).with_context(|| {
-            format!("{name} has no {word:?}; `proprio help {name}` lists what it has")
-        })?;
+        program = program.find_subcommand(word).cloned().unwrap_or_else(|| {
+            let name = program.get_name().to_owned();
+            let why = format!("{name} has no {word:?}; `proprio help {name}` lists what it has");
+            wrong(&mut program, &why)
+        });
     }
     match is_for_a_person() {
-        true => print_part!("{}", at.render_long_help().ansi()),
-        false => print_part!("{}", at.render_long_help()),
+        true => print_part!("{}", program.render_long_help().ansi()),
+        false => print_part!("{}", program.render_long_help()),
     }
-    Ok(())
+}
+
+/// Ends the program: the command line is wrong.
+fn wrong(command: &mut Command, why: &str) -> ! {
+    command.error(ErrorKind::InvalidValue, why).exit()
 }
 
 /// Whether bold letters are of use.
@@ -228,10 +232,10 @@ fn plain(text: &str, is_bold: bool) -> String {
 }
 
 /// Shows what the words of `args` name; `program` is the whole command line.
-pub(crate) fn run(args: &Args, program: Command) -> Result<()> {
+pub(crate) fn run(args: &Args, mut program: Command) {
     let word = args.words.join(" ");
     match answer(&args.words, &program) {
-        Answer::Verb(words) => print_help_of(&words, program)?,
+        Answer::Verb(words) => print_help_of(&words, program),
         Answer::Text(text) => {
             print_line!("{}", plain(&text, is_for_a_person()));
         }
@@ -242,11 +246,11 @@ pub(crate) fn run(args: &Args, program: Command) -> Result<()> {
                 lines.collect::<String>().trim_end()
             );
         }
-        Answer::Unknown(near) => {
-            bail!("nothing is called {word:?}{near}; `proprio help topics` lists the pages")
-        }
+        Answer::Unknown(near) => wrong(
+            &mut program,
+            &format!("nothing is called {word:?}{near}; `proprio help topics` lists the pages"),
+        ),
     }
-    Ok(())
 }
 
 #[cfg(test)]
@@ -412,7 +416,7 @@ mod tests {
             let parsed = Line::try_parse_from(["proprio".to_owned()].into_iter().chain(arguments));
             let problem = parsed
                 .err()
-                .filter(|error| error.kind() != clap::error::ErrorKind::DisplayHelp);
+                .filter(|error| error.kind() != ErrorKind::DisplayHelp);
             assert!(
                 problem.is_none(),
                 "`{line}`: {}",

@@ -136,7 +136,10 @@ fn main() -> ExitCode {
         Verb::Ros2(args) => programs::run("ros2", &args, &domain),
         Verb::Doctor(args) => doctor::run(&args, &domain),
         Verb::Install(args) => install::run(&args),
-        Verb::Help(args) => help::run(&args, Args::command()),
+        Verb::Help(args) => {
+            help::run(&args, Args::command());
+            Ok(())
+        }
         Verb::Completions { shell } => {
             let mut script = Vec::new();
             clap_complete::generate(shell, &mut Args::command(), "proprio", &mut script);

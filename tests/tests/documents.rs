@@ -198,14 +198,16 @@ fn configuration_blocks_are_legal() {
         }
         let blocks = blocks(&text).into_iter();
         for (_, block) in blocks.filter(|(language, _)| language == "toml") {
-            let text = format!("schema = 1\nrobot = \"r\"\n{block}");
-            // Parts of gateway.toml, or of estimator.toml.
+            // A whole file, or parts of gateway.toml or estimator.toml.
+            let text = match block.contains("schema = ") {
+                true => block.clone(),
+                false => format!("schema = 1\nrobot = \"r\"\nmodel = \"m.urdf\"\n{block}"),
+            };
             let problem = match block.contains("[[bus") {
-                true => Plan::parse(&text, Path::new(".")).err(),
-                false => {
-                    let text = text.replacen('\n', "\nmodel = \"m.urdf\"\n", 1);
-                    Config::parse(&text).err().map(|e| format!("{e:?}"))
+                true => {
+                    Plan::parse(&text.replace("model = \"m.urdf\"\n", ""), Path::new(".")).err()
                 }
+                false => Config::parse(&text).err().map(|e| format!("{e:?}")),
             };
             assert!(
                 problem.is_none(),
