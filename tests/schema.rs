@@ -11,7 +11,7 @@ use std::{format, fs};
 
 /// How the files, and the pages that follow from them, are written.
 const WRITE: &str = "PROPRIO_WRITE_REFERENCE=1 cargo test -p proprio-drivers -p proprio-gateway \
-                     -p proprio-estimator -p proprio-tests reference";
+                     -p proprio-estimator -p proprio-tests --lib --test reference reference";
 
 /// The schema of a type, with everything in its place: editors that complete keys do not follow
 /// all references.
