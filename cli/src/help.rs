@@ -347,17 +347,14 @@ mod tests {
 
     #[test]
     fn each_reason_each_state_and_each_driver_has_a_text() {
-        use proprio_topics::{DeviceState, Reason};
-        let reasons = Reason::ALL
-            .iter()
-            .map(|reason| reason.word())
-            .filter(|word| !word.is_empty());
+        use proprio_topics::{DeviceState, LinkState, Reason};
+        let reasons = Reason::ALL.iter().map(|reason| reason.word());
         let states = DeviceState::ALL.iter().map(|state| state.word());
+        let links = LinkState::ALL.iter().map(|state| state.word());
         let drivers = proprio_drivers::DRIVERS.iter().copied();
-        for word in reasons
-            .chain(states.filter(|word| !["starting", "streaming"].contains(word)))
-            .chain(drivers)
-        {
+        let well = ["", "streaming", "up", "ended"];
+        let all = reasons.chain(states).chain(links).chain(drivers);
+        for word in all.filter(|word| !well.contains(word)) {
             assert!(
                 matches!(ask(word), Answer::Text(_)),
                 "{word}: {:?}",
