@@ -140,7 +140,12 @@ fn links_lead_somewhere() {
 fn no_page_is_long() {
     for (file, text) in documents() {
         let words = text.split_whitespace().count();
-        assert!(words <= MOST_WORDS, "{}: {words} words", file.display());
+        // Pages of keys are looked up, not read.
+        let most = match text.starts_with("<!-- Made by") {
+            true => MOST_WORDS * 3 / 2,
+            false => MOST_WORDS,
+        };
+        assert!(words <= most, "{}: {words} words", file.display());
     }
 }
 
