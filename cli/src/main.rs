@@ -10,6 +10,7 @@ mod doctor;
 mod echo;
 mod estimator;
 mod folder;
+mod help;
 mod identify;
 mod install;
 mod programs;
@@ -25,7 +26,7 @@ mod table;
 mod top;
 mod why;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory as _, Parser, Subcommand};
 use proprio_topics::ipc::DomainConfig;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -35,7 +36,7 @@ use std::process::ExitCode;
 ///
 /// Exit codes: 0 success, 2 wrong configuration or command line, 1 any other failure.
 #[derive(Parser)]
-#[command(name = "proprio", version, about)]
+#[command(name = "proprio", version, about, disable_help_subcommand = true)]
 struct Args {
     #[command(subcommand)]
     verb: Verb,
@@ -90,6 +91,13 @@ enum Verb {
     Doctor(doctor::Args),
     /// Install this program, its systemd units and a robot's configuration
     Install(install::Args),
+    /// Show a page of the book: a key, a driver, a reason, a verb; `help topics` lists the pages
+    Help(help::Args),
+    /// Print the completions of a shell: `source <(proprio completions bash)`
+    Completions {
+        /// The shell
+        shell: clap_complete::Shell,
+    },
 }
 
 #[derive(clap::Args)]
@@ -133,6 +141,16 @@ fn main() -> ExitCode {
         Verb::Ros2(args) => programs::run("ros2", &args, &domain),
         Verb::Doctor(args) => doctor::run(&args, &domain),
         Verb::Install(args) => install::run(&args),
+        Verb::Help(args) => {
+            help::run(&args, Args::command());
+            Ok(())
+        }
+        Verb::Completions { shell } => {
+            let mut script = Vec::new();
+            clap_complete::generate(shell, &mut Args::command(), "proprio", &mut script);
+            print_part!("{}", String::from_utf8_lossy(&script));
+            Ok(())
+        }
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -156,4 +174,34 @@ fn fail(error: &anyhow::Error, is_journal: bool) -> ExitCode {
         || proprio_gateway::daemon::is_configuration(error)
         || proprio_estimator::daemon::is_configuration(error);
     ExitCode::from(if configuration { 2 } else { 1 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+    use std::path::Path;
+
+    /// `packaging/man/` has what clap says of each verb.
+    #[test]
+    fn the_man_pages_are_new() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../packaging/man");
+        let mut program = Args::command();
+        program.build();
+        for verb in [&program].into_iter().chain(program.get_subcommands()) {
+            let name = verb.get_display_name().unwrap_or_else(|| verb.get_name());
+            let page = clap_mangen::Man::new(verb.clone()).source("Proprio");
+            let mut made = Vec::new();
+            page.render(&mut made).expect("a page");
+            let file = folder.join(format!("{name}.1"));
+            if std::env::var_os("PROPRIO_WRITE_MAN").is_some() {
+                fs::write(&file, &made).expect("the page can be written");
+            }
+            assert!(
+                fs::read(&file).unwrap_or_default() == made,
+                "{} is old: PROPRIO_WRITE_MAN=1 cargo test -p proprio-cli man",
+                file.display()
+            );
+        }
+    }
 }

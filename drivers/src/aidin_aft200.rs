@@ -1,46 +1,6 @@
-//! AIDIN Robotics AFT200-D80-C force/torque sensors.
-//!
-//! The bit rate is 1 Mbit/s. Streams, big-endian:
-//!
-//! | identifier | name | bytes | content |
-//! |---|---|---|---|
-//! | `id_force` | force | 6 to 8 | fx fy fz u16; further bytes are unused |
-//! | `id_torque` | torque | 6 to 8 | tx ty tz u16; further bytes are unused |
-//!
-//! - force = u16 / 100 - 300 N, torque = u16 / 500 - 50 Nm. A value at an end of the 16 bits is
-//!   reported as saturated.
-//! - The frames have no sequence number: force and torque are paired by order and time
-//!   (`pairing.rs`).
-//!
-//! Commands on `102`, 8 bytes, unused ones zero. The first byte is the sensor's own number, which
-//! is the device's `address`. No answers are known:
-//!
-//! | bytes | meaning |
-//! |---|---|
-//! | `address 05 high low` | period in us, at most 65535 |
-//! | `address 03 01` | send continuously |
-//!
-//! - No command that ends the stream is known: at a stop nothing is sent, and the sensor goes on.
-//! - Do not set the sensor's bias (`address 02 01`, by another program) while readings are in use:
-//!   it changes the zero, and for about a second the sensor sends other contents on the identifiers
-//!   1 to 6, which look like readings.
-//!
-//! Sources: `sensors.py`, `imu_test.py` and `README.md` of rise-lab-skku/rise-aft-can 9705f731,
-//! which was run with one sensor; no document of the maker. Highly probable: the contents and the
-//! start. Probable: the period's unit. Not known: whether the identifiers of the streams follow a
-//! new number of the sensor, therefore they are keys of their own; whether the sensor keeps its
-//! period; what it sends after its six bytes (the source's remark has two more).
-//!
-//! # Recognition
-//! A sensor that streams on the identifiers 1 and 2 is recognised by forces and torques that it can
-//! measure, and by the commands of another program. No question is known that it answers.
-//!
-//! # Keys
-//! ```toml
-//! period_ms = 10    # 1 to 65
-//! id_force = 1      # identifiers of the streams, 0 to 0x7FF
-//! id_torque = 2
-//! ```
+//! The driver `aidin_aft200`: AIDIN AFT200 force/torque sensors.
+//! What follows is its page of the book.
+#![doc = include_str!("../../docs/book/src/devices/aidin_aft200.md")]
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Link, Supervised};
@@ -74,6 +34,7 @@ const FULL_SCALE: (f64, f64) = (200.0, 15.0);
 
 /// The keys of `driver = "aidin_aft200"`.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Period \[ms\], 1 to 65; default 10.

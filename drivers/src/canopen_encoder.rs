@@ -1,49 +1,5 @@
-//! CANopen encoders (CiA 406), absolute, single-turn or multi-turn.
-//!
-//! The address is the node, 1 to 127. The position comes in TPDO 1 (`180` + node): u32,
-//! little-endian, counts. It covers all turns of a multi-turn encoder, and begins anew at the end
-//! of its range.
-//!
-//! At start the driver sets the node pre-operational, checks that its profile (object 1000) is 406,
-//! asks for the counts per turn, maps object 6004 alone to TPDO 1, sets its timer or its SYNC, and
-//! sets the node operational:
-//!
-//! | object | meaning | value |
-//! |---|---|---|
-//! | 6000 | operating parameters; bit 2: scaled | read |
-//! | 6001 | counts per turn of a scaled encoder | read |
-//! | 6501 | counts per turn of one that is not | read |
-//! | 1800 sub 1 | identifier of TPDO 1 | off, and on at the end |
-//! | 1A00 | mapping of TPDO 1 | 6004 00, 32 bits |
-//! | 1800 sub 2 | transmission | 254, or `sync` |
-//! | 1800 sub 5 | timer \[ms\]; 6200 if the node has none | `period_ms` |
-//! | 1017 | heartbeat \[ms\] | 500 |
-//!
-//! Nothing is stored in the node. A node that boots or leaves the operational state is started
-//! again. While its last emergency message (EMCY) is an error, readings have DEVICE_FAULT.
-//!
-//! With `sync = n` the node sends after each n-th SYNC, and `acquired` is the time of that SYNC:
-//! the moment at which the encoder has measured. Something must send SYNC: `canopen_sync`, or
-//! another node.
-//!
-//! If another program commands the node (`listen_only`, or a recorded log), the counts per turn are
-//! those of its answers to that program, or the key, or those of its DCF file, or of an EDS file if
-//! they are constants there. With `configure = false` such a file, `eds`, also says which TPDO has
-//! the position, and where in it. If several have it, one makes the readings until another comes
-//! more than three times as often, or a better one as often: best is one by SYNC, of several the
-//! one of most SYNCs, else the first.
-//!
-//! Sources: CiA 301 4.2, CiA 306 1.3, CiA 406 3.2 as public drivers use it. Certain; makers differ
-//! in objects that they leave out: 6000 and 1017 may be missing, and 6200 replaces the timer.
-//!
-//! # Keys
-//! ```toml
-//! period_ms = 10          # 1 to 65535
-//! counts_per_turn = 8192  # default: the node's own
-//! sync = 0                # 1 to 240: after each n-th SYNC; 0: by its timer
-//! configure = true        # false: TPDO 1 is mapped already, and begins with the position
-//! eds = "encoder.eds"     # the maker's EDS or DCF file, relative to gateway.toml
-//! ```
+//! The driver `canopen_encoder`: CANopen encoders. What follows is its page of the book.
+#![doc = include_str!("../../docs/book/src/devices/canopen_encoder.md")]
 
 use crate::bringup::Bringup;
 use crate::bytes;
@@ -82,6 +38,7 @@ const BY_EVENT: u8 = 254;
 
 /// The keys of `driver = "canopen_encoder"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Period \[ms\], 1 to 65535; default 10.

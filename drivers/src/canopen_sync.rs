@@ -1,15 +1,5 @@
-//! Sends the SYNC of a CANopen bus: all nodes that are set to it measure at once, when it comes.
-//!
-//! It has no channel and no address. It sends `080` without data each `period_ms`, from the start
-//! of the gateway on; at most one device of a bus does. Nodes such as drives can do it too (their
-//! objects 1005 and 1006).
-//!
-//! Sources: CiA 301 4.2. Certain.
-//!
-//! # Keys
-//! ```toml
-//! period_ms = 10.0   # 0.5 to 1000, less than max_silence_ms
-//! ```
+//! The driver `canopen_sync`: The SYNC of a CANopen bus. What follows is its page of the book.
+#![doc = include_str!("../../docs/book/src/devices/canopen_sync.md")]
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::canopen::{self, SYNC};
@@ -24,6 +14,7 @@ use serde::Deserialize;
 
 /// The keys of `driver = "canopen_sync"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Period \[ms\], 0.5 to 1000; default 10.

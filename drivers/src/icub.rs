@@ -12,11 +12,7 @@
 //! asks board 10, `2A0` answers. In a streaming class there is no command byte. Most commands that
 //! set or start something are not acknowledged.
 //!
-//! After power-up these boards wait 5 s in their bootloader, and *any* frame on the bus makes them
-//! stay there. If boards are powered together with the host, set `power_on_silence_ms = 6000`: this
-//! host then stays silent that long at start and before each attempt to wake a silent board. It
-//! cannot keep other senders silent. A reading ends the wait at once, because a board that streams
-//! has left its bootloader.
+//! (Their silence after power-up: docs/book/src/devices/index.md.)
 //!
 //! # Recognition
 //! A scan sends DISCOVER to all boards (`70F`, `FF`), and GET_ADDITIONAL_INFO (`70a`, `0C`) to

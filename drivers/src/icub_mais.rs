@@ -1,31 +1,5 @@
-//! iCub MAIS boards: fifteen Hall sensors, usually of the joints of a hand.
-//!
-//! Streams of address `a`, class 3:
-//!
-//! | identifier | name | bytes | content |
-//! |---|---|---|---|
-//! | `3aC` | HES0TO6 | 7 | sensors 0 to 6 u8 |
-//! | `3aD` | HES7TO14 | 8 | sensors 7 to 14 u8 |
-//!
-//! - A sensor's number is the joint's `channel`. Its value is the field that it measures, in
-//!   counts: the upper 8 of 12 bits. **It is no angle**: `ratio` of the joint is the number of
-//!   counts per rad (with `sign` if they fall), `offset_rad` the angle at count 0. The board knows
-//!   nothing of either.
-//! - The frames are independent: each gives the readings of its own sensors.
-//! - The document says 7 bytes for `3aD`, which is a misprint: eight sensors need eight.
-//!
-//! Commands on `20a`, none of them answered: `10 02` resolution 8 bits, `08 ms` period, `07 00`
-//! start, `07 01` stop.
-//!
-//! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12 and
-//! `sensorReaderDspic30f4013/mais` (icub-firmware b4299211), `canBusAnalogSensor` (icub-main
-//! 24c1a003). Certain.
-//!
-//! # Keys
-//! ```toml
-//! period_ms = 10            # 1 to 255
-//! power_on_silence_ms = 0   # see `crate::icub`
-//! ```
+//! The driver `icub_mais`: iCub Hall sensors. What follows is its page of the book.
+#![doc = include_str!("../../docs/book/src/devices/icub_mais.md")]
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::bytes;
@@ -53,6 +27,7 @@ const RESOLUTION: u8 = 2;
 
 /// The keys of `driver = "icub_mais"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Period \[ms\], 1 to 255; default 10.

@@ -1,51 +1,5 @@
-//! Older iCub motor boards mc4 and bll: positions of two joints per address. (An mc4 has four
-//! joints: two devices, at its address and the next.)
-//!
-//! Streams of address `a`, little-endian, class 1:
-//!
-//! | identifier | name | bytes | content |
-//! |---|---|---|---|
-//! | `1a1` | POSITION | 8 | positions of joint 0 and 1, i32 \[ticks\] |
-//! | `1a7` | VELOCITY | 8 | velocities of joint 0 and 1, accelerations of both, i16 |
-//! | `1a3` | STATUS | 8 | faults, mode of joint 0; of joint 1; CAN; board; error counts, u8 |
-//!
-//! - A tick is a step of the joint's encoder: `ticks_per_turn`, in icub-main's files 360 times
-//!   `Encoder`. A step of velocity is 1000 / 2^`velocity_shift` ticks/s, the first number of
-//!   `JNT_speed_estimation`; another program sets it with command 0E.
-//! - The frames are sent at different instants: a velocity joins the positions that follow within
-//!   `hold_ms`, and is absent after that. Accelerations are too coarse and are not read.
-//! - `mode`: 0 idle, 1 position, 2 velocity, 3 torque, 50 open loop, 60 calibration, A0 hardware
-//!   fault, B0 not configured (hexadecimal).
-//!
-//! STATUS yields an actuator reading per joint, and sets the quality of the joint's readings after
-//! it. `faults` are those of the joint, and from bit 8 on those of the board that are the joint's:
-//!
-//! | fault | bits | effect on a joint reading |
-//! |---|---|---|
-//! | Hall sensors, absolute encoder, optical encoder | 4, 5, 6 | DEVICE_FAULT |
-//! | under-voltage, overload, external, over-current; unused | 0 to 3; 7 | DRIVE_FAULT |
-//! | board: over-temperature of joint 0, of joint 1 | 9, 10 | DRIVE_FAULT |
-//! | board: thermometer of joint 0, of joint 1 | 11, 12 | DRIVE_FAULT |
-//! | board: main loop too long | 8, never set | none |
-//! | mode A0 | `mode` | DRIVE_FAULT |
-//! | modes 60, B0 | `mode` | NOT_CALIBRATED |
-//!
-//! Another program commands these boards, and makes them stream (command 49, a mask of types). This
-//! driver never transmits; it only detects silence.
-//!
-//! Sources: `CanBusMotionControl.cpp` (icub-main 24c1a003), `iCubCanProto_motorControlMessages.h`
-//! and `iCubCanProto_types.h` (icub-firmware-shared 62f2818a), the boards' firmware (icub-firmware
-//! b4299211). Certain: firmware and host agree; a parser in comments has velocities and
-//! accelerations in turn, which is wrong. Highly probable: STATUS (the host alone); that positions
-//! are no joint angles in calibration.
-//!
-//! # Keys
-//! ```toml
-//! ticks_per_turn = [65536.0, 65536.0]  # of joint 0 and 1
-//! velocity_shift = [5, 5]              # 0 to 15
-//! hold_ms = 20                         # how long a velocity is used, 1 to 1000
-//! period_ms = 10                       # 1 to 255; used by the simulated board
-//! ```
+//! The driver `icub_mc4`: Older iCub motor boards. What follows is its page of the book.
+#![doc = include_str!("../../docs/book/src/devices/icub_mc4.md")]
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::bytes;
@@ -98,6 +52,7 @@ const MODES: [u8; 8] = [0x00, 0x01, 0x02, 0x03, 0x50, 0x60, 0xA0, 0xB0];
 
 /// The keys of `driver = "icub_mc4"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Ticks in a turn of each joint; default 65536.

@@ -1,64 +1,5 @@
-//! iCub motor boards 2foc, amcbldc, amc2c and amcfoc: position, velocity and current of the motor
-//! shaft, status and faults.
-//!
-//! Streams of address `a`, little-endian, class 1:
-//!
-//! | identifier | name | bytes | content |
-//! |---|---|---|---|
-//! | `1a0` | 2FOC | 8 | current i16 \[mA\], velocity i16 \[icubdeg/ms\], position i32 \[icubdeg\] |
-//! | `1a3` | STATUS | 8 | mode u8, encoder u8, duty i16 (32000 is 1), faults u32 |
-//! | `1aC` | ADDITIONAL_STATUS | 4 | 2 bytes unused, motor temperature i16, raw |
-//! | `1a5` | OVERFLOW | any | the board lost frames that it should have received |
-//!
-//! - 1 icubdeg = 360 / 65536 deg = 0.0054931640625 deg, of the *motor shaft*: `ratio` in the
-//!   joint's table makes it the joint's. A step of velocity is 5.4931640625 deg/s of the shaft.
-//! - The scale of the motor temperature is not documented: the frame's length is checked, but it
-//!   yields no reading.
-//! - `mode`: 0 idle, 1 position, 6 current, 9 forced idle, 0x0A voltage, 0x50 open loop, 0xA0
-//!   hardware fault, 0xB0 not configured.
-//! - `encoder`, bits: 0 dirty, 1 stuck, 2 index broken, 3 phase broken, 4 not calibrated.
-//!
-//! STATUS yields an actuator reading and sets the quality of the joint readings after it. A fault
-//! belongs to what it spoils:
-//!
-//! | fault | bits | effect on a joint reading |
-//! |---|---|---|
-//! | encoder: dirty, stuck, index or phase broken | `encoder` 0 to 3 | DEVICE_FAULT |
-//! | Hall sensors: impossible order, impossible state | `faults` 1, 3 | DEVICE_FAULT |
-//! | absolute encoder: checksum, calculation | 2, 17 | DEVICE_FAULT |
-//! | SPI timing (the bus to the encoder) | 18 | DEVICE_FAULT |
-//! | position encoder | 19 | DEVICE_FAULT |
-//! | over-current, over-voltage, under-voltage | 4, 5, 6 | DRIVE_FAULT |
-//! | external (emergency stop), over-heating | 7, 9 | DRIVE_FAULT |
-//! | set point expired | 14 | DRIVE_FAULT |
-//! | PWM fatal, I2t, ADC calibration | 16, 22, 23 | DRIVE_FAULT |
-//! | EMU ROM, its checksum | 20, 21 | DRIVE_FAULT |
-//! | position limits | 24, 25 | DRIVE_FAULT |
-//! | silicon revision; unused | 26; 8 | DRIVE_FAULT |
-//! | illegal command | 0 | DRIVE_FAULT |
-//! | bus states, overrun, length, remote | 10 to 13, 15, 27 to 31 | none |
-//! | mode 0xA0, hardware fault | `mode` | DRIVE_FAULT |
-//! | encoder not calibrated | `encoder` 4 | NOT_CALIBRATED |
-//! | mode 0xB0, not configured | `mode` | NOT_CALIBRATED |
-//!
-//! Debatable: under-voltage is that of the motor's supply; an encoder that suffers from it has bits
-//! of its own. The ADC measures currents: with bit 23 the *current* is doubtful, the position is
-//! not. Bits 24 and 25 say where the joint is, which is only known because the position is good.
-//! The mode 0xA0 follows from a fault that has its own bit: if that is an encoder's, the bit
-//! condemns the position. Hall sensors count as encoders: they measure the same shaft, and which of
-//! two is wrong is open.
-//!
-//! Another program commands these boards once a millisecond (`10F`, four target currents, which
-//! triggers the answers above). This driver never transmits; it only detects silence.
-//!
-//! Sources: `TSD-ICUBUNIT-canprotocol-motorboards.docx` (icub-firmware b4299211),
-//! `iCubCanProto_motorControlMessages.h` (icub-firmware-shared 62f2818a). Certain.
-//!
-//! # Keys
-//! ```toml
-//! period_ms = 1      # 1 to 255; set by its commander; used by the simulated board
-//! velocity = true    # false: ignore the board's velocity (coarse if `ratio` is small), encode 0
-//! ```
+//! The driver `icub_motor`: iCub 2FOC motor boards. What follows is its page of the book.
+#![doc = include_str!("../../docs/book/src/devices/icub_motor.md")]
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::bytes;
@@ -154,6 +95,7 @@ const DUTY_PER_LSB: f64 = 1.0 / 32000.0;
 
 /// The keys of `driver = "icub_motor"`.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Period of its commander's requests \[ms\], 1 to 255; default 1.

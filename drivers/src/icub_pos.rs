@@ -1,47 +1,5 @@
-//! iCub POS encoders (boards psc and mtb4fap): angles of finger joints, or lengths.
-//!
-//! Stream of address `a`, little-endian, class 3:
-//!
-//! | identifier | name | bytes | content |
-//! |---|---|---|---|
-//! | `3a1` | POS | 8 | type u8, label << 4 \| n, then three values i16 of which the first n count |
-//!
-//! - Type 0: 0.1 deg; type 1: 0.1 mm. Value k belongs to label + k: that is the `channel` of a
-//!   joint.
-//! - A psc sends both its sensors in one frame, n = 2.
-//!
-//! Commands on `20a`:
-//!
-//! | bytes | meaning | answer on `2a0` |
-//! |---|---|---|
-//! | `52 id<<4\|type S0 S1` | configuration of sensors S0, S1 | none |
-//! | `51 type` | get the configuration | `51 type S0 S1` |
-//! | `53 ms` | period, 0 stops | none |
-//!
-//! S: enabled, inverted, rotation (2 bits: 0, 180, 90, -90 deg), label (4 bits), zero (i16, 0.1
-//! deg). The board then sends ((v + rotation) mod 360 deg) - ((zero + rotation) mod 360 deg),
-//! negated if inverted.
-//!
-//! A lost configuration would leave a board with another zero, and its angles would be plausible
-//! and wrong. Therefore the driver reads the configuration back and repeats it until both agree.
-//! Until then readings are NOT_CALIBRATED, and they remain so if the board does not answer or never
-//! agrees (counted as changed). Without the key `sensors` nothing is configured, and angles are
-//! good at once.
-//!
-//! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12,
-//! `embot_prot_can_analog_periodic.cpp` (icub-firmware b4299211). Certain, except the bytes of
-//! `51`: the firmware's messages hold a type in the question, a type and both sensors in the
-//! answer; it is highly probable that these lie where `52` has them. An mtb4fap answers without its
-//! sensors: do not use `sensors` for it.
-//!
-//! # Keys
-//! ```toml
-//! period_ms = 10            # 1 to 255
-//! quantity = "angle"        # "angle" (rad) or "length" (m): the quantity that the board sends
-//! power_on_silence_ms = 0   # see `crate::icub`
-//! # Configuration of a psc's one or two sensors; without it the board keeps its own.
-//! sensors = [{ label = 0, inverted = false, rotation_deg = 0, zero_deg = 0.0 }, { label = 1 }]
-//! ```
+//! The driver `icub_pos`: iCub POS encoders. What follows is its page of the book.
+#![doc = include_str!("../../docs/book/src/devices/icub_pos.md")]
 
 use crate::bringup::Bringup;
 use crate::bytes;
@@ -73,6 +31,7 @@ const METRE_PER_LSB: f64 = 1e-4;
 
 /// What a POS board measures.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Quantity {
     /// Angles \[rad\].
@@ -94,6 +53,7 @@ impl Quantity {
 
 /// The configuration of one sensor of a board.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Sensor {
     /// Its label, which is the joint's channel.
@@ -148,6 +108,7 @@ impl Sensor {
 
 /// The keys of `driver = "icub_pos"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Period \[ms\], 1 to 255; default 10.

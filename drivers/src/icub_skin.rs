@@ -1,44 +1,5 @@
-//! iCub skin: the triangles of boards mtb, mtb4 and mtb4c, twelve taxels each.
-//!
-//! Streams of address `a`, class 4, triangle T = 0 to 15, two frames each:
-//!
-//! | identifier | bytes | content |
-//! |---|---|---|
-//! | `4aT` | 8 | `40`, taxels 0 to 6 u8 |
-//! | `4aT` | 8 | `C0`, taxels 7 to 11 u8, out of range bits 11:4, bits 3:0 << 4 \| flags |
-//!
-//! - A taxel's capacitance falls with the pressure on it. Its value is `no_load` minus the byte: 0
-//!   without a load, more with pressure, in counts. (A calibration to N/m2 depends on the skin's
-//!   fabric and is not part of the protocol.)
-//! - Taxels 6 and 10 measure the temperature of the patch, no pressure: not a number, as is a taxel
-//!   that the board reports out of range.
-//! - Flags: bit 0 the triangle's chip does not answer, bit 1 it is not connected. Such readings
-//!   have DEVICE_FAULT.
-//! - The two frames have no sequence number: they are paired by order and time (`pairing.rs`), per
-//!   triangle. The reading's `triangle` is T.
-//!
-//! Commands on `20a`, none of them answered:
-//!
-//! | bytes | meaning |
-//! |---|---|
-//! | `4D comp ms no_load` | compensation, period, value without load |
-//! | `50 first last shift 01 low high` | triangles in use, shift of the raw value, offset (i16) |
-//! | `07 00`, `07 01` | start, stop |
-//!
-//! Sources: `TSD-ICUBUNIT-canprotocol-sensorboards.docx` v1.12 (icub-firmware b4299211),
-//! `canBusSkin` (icub-main 24c1a003). Certain, except the thermal taxels and the shift and offset
-//! of `50`, which are the values that icub-main's configurations send.
-//!
-//! # Keys
-//! ```toml
-//! period_ms = 50                # 1 to 255; 16 triangles take 3 to 4 ms of the bus
-//! triangles = [0, 15]           # first and last
-//! no_load = 245                 # a taxel's byte without load
-//! compensation = "temperature"  # "temperature", "palm", "none" or "raw"
-//! pair_timeout_ms = 25.3        # longest time from the first to the second frame of a triangle;
-//!                               # default: half a period plus 0.3 ms
-//! power_on_silence_ms = 0       # see `crate::icub`
-//! ```
+//! The driver `icub_skin`: iCub skin. What follows is its page of the book.
+#![doc = include_str!("../../docs/book/src/devices/icub_skin.md")]
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::bytes;
@@ -70,6 +31,7 @@ const FAULTS: u8 = 0b11;
 
 /// How the board compensates its taxels.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Compensation {
     /// By the thermal taxels.
@@ -96,6 +58,7 @@ impl Compensation {
 
 /// The keys of `driver = "icub_skin"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Period \[ms\], 1 to 255; default 50.

@@ -88,6 +88,9 @@ pub mod recognise;
 mod registry;
 pub mod robotous_rft;
 pub mod robstride;
+#[cfg(test)]
+#[path = "../../tests/schema.rs"]
+mod schema;
 pub mod signal;
 mod unit;
 pub mod vesc;

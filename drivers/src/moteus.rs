@@ -1,55 +1,5 @@
-//! moteus controllers (mjbots) on CAN FD: position, velocity and torque at the output.
-//!
-//! The address is the controller's, 1 to 127. A controller sends nothing by itself: the driver asks
-//! each `period_ms`. Frames are CAN FD with the higher bit rate; the bus must carry it (1 Mbit/s, 5
-//! Mbit/s for the data). Identifiers are source << 8 | destination, extended above 7FF; bit 15 asks
-//! for a reply:
-//!
-//! | identifier | content |
-//! |---|---|
-//! | `8000` \| host << 8 \| address | query: `11 00 1F 01 13 0D` |
-//! | address << 8 \| host | reply |
-//!
-//! A frame is a sequence of subframes; numbers are little-endian:
-//!
-//! | opcode | meaning |
-//! |---|---|
-//! | `10` + type + count | read: register |
-//! | `20` + type + count | reply: register, values |
-//! | `30`, `31` | write or read error: register, code |
-//! | `50` | nothing: fills the frame up to a legal length |
-//!
-//! - Type: 0 i8, 4 i16, 8 i32, C f32. Count: the two low bits, 1 to 3 registers from this one on;
-//!   0: the count follows as a varuint. Registers and codes are varuints.
-//! - Registers: 0 mode, 1 position \[turn\], 2 velocity \[turn/s\], 3 torque \[Nm\], D voltage, E
-//!   temperature \[deg C\], F fault. One step is, as i8, i16, i32: position 0.01, 1e-4, 1e-5;
-//!   velocity 0.1, 2.5e-4, 1e-5; torque 0.5, 0.01, 0.001; temperature 1, 0.1, 0.001. The lowest
-//!   integer means not a number.
-//! - Any type is read, so another program may ask (`listen_only`, or a recorded log). A reply
-//!   without the position is no reading of the joint.
-//! - Mode 1, fault: DRIVE_FAULT. Faults 35 (encoder), 36 (not configured), 42 (theta invalid) and
-//!   43 (position invalid) make the position doubtful: DEVICE_FAULT. They are the `faults` of the
-//!   actuator reading, the mode is its `mode`.
-//! - A joint reading comes with each reply; the actuator's if its mode or fault is new, and it and
-//!   the temperature once a second.
-//!
-//! A reply without an open query is an old one: it is dropped and counted as unexpected, but for a
-//! driver that only listens.
-//!
-//! The driver never commands: it reads registers, and sends nothing at the end.
-//!
-//! Sources: `docs/protocol/can.md` and `registers.md` (moteus db1a7623). Certain: the tests compare
-//! with the package `moteus` 1.1.1.
-//!
-//! # Recognition
-//! A scan that asks sends the query above, from host 0, to all numbers: on a bus with CAN FD alone.
-//! Without questions controllers are recognised by the form of their replies to another program.
-//!
-//! # Keys
-//! ```toml
-//! period_ms = 2     # of the queries, 1 to 1000
-//! host = 0          # the host's own address, 0 to 127
-//! ```
+//! The driver `moteus`: moteus controllers. What follows is its page of the book.
+#![doc = include_str!("../../docs/book/src/devices/moteus.md")]
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes::{self, i16_le, u32_le};
@@ -98,6 +48,7 @@ const TOO_HOT: f64 = 38.0;
 
 /// The keys of `driver = "moteus"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Period of the queries \[ms\], 1 to 1000; default 2.

@@ -83,6 +83,15 @@ macro_rules! drivers {
             all
         }
 
+        /// Each driver's keys, as a schema.
+        #[cfg(test)]
+        fn schemas() -> Vec<(&'static str, serde_json::Value)> {
+            [$((
+                <$module::Options as Driver>::NAME,
+                crate::schema::of::<$module::Options>(),
+            )),+].into()
+        }
+
         /// A driver with its keys.
         #[derive(Debug, Clone, PartialEq)]
         #[non_exhaustive]
@@ -283,5 +292,46 @@ fn check_joints(spec: &Spec, outputs: &[OutputInfo]) -> Result<(), SpecError> {
             most,
         }),
         None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::schema;
+    use serde_json::{Value, json};
+    use std::format;
+
+    /// `definitions/<driver>` is the schema of a device of that driver: its keys, and those of all
+    /// devices, which are the gateway's.
+    #[test]
+    fn the_reference_of_the_keys_of_devices_is_new() {
+        schema::check("gateway.schema.json", |old| {
+            let mut made = old.clone();
+            let definitions = schema::entries(&mut made, "definitions");
+            let device = definitions.entry("device").or_insert_with(|| json!({}));
+            let common = schema::entries(device, "properties").clone();
+            for (driver, mut schema) in schemas() {
+                if let Some(object) = schema.as_object_mut() {
+                    object.remove("$schema");
+                    object.remove("title");
+                    let required = object.entry("required").or_insert_with(|| json!([]));
+                    let required = required.as_array_mut().expect("a list");
+                    required.extend(["driver", "name"].map(Value::from));
+                }
+                let keys = schema::entries(&mut schema, "properties");
+                for key in common.keys() {
+                    assert!(
+                        !keys.contains_key(key),
+                        "{driver}: {key} is a key of every device"
+                    );
+                    let place = format!("#/definitions/device/properties/{key}");
+                    keys.insert(key.clone(), json!({ "$ref": place }));
+                }
+                keys.insert("driver".into(), json!({ "const": driver }));
+                definitions.insert(driver.into(), schema);
+            }
+            made
+        });
     }
 }

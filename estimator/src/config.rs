@@ -27,6 +27,7 @@ pub struct ConfigError {
 
 /// The whole file.
 #[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// The version of the file format: 1.
@@ -72,6 +73,7 @@ pub struct Config {
 
 /// How a thread is scheduled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Realtime {
     /// The processor it is bound to.
@@ -82,6 +84,7 @@ pub struct Realtime {
 
 /// Where kinematics start.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
 pub enum Base {
     /// A link at rest. It implies an unknown wrench on that link: the ground reaction.
@@ -115,6 +118,7 @@ pub enum Base {
 
 /// A link that is at rest while its contact is present.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(deny_unknown_fields)]
 pub struct Foot {
     /// The link or folded frame.
@@ -152,6 +156,7 @@ const fn standard_gravity() -> [f64; 3] {
 
 /// A force/torque sensor.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ForceTorque {
     /// Its channel.
@@ -231,6 +236,7 @@ const fn default_noise_nm() -> [f64; 3] {
 
 /// The measurement frame of a force/torque sensor: axes and origin of its reading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "lowercase")]
 pub enum SensorFrame {
     /// The child link's.
@@ -243,6 +249,7 @@ pub enum SensorFrame {
 
 /// The measurement direction of a force/torque sensor: which link acts on which.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Direction {
     /// By the child on the parent: reading = -(wrench by the parent on the child) + offset.
@@ -253,6 +260,7 @@ pub enum Direction {
 
 /// An unknown external wrench.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Contact {
     /// Its name in tables and services; default: `link`.
@@ -277,6 +285,7 @@ pub struct Contact {
 
 /// How many unknowns a contact has.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum ContactKind {
     /// A force and a torque: 6.
@@ -290,6 +299,7 @@ pub enum ContactKind {
 
 /// Whether a contact is always there.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "lowercase")]
 pub enum Presence {
     /// It is always present, unless it is declared absent.
@@ -303,6 +313,7 @@ pub enum Presence {
 /// A patch of tactile skin ([`crate::skin`]): while it is touched, its contact is present, at the
 /// place of the touch.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Skin {
     /// Its channel.
@@ -349,14 +360,17 @@ const fn default_skin_silence_ms() -> f64 {
 
 /// `[identification]`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Identification {
     /// Whether parameters are identified on-line.
     pub enabled: bool,
     /// From which measurements; default: the force/torque sensors. On-line they alone are used.
+    #[cfg_attr(test, schemars(with = "Vec<elsewhere::IdentificationInput>"))]
     pub inputs: Vec<IdentificationInput>,
     /// Where the joint torques used for identification are measured; default: on the link side of
     /// the gears.
+    #[cfg_attr(test, schemars(with = "elsewhere::TorqueSide"))]
     pub torque_side: TorqueSide,
     /// Largest rate of on-line identification instants \[Hz\]; the trigger's rate if that is less.
     pub rate_hz: f64,
@@ -373,6 +387,7 @@ pub struct Identification {
     pub urdf_relative_std: f64,
     /// Whether `proprio identify` also identifies the gain error of each force/torque sensor, and
     /// which entries of it.
+    #[cfg_attr(test, schemars(with = "elsewhere::Gain"))]
     pub gain: Gain,
     /// Prior standard deviation of a gain error, relative. It holds for diagonal entries, and for
     /// force-force and torque-torque cross-talk. For cross-talk of a torque into a force it is
@@ -406,6 +421,7 @@ impl Default for Identification {
 
 /// `[differentiation]`: velocities and accelerations from samples, by adaptive windows.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Differentiation {
     /// Peak noise of a joint position: at least half its resolution \[rad or m\].
@@ -430,6 +446,7 @@ impl Default for Differentiation {
 
 /// `[input]`: how samples are accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Input {
     /// Longest time without a sample of a channel \[ms\]; after it, estimates that depend on the
@@ -447,6 +464,7 @@ impl Default for Input {
 
 /// `[output]`: when and what is published.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Output {
     /// The trigger channel: each of its stamps gives one estimate. Default: the first force/torque
@@ -467,6 +485,7 @@ pub struct Output {
 
 /// When an estimate is made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "lowercase")]
 pub enum Timing {
     /// Once every channel has a sample of the trigger's stamp or later, or after `max_wait_ms`.
@@ -765,9 +784,54 @@ impl Contact {
     }
 }
 
+/// The words of other crates' types, for the reference. Each list is complete, or does not compile.
+#[cfg(test)]
+#[allow(dead_code)] // only their description is used
+mod elsewhere {
+    use schemars::JsonSchema;
+    use serde::Serialize;
+
+    #[derive(JsonSchema, Serialize)]
+    #[serde(remote = "super::Gain", rename_all = "lowercase")]
+    pub(super) enum Gain {
+        /// All 36 where there is a sensor: the prior keeps those that the logs do not determine.
+        Auto,
+        /// None: the factory gain is correct.
+        None,
+        /// One for each channel.
+        Diagonal,
+        /// All 36.
+        Full,
+    }
+
+    #[derive(JsonSchema, Serialize)]
+    #[serde(remote = "super::IdentificationInput", rename_all = "lowercase")]
+    pub(super) enum IdentificationInput {
+        /// The force/torque sensors.
+        Wrench,
+        /// Measured joint torques.
+        Torque,
+    }
+
+    #[derive(JsonSchema, Serialize)]
+    #[serde(remote = "super::TorqueSide", rename_all = "lowercase")]
+    pub(super) enum TorqueSide {
+        /// Between gear and link, by a joint torque sensor. The rotor's inertia is not included.
+        Link,
+        /// At the motor: current times torque constant and gear ratio. The rotor's inertia is
+        /// included and identified.
+        Motor,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_reference_of_estimator_toml_is_new() {
+        crate::schema::check("estimator.schema.json", |_| crate::schema::of::<Config>());
+    }
 
     const ARM: &str = r#"
         schema = 1

@@ -56,5 +56,8 @@ pub mod pipeline;
 mod plausible;
 pub mod propagation;
 pub mod reading;
+#[cfg(test)]
+#[path = "../../tests/schema.rs"]
+mod schema;
 pub mod setup;
 pub mod skin;

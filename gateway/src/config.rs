@@ -9,6 +9,7 @@ use toml::Spanned;
 
 /// The whole file.
 #[derive(Debug, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Raw {
     /// The version of the file format: 1.
@@ -22,13 +23,15 @@ pub struct Raw {
 
 /// `[[bus]]`.
 #[derive(Debug, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct RawBus {
-    /// Its name.
+    /// The bus's name, in messages and in `proprio status`.
     pub name: String,
     /// The source of its frames.
     pub source: Source,
-    /// Its bit rate \[bit/s\]; that of the arbitration phase for CAN FD.
+    /// Its bit rate \[bit/s\]; that of the arbitration phase for CAN FD. It is used to compute the
+    /// load, where the interface does not tell it; it is not set.
     pub bit_rate: Option<u32>,
     /// The bit rate of the data phase of CAN FD \[bit/s\].
     pub data_bit_rate: Option<u32>,
@@ -39,6 +42,7 @@ pub struct RawBus {
     pub listen_only: bool,
     /// `[[bus.device]]`: common keys and the driver's own keys in one table.
     #[serde(default)]
+    #[cfg_attr(test, schemars(with = "Vec<RawDevice>"))]
     pub device: Vec<Spanned<toml::Table>>,
     /// `[[bus.coupling]]`: joints that several motors move together.
     #[serde(default)]
@@ -47,6 +51,7 @@ pub struct RawBus {
 
 /// The source of a bus's frames.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
 pub enum Source {
     /// A CAN interface of the kernel: `interface = "can0"`, or its adapter by `serial = "..."` or
@@ -55,7 +60,7 @@ pub enum Source {
     SocketCan(Adapter),
     /// The virtual bus on the loopback interface.
     Virtual {
-        /// Its name.
+        /// The bus's name: all programs of a domain that name it hear each other.
         name: String,
     },
     /// A recorded log, of any format of [`crate::log`].
@@ -73,6 +78,7 @@ pub enum Source {
 
 /// The speed of a replay.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "lowercase")]
 pub enum Pace {
     /// As recorded; stamps are shifted to the present.
@@ -84,6 +90,7 @@ pub enum Pace {
 
 /// Scheduling of a thread.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Realtime {
     /// The processor it is bound to.
@@ -94,14 +101,18 @@ pub struct Realtime {
 
 /// The keys common to all devices.
 #[derive(Debug, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 pub struct RawDevice {
-    /// The driver's name.
+    /// The driver's name: a page of the book.
     pub driver: String,
-    /// Its name; for a sensor also the channel's name.
+    /// The device's name, in messages and in `proprio status`; for a sensor also the name of its
+    /// channel, which `estimator.toml` reads.
     pub name: String,
-    /// Its address, as the driver defines it.
+    /// Its address, as the driver defines it: the page of the driver tells. Some drivers have a
+    /// default.
     pub address: Option<u32>,
-    /// Maximum silence \[ms\].
+    /// Maximum silence \[ms\]: after so long without a reading the device is `silent`, and it is
+    /// started again.
     #[serde(default = "default_max_silence_ms")]
     pub max_silence_ms: f64,
     /// Never send to it: another program commands it.
@@ -131,18 +142,19 @@ const fn default_max_silence_ms() -> f64 {
 /// `[[bus.device.joint]]`: the joint, or the motor of a coupling, that a channel of the device
 /// measures: joint = sign * device / ratio + offset.
 #[derive(Debug, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct RawJoint {
     /// The name of the joint, or of the motor. Several devices of a bus may measure one joint if
     /// `takes` says which gives what.
     pub name: String,
-    /// The device's channel.
+    /// The device's channel, of a device that measures several joints: the driver's page tells.
     #[serde(default)]
     pub channel: u8,
-    /// Gear ratio: device angle per joint angle.
+    /// Gear ratio: how far the device turns while the joint turns by one.
     #[serde(default = "one")]
     pub ratio: f64,
-    /// 1 or -1.
+    /// 1, or -1 if the device counts the other way than the axis of the URDF.
     #[serde(default = "plus")]
     pub sign: i8,
     /// The joint's angle where the device reports zero \[rad\].
@@ -165,6 +177,7 @@ pub struct RawJoint {
 
 /// A quantity that a device measures of a joint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "lowercase")]
 pub enum Quantity {
     /// `"position"`.
@@ -182,6 +195,7 @@ pub enum Quantity {
 /// `[[bus.coupling]]`: joints = matrix * motors. Velocities and accelerations follow the same
 /// matrix, torques the transpose of its inverse: power is conserved.
 #[derive(Debug, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct RawCoupling {
     /// The joints' names.
@@ -201,4 +215,41 @@ const fn one() -> f64 {
 
 const fn plus() -> i8 {
     1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::schema;
+    use proprio_drivers::DRIVERS;
+    use serde_json::json;
+
+    /// All but the definitions of devices of one driver, which are the drivers' part.
+    #[test]
+    fn the_reference_of_gateway_toml_is_new() {
+        schema::check("gateway.schema.json", |old| {
+            let mut made = schema::of::<Raw>();
+            let mut device = json!({ "oneOf": [] });
+            let place = "/properties/bus/items/properties/device/items";
+            if let Some(place) = made.pointer_mut(place) {
+                std::mem::swap(place, &mut device);
+            }
+            let one_of: Vec<_> = (DRIVERS.iter())
+                .map(|driver| json!({ "$ref": format!("#/definitions/{driver}") }))
+                .collect();
+            made.pointer_mut(place).expect("devices")["oneOf"] = one_of.into();
+            let names = schema::entries(&mut device, "properties").keys();
+            assert!(
+                names.eq(RawDevice::KEYS
+                    .iter()
+                    .collect::<std::collections::BTreeSet<_>>())
+            );
+            let definitions = schema::entries(&mut made, "definitions");
+            definitions.insert("device".into(), device);
+            for driver in DRIVERS {
+                definitions.insert((*driver).into(), old["definitions"][*driver].clone());
+            }
+            made
+        });
+    }
 }

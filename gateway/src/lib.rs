@@ -47,6 +47,9 @@ pub mod plan;
 pub mod publish;
 mod reload;
 pub mod scan;
+#[cfg(test)]
+#[path = "../../tests/schema.rs"]
+mod schema;
 pub mod status;
 mod thread;
 mod watch;

@@ -8,7 +8,7 @@ mod wiring;
 mod words;
 
 pub use crate::joints::JointMap;
-pub(crate) use words::did_you_mean;
+pub use words::did_you_mean;
 
 use crate::config::{Pace, Raw, RawBus, RawDevice, RawJoint, Realtime, Source};
 use crate::joints::{CouplingPlan, Feed, Layout, Takes, Target};

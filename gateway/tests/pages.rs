@@ -1,5 +1,5 @@
-//! The page of each driver, which is the first comment of its file: its keys load, all of them are
-//! there, and it says where it comes from.
+//! The page of each driver in the book: its keys load, all of them are there, and it says where it
+//! comes from.
 #![allow(missing_docs, clippy::unwrap_used, clippy::panic)]
 
 use proprio_drivers::DRIVERS;
@@ -15,17 +15,12 @@ fn source(file: &str) -> String {
 
 /// The page of a driver.
 fn page(driver: &str) -> String {
-    let text = source(&format!("{driver}.rs"));
-    let lines = text.lines().map_while(|line| line.strip_prefix("//!"));
-    lines
-        .map(|line| line.strip_prefix(' ').unwrap_or(line))
-        .collect::<Vec<_>>()
-        .join("\n")
+    source(&format!("../../docs/book/src/devices/{driver}.md"))
 }
 
 /// Its block of keys.
 fn keys(page: &str) -> &str {
-    let (_, keys) = page.split_once("# Keys\n```toml\n").unwrap_or_default();
+    let (_, keys) = page.split_once("## Keys\n```toml\n").unwrap_or_default();
     keys.split("```").next().unwrap_or_default()
 }
 
@@ -148,20 +143,24 @@ fn each_key_is_on_its_page() {
     assert!(count > 40, "{count}");
 }
 
-/// README.md lists every driver.
+/// The book lists every driver, and so does the library.
 #[test]
-fn the_readme_names_each_driver() {
-    let readme = Path::new(env!("CARGO_MANIFEST_DIR")).join("../README.md");
-    let readme = std::fs::read_to_string(readme).unwrap();
+fn the_lists_name_each_driver() {
+    let list = source("../../docs/book/src/devices/index.md");
     let library = source("lib.rs");
     for driver in DRIVERS {
         assert!(
-            readme.contains(&format!("`{driver}`")),
-            "README.md: {driver}"
+            list.contains(&format!("[`{driver}`]({driver}.md)")),
+            "the book: {driver}"
         );
         assert!(
             library.contains(&format!("[`{driver}`]")),
             "lib.rs: {driver}"
+        );
+        let module = source(&format!("{driver}.rs"));
+        assert!(
+            module.contains(&format!("/devices/{driver}.md\")]")),
+            "{driver}.rs: its page"
         );
     }
 }

@@ -191,7 +191,7 @@ def test_a_killed_daemon_is_missed_and_found_again(arm, name):
         until("both", lambda: robot.who_is_missing().is_nobody)
 
 
-@pytest.mark.parametrize("page", ["python/README.md", "docs/reading.md"])
+@pytest.mark.parametrize("page", ["python/README.md", "docs/book/src/read/python.md"])
 def test_the_pages_first_program(arm, page):
     program = (TREE / page).read_text().split("```python\n")[1].split("```")[0]
     done = subprocess.run(

@@ -96,7 +96,8 @@ def test_the_commands_words_are_the_error(tmp_path):
 
 
 def test_the_pages_program_on_files(tmp_path, monkeypatch):
-    program = (TREE / "docs/reading.md").read_text().split("```python\n")[2].split("```")[0]
+    page = (TREE / "docs/book/src/read/python.md").read_text()
+    program = page.split("```python\n")[2].split("```")[0]
     for name in ("estimator.toml", "cad.urdf"):
         (tmp_path / name).write_bytes((SESSIONS / name).read_bytes())
     for to, of in ("a", "train"), ("b", "validate"), ("c", "validate"):

@@ -12,7 +12,7 @@ PACKAGE = TREE / "python"
 def test_types_are_strict(tmp_path):
     """Those of the package, and the pages' programs that use them."""
     programs = []
-    for page in (PACKAGE / "README.md", TREE / "docs" / "reading.md"):
+    for page in (PACKAGE / "README.md", TREE / "docs/book/src/read/python.md"):
         for program in page.read_text().split("```python\n")[1:]:
             path = tmp_path / f"program_{len(programs)}.py"
             path.write_text(program.split("```")[0])

@@ -85,6 +85,9 @@ const CONFINED: [(&str, &[&str]); 7] = [
     ("ratatui*", &["proprio-cli"]),
 ];
 
+/// Libraries of tests alone, whoever uses them: they describe and check documents.
+const IN_TESTS: [&str; 3] = ["schemars", "clap_mangen", "pulldown-cmark"];
+
 /// The parts of iceoryx2 that topics may use without its feature `ipc`: they are no_std and open
 /// nothing.
 const ALWAYS_IN_TOPICS: [&str; 2] = ["iceoryx2-bb-elementary-traits", "iceoryx2-bb-derive-macros"];
@@ -284,6 +287,9 @@ fn escaped_libraries(metadata: &Value) -> Vec<String> {
             if owners.is_some_and(|owners| !owners.contains(&name)) {
                 wrong.push(format!("{name} -> {to}"));
             }
+            if IN_TESTS.contains(&to) && dependency["kind"] != "dev" {
+                wrong.push(format!("{name} -> {to} outside tests"));
+            }
             // Identification uses types of topics, but neither ports nor tables.
             if name == "proprio-identification"
                 && to == "proprio-topics"
@@ -397,6 +403,9 @@ fn libraries_with_one_owner_stay_with_it() {
                 dependencies.push(
                     serde_json::json!({ "name": "nalgebra", "kind": "dev", "optional": false }),
                 );
+                dependencies.push(
+                    serde_json::json!({ "name": "schemars", "kind": null, "optional": true }),
+                );
             }
             "proprio-topics" => {
                 dependencies
@@ -419,6 +428,7 @@ fn libraries_with_one_owner_stay_with_it() {
             "proprio-cli -> socketcan",
             "proprio-gateway -> iceoryx2",
             "proprio-gateway -> nalgebra",
+            "proprio-gateway -> schemars outside tests",
             "proprio-topics -> iceoryx2 without the feature ipc",
             "proprio-topics: feature csv takes dep:iceoryx2-bb-container",
         ]

@@ -331,6 +331,10 @@ fn every_verb_has_help() {
         }
     }
     assert!(place.run(&["--version"]).good().out.starts_with("proprio "));
+    let page = place.run(&["help", "unexplained"]).good();
+    assert!(page.out.starts_with("## `unexplained`\n"), "{}", page.out);
+    let script = place.run(&["completions", "bash"]).good();
+    assert!(script.out.contains("identify"));
 }
 
 #[test]
@@ -340,6 +344,8 @@ fn typing_mistakes_end_with_2_and_say_what_was_meant() {
         (&["decod"][..], "decode"),
         (&["gateway", "--confg", "x"], "--config"),
         (&["gateway"], "--config <FILE>"),
+        (&["help", "unexplaned"], "did you mean \"unexplained\"?"),
+        (&["help", "ctl", "tar"], "`proprio help ctl`"),
         (
             &["estimate", "--config", "estimator.toml"],
             "--samples <FILE>",

@@ -273,7 +273,7 @@ fn the_documents_programs_compile() {
     let Some(library) = Library::install(&rig) else {
         return;
     };
-    let page = fs::read_to_string(root().join("docs/reading.md")).expect("the page");
+    let page = fs::read_to_string(root().join("docs/book/src/read/c.md")).expect("the page");
     let mut compiled = 0;
     for (language, compiler) in [("c", ["gcc", "-std=c99"]), ("cpp", ["g++", "-std=c++17"])] {
         for block in page.split("```").skip(1).step_by(2) {

@@ -3,7 +3,7 @@
 
 use proprio_tests::truth::{Outcome, Run, TROUBLES};
 
-/// What is not found yet, or not in all runs: docs/figures.md has the table.
+/// What is not found yet, or not in all runs: docs/book/src/figures/truth.md has the table.
 const OPEN: &[&str] = &[
     "push where no contact is",
     "payload taken",

@@ -136,7 +136,7 @@ fn assert_sums(answer: &Json) {
 
 const FT: &str = "l_arm_ft_sensor";
 
-/// What the arm is, what is configured, what fails, the joint, and words of the first line about it.
+/// What the arm is, what is configured, what fails, the joint, and words of its first line.
 type Case<'a> = (Arm, Arm, &'a [String], &'a str, &'a [&'a str]);
 
 /// Each case at once: live, then from its recording.

@@ -282,7 +282,8 @@ impl Known {
         });
         Story {
             head: format!(
-                "its deviation of {} Nm exceeds the bound of {} Nm (output.max_torque_std_nm){part}",
+                "its deviation of {} Nm exceeds the bound of {} Nm \
+                 (output.max_torque_std_nm){part}",
                 digits(budget.deviation),
                 digits(budget.bound)
             ),
@@ -430,8 +431,8 @@ impl Channel {
     }
 }
 
-/// The parts of a budget, the largest first; without those of no or of infinite variance. Parts that were
-/// identified together, of which one cancels a part of another, are one.
+/// The parts of a budget, the largest first; without those of no or of infinite variance. Parts
+/// that were identified together, of which one cancels a part of another, are one.
 pub(super) fn shares(budget: &TorqueBudget) -> Vec<Share> {
     let matters = |part: &&BudgetPart| part.variance != 0.0 && part.variance.is_finite();
     let parts = budget.parts().iter().filter(matters);

@@ -39,6 +39,7 @@ pub(super) fn opcode_of(id: Id, base: u8) -> Option<u8> {
 
 /// A unit of force.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 pub enum ForceUnit {
     /// Pound-force.
     #[serde(rename = "lbf")]
@@ -92,6 +93,7 @@ impl ForceUnit {
 
 /// A unit of torque.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 pub enum TorqueUnit {
     /// Pound-force inch.
     #[serde(rename = "lbf-in")]

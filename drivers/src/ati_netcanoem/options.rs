@@ -8,6 +8,7 @@ use serde::Deserialize;
 
 /// The keys of `driver = "ati_netcanoem"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Period of the requests \[ms\], 1 to 1000; default 2.

@@ -9,6 +9,7 @@ use serde::Deserialize;
 
 /// The unit of object 606C.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 pub enum VelocityUnit {
     /// Counts per second.
     #[serde(rename = "counts/s")]
@@ -75,6 +76,7 @@ impl Unit {
 
 /// The unit of object 6076.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 pub enum TorqueUnit {
     /// Of CiA 402: a thousandth of a newton metre.
     #[serde(rename = "mNm")]
@@ -106,6 +108,7 @@ impl TorqueUnit {
 
 /// The unit of object 6078.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 pub enum CurrentUnit {
     /// A thousandth of the rated current.
     #[default]
@@ -118,6 +121,7 @@ pub enum CurrentUnit {
 
 /// The mapping of one TPDO.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct PdoKeys {
     /// 1 to 4.
@@ -133,6 +137,7 @@ pub struct PdoKeys {
 
 /// The keys of `driver = "canopen_drive"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Counts per turn of the motor; default the drive's own.

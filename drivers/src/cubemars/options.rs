@@ -10,6 +10,7 @@ use serde::Deserialize;
 
 /// The mode that a motor is configured for.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Mode {
     /// MIT mode.
@@ -21,6 +22,7 @@ pub enum Mode {
 
 /// The third value of MIT mode.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Effort {
     /// A torque \[Nm\].
@@ -32,6 +34,7 @@ pub enum Effort {
 
 /// The degrees of a position in servo mode.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Angle {
     /// Of the output shaft.
@@ -43,6 +46,7 @@ pub enum Angle {
 
 /// A model, for its ranges, pole pairs and gear ratio.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[allow(missing_docs)] // the names say it
 pub enum Model {
     #[serde(rename = "AK10-9")]
@@ -78,6 +82,7 @@ impl Model {
 
 /// The keys of `driver = "cubemars"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// The motor's mode; default MIT.

@@ -7,6 +7,7 @@ use serde::Deserialize;
 
 /// A model, for its ranges.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[allow(missing_docs)] // the names say it
 #[allow(non_camel_case_types)]
 pub enum Model {
@@ -46,6 +47,7 @@ impl Model {
 
 /// The keys of `driver = "damiao"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Its model, for ranges that neither a key nor the motor tells.

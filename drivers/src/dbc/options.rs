@@ -9,6 +9,7 @@ use serde::{Deserialize, Deserializer, de};
 
 /// The keys of one device.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Options {
     /// The .dbc file, relative to the configuration.
@@ -32,10 +33,12 @@ pub struct Options {
 
 /// One reading: the signals of its values.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ReadingKeys {
     /// Its kind.
     #[serde(deserialize_with = "kind")]
+    #[cfg_attr(test, schemars(with = "String", extend("enum" = WORDS)))]
     pub kind: Kind,
     /// The end of its channel's name; empty for the device's own.
     #[serde(default)]
@@ -58,16 +61,18 @@ pub struct ReadingKeys {
     pub counter: Option<String>,
 }
 
+/// The kinds.
+const WORDS: &[&str] = &[
+    "joint",
+    "wrench",
+    "imu",
+    "gauges",
+    "temperature",
+    "actuator",
+    "skin",
+];
+
 fn kind<'de, D: Deserializer<'de>>(word: D) -> Result<Kind, D::Error> {
-    const WORDS: &[&str] = &[
-        "joint",
-        "wrench",
-        "imu",
-        "gauges",
-        "temperature",
-        "actuator",
-        "skin",
-    ];
     let word = String::deserialize(word)?;
     let known = Kind::ALL.into_iter().find(|kind| kind.word() == word);
     known.ok_or_else(|| de::Error::unknown_variant(&word, WORDS))

@@ -40,6 +40,7 @@ const MTB_RATE_LSB: f64 = 250.0 / 32768.0 * PI / 180.0;
 
 /// The quantities of an IMU.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Quantity {
     /// Proper acceleration.
@@ -69,6 +70,7 @@ impl Quantity {
 
 /// The chip's operation mode.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Fusion {
     /// Fusion of all three sensors.
@@ -123,6 +125,7 @@ impl Fusion {
 
 /// The kind of legacy frames, which determines their scale.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Legacy {
     /// No legacy frames: IMU_TRIPLE and the others.

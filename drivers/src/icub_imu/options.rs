@@ -9,6 +9,7 @@ use serde::Deserialize;
 
 /// The keys of `driver = "icub_imu"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// The quantities of a reading; default acceleration and angular velocity.

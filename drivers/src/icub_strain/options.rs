@@ -6,6 +6,7 @@ use serde::Deserialize;
 
 /// The streamed quantities.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Stream {
     /// Wrenches.
@@ -40,6 +41,7 @@ impl Stream {
 
 /// The keys of `driver = "icub_strain"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Full scale of fx fy fz \[N\]; default: the board's own.

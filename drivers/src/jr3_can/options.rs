@@ -6,6 +6,7 @@ use serde::Deserialize;
 
 /// The keys of `driver = "jr3_can"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Full scale of fx fy fz \[N\]; default: the board's own.

@@ -5,6 +5,7 @@ use serde::Deserialize;
 
 /// A motor's protocol.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Protocol {
     /// V3 and V4.

@@ -10,6 +10,7 @@ use serde::Deserialize;
 
 /// Which frames are a reading of the joint.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Position {
     /// Answers with an angle.
@@ -23,6 +24,7 @@ pub enum Position {
 
 /// The keys of `driver = "myactuator"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Its protocol; default V3.

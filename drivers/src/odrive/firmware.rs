@@ -70,6 +70,7 @@ const ERRORS_0_5: &[(u32, &str)] = &[
 
 /// The generation of an ODrive's firmware.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 pub enum Firmware {
     /// 0.6: ODrive S1, Pro, Micro.
     #[default]

@@ -9,6 +9,7 @@ use serde::Deserialize;
 
 /// The keys of `driver = "odrive"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Its firmware; default 0.6.

@@ -88,6 +88,7 @@ pub(super) const REPETITION: u8 = 2 << 6;
 
 /// The quantities of a sensor, in the order of its messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Quantity {
     /// Pitch and roll.
@@ -114,6 +115,7 @@ impl Quantity {
 
 /// The order of x, y and z in a message.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Axes {
     /// Pitch, roll, yaw.
@@ -135,6 +137,7 @@ impl Axes {
 
 /// Where the axes of the acceleration point.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Upright {
     /// y left and z up.

@@ -6,6 +6,7 @@ use serde::Deserialize;
 
 /// The keys of `driver = "optoforce_daq"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Steps per N of fx fy fz. Needed.

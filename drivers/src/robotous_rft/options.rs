@@ -6,6 +6,7 @@ use serde::Deserialize;
 
 /// The models, which differ in their scales.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 pub enum Model {
     /// RFT40-SA01.
     #[default]
@@ -68,6 +69,7 @@ impl Model {
 
 /// The keys of `driver = "robotous_rft"`.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// The model; default RFT40-SA01.

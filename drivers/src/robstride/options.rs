@@ -10,6 +10,7 @@ use serde::Deserialize;
 
 /// The protocol that a motor is set to.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Protocol {
     /// Extended identifiers.
@@ -21,6 +22,7 @@ pub enum Protocol {
 
 /// A model, for its ranges.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[allow(missing_docs)] // the names say it
 pub enum Model {
     RS00,
@@ -54,6 +56,7 @@ impl Model {
 
 /// The keys of `driver = "robstride"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Its model, for the defaults of other keys.

@@ -8,6 +8,7 @@ use serde::Deserialize;
 
 /// Where the position is taken from.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Position {
     /// The PID position in status 4.
@@ -19,6 +20,7 @@ pub enum Position {
 
 /// The keys of `driver = "vesc"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// Where the position is taken from; default the PID position.

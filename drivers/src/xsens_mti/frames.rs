@@ -27,6 +27,7 @@ pub(super) mod status {
 
 /// The messages that this driver reads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Message {
     /// Error.
@@ -88,6 +89,7 @@ impl Message {
 
 /// Which messages hold angular velocity and acceleration.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum HighRate {
     /// The usual ones.

@@ -9,6 +9,7 @@ use serde::Deserialize;
 
 /// The keys of `driver = "xsens_mti"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     /// The messages of a reading; default sample time, angular velocity, acceleration.

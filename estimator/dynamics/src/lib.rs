@@ -35,7 +35,7 @@
 //! tau = Y(q, dq, ddq) phi    phi = [m, h_x, h_y, h_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz] per link
 //! ```
 //! SI units. [`spatial`] defines all of it. Nothing allocates after construction. Speeds are in
-//! docs/figures.md.
+//! docs/book/src/figures/speed.md.
 
 pub mod calibration;
 mod equation;

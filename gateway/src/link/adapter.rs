@@ -22,6 +22,7 @@ pub const SYS: &str = "/sys";
 
 /// The way in which a configuration names a CAN interface.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(try_from = "Keys")]
 pub enum Adapter {
     /// By the kernel's name, such as `can0`.
@@ -44,11 +45,16 @@ pub enum Adapter {
 
 /// The keys of `source` in gateway.toml.
 #[derive(Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 struct Keys {
+    /// The kernel's name, such as `can0`. Needed, unless `serial` or `usb_port` is given.
     interface: Option<String>,
+    /// The serial number of the adapter, as `proprio doctor` shows it.
     serial: Option<String>,
+    /// The USB port that the adapter is plugged into, such as `1-2.3`: `proprio doctor` shows it.
     usb_port: Option<String>,
+    /// The channel of an adapter with several interfaces; with `serial` or `usb_port`.
     channel: Option<u32>,
 }
 

@@ -36,6 +36,7 @@ const SURE: usize = 24;
 
 /// The meaning of the relative stamps of a candump log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
 pub enum Stamps {
     /// Told by the whole log.

@@ -1,7 +1,8 @@
 //! Words of messages about a configuration.
 
 /// The word that was probably meant, as the end of a message; empty if none is near.
-pub(crate) fn did_you_mean<'a>(unknown: &str, words: impl Iterator<Item = &'a str>) -> String {
+#[must_use]
+pub fn did_you_mean<'a>(unknown: &str, words: impl Iterator<Item = &'a str>) -> String {
     // Winkler's similarity, because most mistakes are at the end of a key; above 0.85 two words
     // share most letters, or one is the beginning of the other.
     words

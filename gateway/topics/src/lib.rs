@@ -85,13 +85,9 @@ pub const MAX_SUBTREES: usize = MAX_SENSORS + 1;
 /// Maximum number of buses of one gateway; also the maximum number of publishers of samples.
 pub const MAX_BUSES: usize = 16;
 
-/// The programs in README.md and in the documents compile.
+/// The program in the book compiles.
 #[cfg(all(doctest, feature = "ipc"))]
 mod documents {
-    #[doc = include_str!("../../../README.md")]
-    struct Readme;
-    #[doc = include_str!("../../../docs/commissioning.md")]
-    struct Commissioning;
-    #[doc = include_str!("../../../docs/figures.md")]
-    struct Figures;
+    #[doc = include_str!("../../../docs/book/src/read/rust.md")]
+    struct Page;
 }
