@@ -17,7 +17,7 @@ use proprio_identification::robot::IdentificationInput;
 use proprio_identification::{CovarianceRoot, Robot};
 use proprio_planning::excite::{Plan, Planner, Task};
 use proprio_planning::motion::{Fence, JointLimits, Series};
-use proprio_planning::workspace::RISE;
+use proprio_planning::workspace::{RISE, measured};
 use serde_json::json;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -128,10 +128,7 @@ fn task<'a>(
             args.seconds
         ));
     }
-    let dofs: Vec<usize> = robot
-        .published()
-        .filter(|&dof| robot.locked[dof].is_nan())
-        .collect();
+    let dofs: Vec<usize> = measured(robot).collect();
     let wanted = match args.joint.as_slice() {
         [] => dofs.clone(),
         names => (names.iter())
@@ -311,11 +308,6 @@ fn fence(robot: &Robot, config: &Config, text: &str) -> Result<Fence, String> {
         least: [x, y, z],
         greatest: [x2, y2, z2],
     })
-}
-
-/// The degrees of freedom in the table.
-fn measured(robot: &Robot) -> impl Iterator<Item = usize> {
-    robot.published().filter(|&dof| robot.locked[dof].is_nan())
 }
 
 /// Writes the motion as a table of samples.

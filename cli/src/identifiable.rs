@@ -7,7 +7,7 @@ use proprio_estimator::config::{Config, ConfigError, ForceTorque};
 use proprio_estimator::setup::{Setup, nearest};
 use proprio_identification::{Robot, parallel};
 use proprio_planning::knowledge::{Knowledge, Torque, limit, only, regime};
-use proprio_planning::workspace::Workspace;
+use proprio_planning::workspace::{Deviation, Workspace, measured};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -149,8 +149,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 
 /// The degree of freedom of a published torque, by the joint's name.
 pub(crate) fn torque_of(robot: &Robot, name: &str) -> Result<usize, String> {
-    let mut dofs = robot.published().filter(|&dof| robot.locked[dof].is_nan());
-    let found = dofs.find(|&dof| robot.model.dof_name(dof) == name);
+    let found = measured(robot).find(|&dof| robot.model.dof_name(dof) == name);
     found.ok_or_else(|| {
         let hint = nearest(name, robot.joint_names());
         format!("--joint {name}: it is not a moving joint that is measured{hint}")
@@ -275,9 +274,7 @@ fn remedies(set: &Set, absent: &[String], dof: Option<usize>) -> anyhow::Result<
     let Some((dof, now)) = chosen else {
         return Ok(None);
     };
-    let of = |deviations: Vec<proprio_planning::workspace::Deviation>| {
-        deviations.iter().find(|own| own.dof == dof)?.torque
-    };
+    let of = |deviations: Vec<Deviation>| deviations.iter().find(|own| own.dof == dof)?.torque;
     let least = |mut all: Vec<(String, f64)>, than: f64| {
         all.retain(|(_, own)| than > NOTHING && *own < (1.0 - WORTH) * than);
         all.sort_by(|a, b| a.1.total_cmp(&b.1));
@@ -317,8 +314,10 @@ fn remedies(set: &Set, absent: &[String], dof: Option<usize>) -> anyhow::Result<
     let moving =
         |dofs: &[usize]| of(limit(&set.free, &only(&set.free, dofs), &set.workspace).ok()?);
     let still = moving(&[]).unwrap_or(now);
-    let motions = (set.knowledge.torques.iter())
-        .filter_map(|own| Some((model.dof_name(own.dof).to_owned(), moving(&[own.dof])?)));
+    let dofs: Vec<usize> = set.knowledge.torques.iter().map(|own| own.dof).collect();
+    let motions = parallel::map(dofs.len(), |k| moving(&dofs[k..=k]));
+    let motions = (dofs.iter().zip(motions))
+        .filter_map(|(&dof, own)| Some((model.dof_name(dof).to_owned(), own?)));
     Ok(Some(Remedies {
         joint: model.dof_name(dof).to_owned(),
         unit: unit(model, dof),

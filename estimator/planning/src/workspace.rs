@@ -44,6 +44,11 @@ pub struct State {
     pub acceleration: Vec<f64>,
 }
 
+/// The degrees of freedom that move and of which the torque is published.
+pub fn measured(robot: &Robot) -> impl Iterator<Item = usize> {
+    robot.published().filter(|&dof| robot.locked[dof].is_nan())
+}
+
 /// The range of a joint in the URDF; where it has none a whole turn, or 0.3 m to either side.
 #[must_use]
 pub fn range(model: &Model, dof: usize) -> Limits {
@@ -211,8 +216,7 @@ impl Workspace {
         let mut puppet = Puppet::new(robot)?;
         let mut solver = Solver::new(structure);
         let columns = LINK_PARAMETERS * model.link_count() + 6 * structure.sensors().len();
-        let published = robot.published().filter(|&dof| robot.locked[dof].is_nan());
-        let mut torques: Vec<(usize, Option<DMatrix<f64>>)> = published
+        let mut torques: Vec<(usize, Option<DMatrix<f64>>)> = measured(robot)
             .map(|dof| (dof, Some(DMatrix::zeros(count, columns))))
             .collect();
         let mut readings = Vec::new();
