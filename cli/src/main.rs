@@ -9,8 +9,10 @@ mod demo;
 mod doctor;
 mod echo;
 mod estimator;
+mod excite;
 mod folder;
 mod help;
+mod identifiable;
 mod identify;
 mod install;
 mod programs;
@@ -68,6 +70,10 @@ enum Verb {
     Table(table::Args),
     /// Estimate joint torques and contact wrenches from a table of samples
     Estimate(convert::Estimate),
+    /// Tell what a robot's F/T sensors can identify, and which torques rest on CAD for ever
+    Identifiable(identifiable::Args),
+    /// Plan the motion that lessens the uncertainty of torques the most
+    Excite(excite::Args),
     /// Identify inertial parameters from recorded tables of samples and write a report
     Identify(identify::Args),
     /// Show the robots of a running system: processes, buses, devices, channels, estimates
@@ -131,6 +137,8 @@ fn main() -> ExitCode {
         Verb::Table(args) => table::run(&args),
         Verb::Why(args) => why::run(&args, &domain),
         Verb::Estimate(args) => convert::estimate(&args),
+        Verb::Identifiable(args) => identifiable::run(&args),
+        Verb::Excite(args) => excite::run(&args),
         Verb::Identify(args) => identify::run(&args),
         Verb::Status(args) => status::run(&args, &domain),
         Verb::Top(args) => top::run(&args, &domain),

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// The permitted direct dependencies between members of the workspace.
-const DIRECTIONS: [(&str, &[&str]); 13] = [
+const DIRECTIONS: [(&str, &[&str]); 14] = [
     ("proprio-topics", &[]),
     ("proprio-drivers", &["proprio-topics"]),
     ("proprio-gateway", &["proprio-drivers", "proprio-topics"]),
@@ -18,6 +18,14 @@ const DIRECTIONS: [(&str, &[&str]); 13] = [
     (
         "proprio-identification",
         &["proprio-dynamics", "proprio-topics"],
+    ),
+    (
+        "proprio-planning",
+        &[
+            "proprio-dynamics",
+            "proprio-identification",
+            "proprio-topics",
+        ],
     ),
     (
         "proprio-estimator",
@@ -50,12 +58,13 @@ const DIRECTIONS: [(&str, &[&str]); 13] = [
         &["proprio-dynamics", "proprio-identification"],
     ),
 ];
-const EVERYTHING: [&str; 10] = [
+const EVERYTHING: [&str; 11] = [
     "proprio-topics",
     "proprio-drivers",
     "proprio-gateway",
     "proprio-dynamics",
     "proprio-identification",
+    "proprio-planning",
     "proprio-estimator",
     "proprio-simulator",
     "proprio-bridge",
@@ -73,6 +82,7 @@ const CONFINED: [(&str, &[&str]); 7] = [
         &[
             "proprio-dynamics",
             "proprio-identification",
+            "proprio-planning",
             "proprio-estimator",
             "proprio-simulator",
         ],

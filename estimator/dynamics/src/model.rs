@@ -206,6 +206,7 @@ struct JointFacts {
     child_link: String,
     limits: Option<Limits>,
     effort: Option<f64>,
+    velocity: Option<f64>,
     /// The joint that it follows, multiplier and offset.
     mimic: Option<(String, f64, f64)>,
 }
@@ -346,10 +347,10 @@ impl Model {
         self.folded_joints.contains_key(joint)
     }
 
-    /// The parent and child links of each fixed joint that was folded, in no particular order.
-    pub fn folded_links(&self) -> impl Iterator<Item = (&str, &str)> {
-        let links = self.folded_joints.values();
-        links.map(|(parent, child)| (parent.as_str(), child.as_str()))
+    /// Each fixed joint that was folded, with its parent and child links, in no particular order.
+    pub fn folded_joints(&self) -> impl Iterator<Item = (&str, [&str; 2])> {
+        let joints = self.folded_joints.iter();
+        joints.map(|(joint, (parent, child))| (joint.as_str(), [parent.as_str(), child.as_str()]))
     }
 
     /// Whether a link or joint of this name was dropped, because it is the joint that lets the
@@ -424,6 +425,11 @@ impl Model {
     /// The effort limit of a joint in the URDF [Nm or N]; `None` if it is missing or zero.
     pub fn effort(&self, joint: usize) -> Option<f64> {
         self.joint_facts.get(joint).and_then(|facts| facts.effort)
+    }
+
+    /// The velocity limit of a joint in the URDF [rad/s or m/s]; `None` if it is missing or zero.
+    pub fn velocity(&self, joint: usize) -> Option<f64> {
+        self.joint_facts.get(joint).and_then(|facts| facts.velocity)
     }
 
     /// The inertia of every body, about the origin and in the axes of its frame.

@@ -4,6 +4,7 @@
 //! - Off-line, [`identify`]`(&`[`Robot`]`, Vec<`[`Dataset`]`>, ..)` takes recorded logs and returns
 //!   an [`Outcome`]: parameters, covariance, figures for each log, findings.
 //! - On-line, [`online`] estimates the same parameters recursively while the robot works.
+//! - [`forecast`] states what the covariance would be after a motion that nobody has made yet.
 //!
 //! `examples/identification.rs` is a program of 20 lines.
 //!
@@ -70,6 +71,7 @@ pub mod dataset;
 mod diagnose;
 mod finding;
 mod fit;
+pub mod forecast;
 mod hypothesis;
 pub mod linear;
 mod measurement;

@@ -7,4 +7,4 @@ mod curves;
 mod log;
 pub(crate) mod outcome;
 pub(crate) mod prediction;
-mod uncertainty;
+pub(crate) mod uncertainty;

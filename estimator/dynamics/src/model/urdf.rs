@@ -47,6 +47,7 @@ struct RawJoint<'d> {
     origin: Pose,
     limits: Option<Limits>,
     effort: Option<f64>,
+    velocity: Option<f64>,
     /// The joint that it follows, with multiplier and offset.
     mimic: Option<(&'d str, f64, f64)>,
 }
@@ -303,6 +304,12 @@ fn read_joint<'d>(
         _ => Ok(None),
     };
     let (lower, upper, effort) = (limit("lower")?, limit("upper")?, limit("effort")?);
+    // What cannot be read counts as missing: only the planning of motions needs it.
+    let velocity = limit("velocity").ok().flatten();
+    let positive = |value: Option<[f64; 1]>| {
+        let value = value.map(|[value]| value);
+        value.filter(|value| *value > 0.0 && value.is_finite())
+    };
     let is_limited = word != "continuous" && (lower.is_some() || upper.is_some());
     let limits = is_limited.then(|| Limits {
         lower: lower.map_or(0.0, |[lower]| lower),
@@ -328,9 +335,8 @@ fn read_joint<'d>(
         child,
         origin: origin(node, node)?,
         limits,
-        effort: effort
-            .map(|[effort]| effort)
-            .filter(|effort| *effort > 0.0 && effort.is_finite()),
+        effort: positive(effort),
+        velocity: positive(velocity),
         mimic,
     })
 }
@@ -699,6 +705,7 @@ impl Folder<'_, '_> {
             child_link: self.links[joint.child].name.to_owned(),
             limits: joint.limits,
             effort: joint.effort,
+            velocity: joint.velocity,
             mimic: (joint.mimic).map(|(leader, ratio, offset)| (leader.to_owned(), ratio, offset)),
         };
         let new = model.joints.len();

@@ -32,7 +32,7 @@ use proprio_dynamics::{ContactSet, FrameMotion};
 use proprio_topics::{Nanos, Reason};
 
 /// Greatest number of observations per second \[Hz\]. A slower log keeps its own stamps.
-const RATE: f64 = 100.0;
+pub(crate) const RATE: f64 = 100.0;
 
 /// Length of signal required on either side of a time for its derivatives, unless the window is
 /// narrower \[ns\].

@@ -162,7 +162,7 @@ pub(crate) fn outcome(
         robot: robot.name.clone(),
         verdict: verdict(identified),
         links: links(robot, identified, &narrow, &root, &spread),
-        covariance: covariance(identified, &root),
+        covariance: covariance(unknowns, &identified.reduced, &root),
         tau: identified.fit.tau,
         least_retained_fraction: identified.retained[..unknowns.links.len()]
             .iter()

@@ -401,8 +401,11 @@ pub(crate) fn significance(
 
 /// Joint covariance of the parameters, and of each sensor's offset at the end of the last segment
 /// of a training log in which it was read.
-pub(crate) fn covariance(identified: &Identified, root: &DMatrix<f64>) -> CovarianceRoot {
-    let unknowns = &identified.unknowns;
+pub(crate) fn covariance(
+    unknowns: &Unknowns,
+    logs: &[ReducedLog],
+    root: &DMatrix<f64>,
+) -> CovarianceRoot {
     let (links, p, s) = (
         unknowns.inertial(),
         unknowns.parameters(),
@@ -423,11 +426,11 @@ pub(crate) fn covariance(identified: &Identified, root: &DMatrix<f64>) -> Covari
         let read = |reduced: &ReducedLog| {
             (0..6).any(|axis| reduced.covariance[(6 * place + axis, 6 * place + axis)] < UNREAD)
         };
-        let last = identified.reduced.len().saturating_sub(1);
-        identified.reduced.iter().rposition(read).unwrap_or(last)
+        let last = logs.len().saturating_sub(1);
+        logs.iter().rposition(read).unwrap_or(last)
     };
     let sources: Vec<usize> = (0..unknowns.sensors.len()).map(source).collect();
-    for (number, reduced) in identified.reduced.iter().enumerate() {
+    for (number, reduced) in logs.iter().enumerate() {
         let own = (0..s).filter(|unknown| sources[unknown / 6] == number);
         let own: Vec<usize> = own.collect();
         if own.is_empty() {
