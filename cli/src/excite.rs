@@ -44,14 +44,14 @@ pub(crate) struct Args {
     /// The duration of the motion [s]
     #[arg(long, value_name = "S", default_value_t = 12.0)]
     seconds: f64,
-    /// Limits of a joint in place of the URDF's, e.g. elbow=0.3,1.8,1.5,4 [rad, rad/s, rad/s^2];
-    /// may be given several times. Without an acceleration it is what reaches the velocity in
-    /// 0.5 s. Equal positions: it stays there
-    #[arg(long, value_name = "JOINT=LOWER,UPPER[,VELOCITY[,ACCELERATION]]")]
+    /// Limits of a joint in place of the URDF's: JOINT=LOWER,UPPER[,VELOCITY[,ACCELERATION]], e.g.
+    /// elbow=0.3,1.8,1.5,4 [rad, rad/s, rad/s^2]; may be given several times. Without an
+    /// acceleration it is what reaches the velocity in 0.5 s. Equal positions: it stays there
+    #[arg(long, value_name = "LIMITS")]
     limit: Vec<String>,
     /// A box that the origin of a link, or a point in its axes, does not leave, in the axes of the
-    /// base link [m]; may be given several times
-    #[arg(long, value_name = "LINK[@X,Y,Z]=XMIN,XMAX,YMIN,YMAX,ZMIN,ZMAX")]
+    /// base link [m]: LINK[@X,Y,Z]=XMIN,XMAX,YMIN,YMAX,ZMIN,ZMAX; may be given several times
+    #[arg(long, value_name = "BOX")]
     #[arg(allow_hyphen_values = true)]
     r#box: Vec<String>,
     /// The parameters.toml of an earlier identification: what matters is what it left uncertain
@@ -202,17 +202,36 @@ fn limits(
 ) -> Result<Vec<Option<JointLimits>>, String> {
     let model = &robot.model;
     let joint = |dof: usize| model.dof_joint(dof).unwrap_or_default();
-    // Lower, upper, velocity, acceleration.
+    // Lower, upper, velocity, acceleration: those of the joint, and of the joints that follow it.
     let mut own: Vec<[Option<f64>; 4]> = (0..model.dof_count())
         .map(|dof| {
             let range = model.limits(joint(dof));
             let velocity = model.velocity(joint(dof));
-            [
+            let of_leader = [
                 range.map(|own| own.lower),
                 range.map(|own| own.upper),
                 velocity,
                 None,
-            ]
+            ];
+            let all = model.joints().iter().enumerate();
+            let followers =
+                all.filter(|(number, own)| own.dof == Some(dof) && *number != joint(dof));
+            followers.fold(of_leader, |[lower, upper, velocity, _], (number, own)| {
+                let at = |limit: f64| (limit - own.offset) / own.ratio;
+                let range = model.limits(number).filter(|_| own.ratio != 0.0);
+                let range = range.map(|range| (at(range.lower), at(range.upper)));
+                let range = range.map(|(a, b)| (a.min(b), a.max(b)));
+                let least =
+                    |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b).reduce(f64::min);
+                let most = |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b).reduce(f64::max);
+                let rate = model.velocity(number).map(|rate| rate / own.ratio.abs());
+                [
+                    most(lower, range.map(|range| range.0)),
+                    least(upper, range.map(|range| range.1)),
+                    least(velocity, rate.filter(|rate| rate.is_finite())),
+                    None,
+                ]
+            })
         })
         .collect();
     for text in given {

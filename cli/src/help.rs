@@ -202,6 +202,7 @@ fn is_for_a_person() -> bool {
 
 /// A page for the terminal: without comments and without the targets of links.
 fn plain(text: &str, is_bold: bool) -> String {
+    let text = without_links(text);
     let mut plain = String::new();
     let mut is_code = false;
     for line in text.lines().filter(|line| !line.starts_with("<!--")) {
@@ -211,24 +212,32 @@ fn plain(text: &str, is_bold: bool) -> String {
             plain += &format!("\x1b[1m{}\x1b[0m\n", heading.replace('`', ""));
             continue;
         }
-        let mut rest = line;
-        if !is_code {
-            // `[text](page.md)`: the text.
-            while let Some((before, after)) = rest.split_once("](") {
-                let Some((_, behind)) = after.split_once(')') else {
-                    break;
-                };
-                match before.rsplit_once('[') {
-                    Some((before, text)) => plain += &format!("{before}{text}"),
-                    None => plain += before,
-                }
-                rest = behind;
-            }
-        }
-        plain += rest;
+        plain += line;
         plain.push('\n');
     }
     plain.trim().to_owned()
+}
+
+/// The text with `text` for `[text](page.md)`, outside blocks of code. A link may go over the end
+/// of a line.
+fn without_links(text: &str) -> String {
+    let fence = "```";
+    let parts = text.split(fence).enumerate().map(|(number, part)| {
+        let mut plain = String::new();
+        let mut rest = part;
+        while number % 2 == 0
+            && let Some((before, after)) = rest.split_once("](")
+            && let Some((_, behind)) = after.split_once(')')
+        {
+            match before.rsplit_once('[') {
+                Some((before, text)) => plain += &format!("{before}{text}"),
+                None => plain += before,
+            }
+            rest = behind;
+        }
+        plain + rest
+    });
+    parts.collect::<Vec<_>>().join(fence)
 }
 
 /// Shows what the words of `args` name; `program` is the whole command line.
@@ -288,6 +297,15 @@ mod tests {
         assert!(
             !text("unexplained").contains("\n## `contradicted`"),
             "it ends with its section"
+        );
+    }
+
+    #[test]
+    fn the_targets_of_links_are_left_out_over_lines_too() {
+        let page = "# A\n[one](a.md), ([two\nthree](b.md#c)) and x[1]\n```sh\n[a](b)\n```\n";
+        assert_eq!(
+            plain(page, false),
+            "# A\none, (two\nthree) and x[1]\n```sh\n[a](b)\n```"
         );
     }
 

@@ -10,6 +10,7 @@ mod log;
 mod story;
 
 use crate::convert::Configured;
+use anyhow::bail;
 use log::Spell;
 use proprio_topics::ipc::DomainConfig;
 use proprio_topics::{Nanos, Reason, Source, TorqueBudget};
@@ -34,9 +35,15 @@ pub(crate) struct Args {
     /// With --samples: identified parameters (parameters.toml) to use
     #[arg(long, value_name = "FILE", requires = "samples")]
     parameters: Option<PathBuf>,
-    /// With --samples: the instant to look at, as in the log [s]; default: the end of the longest
-    /// time for which the torque was withheld after it had been valid
-    #[arg(long, value_name = "SECONDS", requires = "samples")]
+    /// With --samples: the instant to look at, as in the log [s]; default: late in what caused the
+    /// longest outage after the torque had been valid
+    #[arg(
+        long,
+        value_name = "SECONDS",
+        requires = "samples",
+        value_parser = seconds,
+        allow_negative_numbers = true
+    )]
     at: Option<f64>,
     /// Print everything as JSON, one object
     #[arg(long)]
@@ -49,6 +56,12 @@ const MOST: usize = 10;
 /// The least share that has a line of its own [%].
 const LEAST: f64 = 0.1;
 
+/// An instant of a log [s].
+fn seconds(text: &str) -> Result<f64, String> {
+    let number = text.parse().ok().filter(|t: &f64| t.is_finite());
+    number.ok_or_else(|| "write seconds, as in the log".to_owned())
+}
+
 /// Says why.
 pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     let (known, at, spells) = match &args.samples {
@@ -60,14 +73,17 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
         Some(samples) => {
             let (config, parameters) = (args.config.as_deref(), args.parameters.as_deref());
             let configured = Configured::new(config, parameters, samples)?;
+            if samples.as_os_str() == "-" {
+                bail!("--samples -: give a file, which is read twice");
+            }
             let at = args.at.map(Nanos::from_seconds);
-            let (known, t, spells) = log::know(configured, samples, &args.joint, at)?;
-            (known, Some(t), spells)
+            let found = log::know(configured, samples, &args.joint, at)?;
+            (found.known, found.t, found.spells)
         }
     };
     let story = known.story();
     if args.json {
-        print_line!("{}", in_json(&known, &story, at));
+        print_line!("{}", in_json(&known, &story, at, &spells));
         return Ok(());
     }
     let when = at.map_or(String::new(), |t| format!("at {t} s, "));
@@ -81,19 +97,30 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     if let Some(budget) = &known.budget {
         print_budget(budget);
     }
+    if args.samples.is_some() && known.identifies {
+        print_line!(
+            "\nthe estimator ran on this log anew: without what the robot had learnt before it"
+        );
+    }
     print_spells(&spells);
     Ok(())
 }
 
 fn print_budget(budget: &TorqueBudget) {
     let bound = match budget.bound.is_finite() {
-        true => format!(", the bound {} Nm", digits(budget.bound)),
+        true => format!(", the bound {} {}", digits(budget.bound), budget.unit()),
         false => String::new(),
     };
+    if budget.parts().is_empty() {
+        return print_line!(
+            "\nits estimator, of another version, does not say what the deviation is made of"
+        );
+    }
     match budget.deviation.is_finite() {
         true => print_line!(
-            "\nits deviation is {} Nm{bound}; the variance is made of",
-            digits(budget.deviation)
+            "\nits deviation is {} {}{bound}; the variance is made of",
+            digits(budget.deviation),
+            budget.unit()
         ),
         false => print_line!(
             "\nits deviation is not known, because of what identification has not refuted{bound}; \
@@ -107,8 +134,9 @@ fn print_budget(budget: &TorqueBudget) {
     for share in shown {
         let deviation = digits(share.variance.max(0.0).sqrt());
         print_line!(
-            "  {:>5.1} %  {deviation:>8} Nm  {}",
+            "  {:>5.1} %  {deviation:>8} {:<2}  {}",
             percent(share, budget),
+            budget.unit(),
             share.name
         );
     }
@@ -168,7 +196,13 @@ fn print_spells(spells: &[Spell]) {
     }
 }
 
-fn in_json(known: &Known, story: &Story, at: Option<Nanos>) -> serde_json::Value {
+fn in_json(known: &Known, story: &Story, at: Option<Nanos>, spells: &[Spell]) -> serde_json::Value {
+    let times = spells.iter().map(|spell| {
+        json!({
+            "from": spell.begin.seconds(), "to": spell.end.seconds(),
+            "reason": spell.reason.word(), "cause": spell.cause, "no_estimates": spell.is_gap,
+        })
+    });
     let finite = |value: f64| value.is_finite().then_some(value);
     let at = at.or_else(|| Some(known.budget.as_ref()?.header.acquired));
     let budget = known.budget.as_ref().map(|budget| {
@@ -182,6 +216,7 @@ fn in_json(known: &Known, story: &Story, at: Option<Nanos>) -> serde_json::Value
         json!({
             "valid": budget.torque.valid == 1,
             "torque": finite(budget.torque.torque),
+            "unit": budget.unit(),
             "deviation": finite(budget.deviation),
             "bound": finite(budget.bound),
             "reason": budget.torque.reason.get().map(Reason::word),
@@ -193,5 +228,6 @@ fn in_json(known: &Known, story: &Story, at: Option<Nanos>) -> serde_json::Value
     json!({
         "joint": known.joint, "t": at.map(Nanos::seconds), "why": story.head,
         "because": story.because, "advice": story.advice, "cause": known.cause, "budget": budget,
+        "times": times.collect::<Vec<_>>(),
     })
 }

@@ -6,7 +6,7 @@ use proprio_dynamics::ContactKind;
 use proprio_dynamics::calibration::Gain;
 use proprio_dynamics::regressor::identifiable::{Identifiable, Measured, Offsets, Scope};
 use proprio_identification::robot::BaseMotion;
-use proprio_topics::{Description, Entry, Kind, Name, Publisher, Role};
+use proprio_topics::{Description, Entry, Kind, Name, Publisher, Role, TRIGGER};
 use std::fmt;
 
 impl Setup {
@@ -200,6 +200,10 @@ impl Setup {
             .enumerate()
             .map(|(number, (kind, own))| Entry {
                 name: name(own),
+                origin: match number == self.robot.trigger {
+                    true => name(TRIGGER),
+                    false => Name::EMPTY,
+                },
                 kind: kind.in_memory(),
                 max_silence: of_skin(number)
                     .map_or(self.robot.max_silence, |skin| skin.max_silence),

@@ -290,7 +290,7 @@ fn what_a_torque_rests_on_is_complete() {
         .filter(|part| part.source == Source::Position)
         .map(|part| part.travel);
     assert!(
-        travel.clone().all(|travel| (0.05..4.0).contains(&travel)),
+        travel.clone().all(|travel| (0.05..1.0).contains(&travel)),
         "{:?}",
         Vec::from_iter(travel)
     );

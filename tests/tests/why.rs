@@ -4,7 +4,7 @@
 
 use proprio_tests::watch::open;
 use proprio_tests::{Arm, PATIENCE, Process, Rig, Written, until};
-use proprio_topics::TorqueEstimate;
+use proprio_topics::{Sample, TorqueEstimate};
 use serde_json::Value as Json;
 use std::time::Duration;
 use toml::{Table, Value};
@@ -61,7 +61,9 @@ impl System {
         let simulator = rig.start(&arguments);
         let gateway = rig.start(&["gateway", "--config", &arm.gateway]);
         let estimator = rig.start(&["estimator", "--config", &arm.estimator]);
-        drop(open::<TorqueEstimate>(&rig.open(), "icub_left_arm"));
+        let domain = rig.open();
+        drop(open::<TorqueEstimate>(&domain, "icub_left_arm"));
+        drop(open::<Sample>(&domain, "icub_left_arm"));
         let recording = rig.path("run.mcap").display().to_string();
         let (gateway_toml, estimator_toml) = (&arm.gateway, &arm.estimator);
         let recorder = rig.start(&[
@@ -139,15 +141,17 @@ const FT: &str = "l_arm_ft_sensor";
 /// What the arm is, what is configured, what fails, the joint, and words of its first line.
 type Case<'a> = (Arm, Arm, &'a [String], &'a str, &'a [&'a str]);
 
-/// Each case at once: live, then from its recording.
-fn assert_named(cases: &[Case<'_>]) {
+/// Each case at once: live, then from its recording, at an instant that is so much later \[s\].
+/// There identification begins with the recorder, and has seen less.
+fn assert_named(cases: &[Case<'_>], later: f64) {
     std::thread::scope(|scope| {
         for (robot, arm, faults, joint, words) in cases {
             scope.spawn(move || {
                 let mut system = System::start(robot, arm, faults);
                 let live = system.is_answered(joint, words);
-                std::thread::sleep(Duration::from_millis(500));
-                let recorded = system.ask_recording(joint, live["t"].as_f64());
+                std::thread::sleep(Duration::from_secs_f64(later + 0.5));
+                let at = live["t"].as_f64().map(|t| t + later);
+                let recorded = system.ask_recording(joint, at);
                 assert_has(&recorded, words);
                 for answer in [live, recorded] {
                     if answer["budget"]["deviation"].is_number() {
@@ -177,36 +181,89 @@ fn boards_buses_saturation_and_contacts_are_named() {
     let board = [format!("silent:{FT}@4..")];
     let saturation = [format!("saturate:{FT}@4..")];
     let push = ["push:l_forearm=40@4..".to_owned()];
-    assert_named(&[
+    // What is late is only seen by who knows the masses.
+    let late = [format!("late:{FT}=0.5@4..")];
+    let mut exact = arm();
+    let known = Table::from_iter([("urdf_relative_std".to_owned(), 0.01.into())]);
+    exact
+        .estimator
+        .insert("identification".into(), known.into());
+    assert_named(
+        &[
+            (
+                touched(),
+                touched(),
+                &board,
+                "l_elbow",
+                &["board l_arm_ft_sensor on bus left_arm is silent"],
+            ),
+            (
+                arm(),
+                arm(),
+                &all_motors,
+                "l_wrist_yaw",
+                &["all 7 boards of bus left_arm_motors are silent"],
+            ),
+            (
+                touched(),
+                touched(),
+                &saturation,
+                "l_elbow",
+                &["l_arm_ft_sensor is saturated"],
+            ),
+            (
+                arm(),
+                arm(),
+                &push,
+                "l_elbow",
+                &["undeclared contact", "on the links from l_upper_arm on"],
+            ),
+            (
+                arm(),
+                exact,
+                &late,
+                "l_elbow",
+                &["F/T readings that are late"],
+            ),
+        ],
+        0.0,
+    );
+}
+
+/// What has ended is found in the recording, without an instant.
+#[test]
+fn an_outage_that_is_over_is_named() {
+    let motors = ["shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow"];
+    let motors = motors
+        .iter()
+        .chain(&["wrist_prosup", "wrist_pitch", "wrist_yaw"]);
+    let bus: Vec<String> = motors
+        .map(|motor| format!("silent:l_{motor}_motor@4..7"))
+        .collect();
+    let board = [format!("silent:{FT}@4..7")];
+    let cases: [(&[String], &str, &str); 2] = [
         (
-            touched(),
-            touched(),
+            &bus,
+            "l_wrist_yaw",
+            "all 7 boards of bus left_arm_motors are silent",
+        ),
+        (
             &board,
             "l_elbow",
-            &["board l_arm_ft_sensor on bus left_arm is silent"],
+            "board l_arm_ft_sensor on bus left_arm is silent",
         ),
-        (
-            arm(),
-            arm(),
-            &all_motors,
-            "l_wrist_yaw",
-            &["all 7 boards of bus left_arm_motors are silent"],
-        ),
-        (
-            touched(),
-            touched(),
-            &saturation,
-            "l_elbow",
-            &["l_arm_ft_sensor is saturated"],
-        ),
-        (
-            arm(),
-            arm(),
-            &push,
-            "l_elbow",
-            &["undeclared contact", "on the links from l_upper_arm on"],
-        ),
-    ]);
+    ];
+    std::thread::scope(|scope| {
+        for (faults, joint, words) in cases {
+            scope.spawn(move || {
+                let mut system = System::start(&touched(), &touched(), faults);
+                std::thread::sleep(Duration::from_secs(8));
+                system.is_answered(joint, &["is valid"]);
+                std::thread::sleep(Duration::from_millis(500));
+                assert_has(&system.ask_recording(joint, None), &[words]);
+            });
+        }
+    });
 }
 
 #[test]
@@ -228,25 +285,28 @@ fn what_is_not_configured_well_is_named() {
         sensor.remove("offset_n");
         sensor.remove("offset_nm");
     }
-    assert_named(&[
-        (
-            touched(),
-            tight,
-            &[],
-            "l_elbow",
-            &["exceeds the bound of 0.0100 Nm", "output.max_torque_std_nm"],
-        ),
-        (
-            touched(),
-            unknown,
-            &[],
-            "l_elbow",
-            &[
-                "exceeds the bound",
-                "100 % of the variance is the offset of l_arm_ft_sensor",
-            ],
-        ),
-    ]);
+    assert_named(
+        &[
+            (
+                touched(),
+                tight,
+                &[],
+                "l_elbow",
+                &["exceeds the bound of 0.0100 Nm", "output.max_torque_std_nm"],
+            ),
+            (
+                touched(),
+                unknown,
+                &[],
+                "l_elbow",
+                &[
+                    "exceeds the bound",
+                    "100 % of the variance is the offset of l_arm_ft_sensor",
+                ],
+            ),
+        ],
+        0.0,
+    );
 }
 
 #[test]
@@ -264,38 +324,38 @@ fn what_contradicts_the_configuration_is_named() {
         .parse()
         .expect("TOML");
     sideways.estimator.insert("base".into(), base.into());
-    let late = [format!("late:{FT}=0.3@20..")];
+    let mut uncertain = identifying();
+    let bound = ("max_torque_std_nm".to_owned(), 0.01.into());
+    let output = uncertain.estimator.get_mut("output");
+    let output = output.and_then(Value::as_table_mut);
+    output.expect("a table").extend([bound]);
     let still = ["still:l_elbow".to_owned()];
-    assert_named(&[
-        (
-            arm(),
-            reversed,
-            &[],
-            "l_elbow",
-            &["the encoder of l_elbow is reversed"],
-        ),
-        (
-            arm(),
-            sideways,
-            &[],
-            "l_elbow",
-            &["gravity has another direction"],
-        ),
-        (
-            arm(),
-            identifying(),
-            &still,
-            "l_elbow",
-            &["l_elbow has hardly moved"],
-        ),
-        (
-            arm(),
-            identifying(),
-            &late,
-            "l_elbow",
-            &["F/T readings that are late"],
-        ),
-    ]);
+    assert_named(
+        &[
+            (
+                arm(),
+                reversed,
+                &[],
+                "l_elbow",
+                &["the encoder of l_elbow is reversed"],
+            ),
+            (
+                arm(),
+                sideways,
+                &[],
+                "l_elbow",
+                &["gravity has another direction"],
+            ),
+            (
+                arm(),
+                uncertain,
+                &still,
+                "l_elbow",
+                &["l_elbow has hardly moved"],
+            ),
+        ],
+        8.0,
+    );
 }
 
 #[test]
@@ -310,7 +370,7 @@ fn what_is_asked_wrongly_is_answered() {
     assert!(text.contains("no gateway or estimator runs"), "{text}");
     assert!(fails(&["why", "l_elbow", "--config", "x"]).contains("--samples"));
     let arm = arm().write(&rig.path("robot"));
-    let _gateway = rig.start(&["gateway", "--config", &arm.gateway]);
+    let mut gateway = rig.start(&["gateway", "--config", &arm.gateway]);
     let _estimator = rig.start(&["estimator", "--config", &arm.estimator]);
     drop(open::<TorqueEstimate>(&rig.open(), "icub_left_arm"));
     assert!(
@@ -320,5 +380,16 @@ fn what_is_asked_wrongly_is_answered() {
     // No board: there are no estimates.
     let answer = rig.run(&["why", "l_elbow"]);
     let text = String::from_utf8_lossy(&answer.stdout);
-    assert!(text.starts_with("l_elbow has no torque: "), "{text}");
+    assert!(
+        text.starts_with("l_elbow has no torque: all 2 boards of bus left_arm are silent\n"),
+        "{text}"
+    );
+    // Without the gateway.
+    gateway.end();
+    let answer = rig.run(&["why", "l_elbow"]);
+    let text = String::from_utf8_lossy(&answer.stdout);
+    assert!(
+        text.starts_with("l_elbow has no torque: the gateway "),
+        "{text}"
+    );
 }

@@ -6,7 +6,8 @@ use proprio_bridge::{Described, Level, bus_state, device_state, first_of, next, 
 use proprio_estimator::setup::nearest;
 use proprio_topics::ipc::{Domain, DomainConfig, PortError, Presence, Reader, monotonic};
 use proprio_topics::{
-    Description, EstimatorHealth, GatewayHealth, Nanos, Publisher, Reason, Role, TorqueBudget,
+    Description, EstimatorHealth, GatewayHealth, Nanos, Publisher, Reason, Role, TRIGGER,
+    TorqueBudget, TorqueEstimate,
 };
 
 /// For how long budgets are listened to: the last one that tells of a withheld torque counts.
@@ -45,16 +46,23 @@ pub(super) fn know(
     .into_iter()
     .find(|(_, own)| *own != Presence::Running)
     .map(|(daemon, own)| format!("the {daemon} {own}"));
-    let budget = match (&mut budgets, number) {
-        (Some(budgets), Some(number)) if presence.estimator == Presence::Running => {
-            listen(budgets, number)
+    let budget = match number {
+        Some(number) if presence.estimator == Presence::Running => {
+            let budget = budgets.as_mut().and_then(|budgets| listen(budgets, number));
+            budget.or_else(|| torque(&domain, &robot, number))
         }
         _ => None,
     };
-    let cause = budget.as_ref().and_then(|budget| {
-        let entry = names.as_ref()?.find(Role::Channel, budget.torque.cause)?;
-        Some(entry.name.as_str().to_owned())
+    let mut channels = names.iter().flat_map(|names| names.entries());
+    let cause = channels.find(|entry| {
+        let is_cause = match &budget {
+            Some(budget) => entry.index == budget.torque.cause,
+            // Without estimates it is the channel of their instants.
+            None => entry.origin.as_str() == TRIGGER,
+        };
+        entry.role == Role::Channel && is_cause
     });
+    let cause = cause.map(|entry| entry.name.as_str().to_owned());
     let health = first_of(&domain, &robot, |reader: &mut Reader<EstimatorHealth>| {
         reader.latest().ok()?
     })?;
@@ -106,6 +114,27 @@ fn listen(budgets: &mut Reader<TorqueBudget>, joint: u32) -> Option<TorqueBudget
     }
 }
 
+/// The torque of a joint without a budget: an estimator of an earlier version publishes none.
+fn torque(domain: &Domain, robot: &str, joint: u32) -> Option<TorqueBudget> {
+    let mut reader = Reader::<TorqueEstimate>::open(domain, robot).ok()?;
+    let deadline = monotonic() + LISTEN;
+    let estimate = loop {
+        match next(&mut reader).ok()? {
+            Some(estimate) => break estimate,
+            None if monotonic() >= deadline => return None,
+            None => reader.wait(deadline),
+        };
+    };
+    let torque = *estimate.joints().get(joint as usize)?;
+    Some(TorqueBudget {
+        header: estimate.header,
+        deviation: torque.standard_deviation,
+        torque,
+        joint,
+        ..TorqueBudget::new()
+    })
+}
+
 /// The state of channels, boards and buses; those first that the estimator reads.
 fn system(domain: &Domain, robot: &str, read: Option<&Description>) -> anyhow::Result<System> {
     let health = first_of(domain, robot, |reader: &mut Reader<GatewayHealth>| {
@@ -147,7 +176,7 @@ fn system(domain: &Domain, robot: &str, read: Option<&Description>) -> anyhow::R
         name: name.to_owned(),
         bus,
         state,
-        is_well: level == Level::Ok,
+        level,
     };
     let devices = health.devices().iter();
     let devices = devices.map(|own| part(own.name.as_str(), bus(own.bus), device_state(own)));

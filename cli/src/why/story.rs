@@ -1,6 +1,7 @@
 //! What is known of a torque, and what follows from it for a person: what it is, why, and what to
 //! do. Without input and output.
 
+use proprio_bridge::Level;
 use proprio_topics::{BudgetPart, Reason, Source, TorqueBudget};
 use std::collections::BTreeSet;
 
@@ -18,15 +19,15 @@ pub(super) struct Channel {
 }
 
 /// A board, or a bus.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) struct Part {
     pub(super) name: String,
     /// The bus of a board.
     pub(super) bus: String,
     /// How it is.
     pub(super) state: String,
-    /// Whether that is as it should be.
-    pub(super) is_well: bool,
+    /// How bad that is.
+    pub(super) level: Level,
 }
 
 /// The system that a torque comes from, as far as it is known.
@@ -68,11 +69,18 @@ pub(super) struct Story {
 pub(super) struct Share {
     pub(super) name: String,
     pub(super) variance: f64,
+    /// What it is, or the first of several.
+    pub(super) source: Source,
 }
 
-/// A joint that has moved less since the estimator's start \[rad or m\] shows little of what it
-/// moves: a tenth of the travel that one wants for an identification.
-const UNMOVED: f64 = 0.1;
+/// What to do if a daemon does not run.
+const RESTART: &str = "its log tells more (journalctl -u proprio-gateway -u proprio-estimator): \
+                       start it, or, if it is stopped or stuck, let it go on (kill -CONT) or \
+                       restart it";
+
+/// A joint that has moved through less of its range since the estimator's start shows little of
+/// what it moves.
+const UNMOVED: f64 = 0.05;
 
 impl Known {
     pub(super) fn story(&self) -> Story {
@@ -94,9 +102,10 @@ impl Known {
             });
             return Story {
                 head: format!(
-                    "{joint} is valid: {} +- {} Nm",
+                    "{joint} is valid: {} +- {} {}",
                     digits(budget.torque.torque),
-                    digits(budget.deviation)
+                    digits(budget.deviation),
+                    budget.unit()
                 ),
                 because: because.into_iter().collect(),
                 advice: String::new(),
@@ -166,8 +175,9 @@ impl Known {
                     list(&names(budget, Source::Present))
                 ),
                 &[],
-                "declare absent which are not there (presence = \"possible\"), or give kind = \
-                 \"force\" to those that can not exert a torque",
+                "give presence = \"possible\" to those that are not always there, so that a \
+                 program, a skin or the F/T readings say when they are; or kind = \"force\" to \
+                 those that can not exert a torque",
             ),
             Reason::Uncertain => self.uncertain(budget),
             Reason::Unexplained => told(
@@ -257,7 +267,8 @@ impl Known {
             };
         }
         let largest = shares(budget).into_iter().next();
-        let advice = match budget.parts().first().and_then(|part| part.source.get()) {
+        let advice = match largest.as_ref().map(|share| share.source) {
+            Some(Source::Offset | Source::Drift) if self.identifies => moving(&unmoved),
             Some(Source::Offset | Source::Drift) => {
                 "let the estimator identify the offset ([identification] enabled = true) and move \
                  the robot without a contact; or state it (offset_n, offset_nm), or tare"
@@ -271,7 +282,14 @@ impl Known {
                  steps"
                     .to_owned()
             }
-            _ => "raise the bound if so large a deviation does no harm".to_owned(),
+            Some(Source::Base) => {
+                "level the base, or calibrate its IMU; or raise the bound".to_owned()
+            }
+            Some(Source::Place) => {
+                "declare the contact's place better, or give it a skin; or raise the bound"
+                    .to_owned()
+            }
+            _ => "if so large a deviation does no harm, raise the bound".to_owned(),
         };
         let part = largest.map_or(String::new(), |own| {
             format!(
@@ -280,12 +298,19 @@ impl Known {
                 own.name
             )
         });
+        let part = match unmoved.as_slice() {
+            all @ [_, ..] if self.identifies => {
+                format!("{part}; {} hardly moved", list_has(all))
+            }
+            _ => part,
+        };
         Story {
             head: format!(
-                "its deviation of {} Nm exceeds the bound of {} Nm \
+                "its deviation of {} {unit} exceeds the bound of {} {unit} \
                  (output.max_torque_std_nm){part}",
                 digits(budget.deviation),
-                digits(budget.bound)
+                digits(budget.bound),
+                unit = budget.unit()
             ),
             because: still,
             advice,
@@ -306,9 +331,21 @@ impl Known {
             return Story {
                 head: since,
                 because: Vec::new(),
-                advice: "see `proprio status` for its board".to_owned(),
+                advice: "compare the two configurations: `proprio estimator --check --gateway`"
+                    .to_owned(),
             };
         };
+        if !own.is_silent && own.age.is_some() {
+            return Story {
+                head: format!("samples of {name} come too rarely"),
+                because: vec![
+                    "between two of them was more than input.max_silence_ms allows".to_owned(),
+                ],
+                advice: "compare its rate in `proprio status` with max_silence_ms: three periods \
+                         are a good maximum; a bus that is full, or lost frames, make gaps"
+                    .to_owned(),
+            };
+        }
         let because = match own.device.is_empty() {
             true => vec![since.clone()],
             false => vec![since.clone(), own.comes_from()],
@@ -317,8 +354,7 @@ impl Known {
             return Story {
                 head: trouble.clone(),
                 because,
-                advice: "start it again; its log says why it ended (journalctl -u proprio-gateway)"
-                    .to_owned(),
+                advice: RESTART.to_owned(),
             };
         }
         let bus = system.buses.iter().find(|bus| bus.name == own.bus);
@@ -329,7 +365,7 @@ impl Known {
             "check its interface (ip -details link show), cable, power of the boards, \
                           termination and bit rate"
                 .to_owned();
-        if let Some(bus) = bus.filter(|bus| !bus.is_well) {
+        if let Some(bus) = bus.filter(|bus| bus.level == Level::Error) {
             return Story {
                 head: format!("bus {} is {}", bus.name, bus.state),
                 because,
@@ -344,7 +380,7 @@ impl Known {
             };
         }
         let device = system.device(own);
-        let (head, because) = match device.filter(|device| !device.is_well) {
+        let (head, because) = match device.filter(|device| device.level == Level::Error) {
             Some(device) => (
                 format!(
                     "board {} on bus {} is {}",
@@ -358,11 +394,14 @@ impl Known {
                 because,
             ),
         };
+        let others = match boards.len() > 1 && !all_silent {
+            true => "; other boards of the bus are heard",
+            false => "",
+        };
         Story {
             head,
             because,
-            advice: "check its power, cable and address; other boards of the bus are heard"
-                .to_owned(),
+            advice: format!("check its power, cable and address{others}"),
         }
     }
 
@@ -373,21 +412,17 @@ impl Known {
             return Story {
                 head: trouble.clone(),
                 because: Vec::new(),
-                advice: "start it: `systemctl status proprio-gateway proprio-estimator` and their \
-                         logs tell more"
-                    .to_owned(),
+                advice: RESTART.to_owned(),
             };
         }
-        let known = self.cause.as_deref().and_then(|name| system.channel(name));
-        let silent = known.or_else(|| system.channels.iter().find(|channel| channel.is_silent));
-        match silent {
-            Some(channel) => {
-                let mut story = self.silent(&channel.name);
-                story.because.push(
-                    "an estimate is made for each sample of the trigger channel (output.trigger); \
-                     none comes"
-                        .to_owned(),
-                );
+        let trigger = self.cause.as_deref().and_then(|name| system.channel(name));
+        match trigger.filter(|trigger| trigger.is_silent) {
+            Some(trigger) => {
+                let mut story = self.silent(&trigger.name);
+                story.because.push(format!(
+                    "an estimate is made for each sample of {} (output.trigger)",
+                    trigger.name
+                ));
                 story
             }
             None => Story {
@@ -413,10 +448,11 @@ impl System {
 
     /// What is not as it should be with a channel's board and bus.
     fn conspicuous(&self, channel: &Channel) -> impl Iterator<Item = String> {
-        let device = self.device(channel).filter(|device| !device.is_well);
+        let device = self.device(channel);
+        let device = device.filter(|device| device.level != Level::Ok);
         let bus = self.buses.iter().find(|bus| bus.name == channel.bus);
         let of_device = device.map(|device| format!("board {} is {}", device.name, device.state));
-        let bus = bus.filter(|bus| !bus.is_well);
+        let bus = bus.filter(|bus| bus.level != Level::Ok);
         let of_bus = bus.map(|bus| format!("bus {} is {}", bus.name, bus.state));
         of_device.into_iter().chain(of_bus)
     }
@@ -436,24 +472,42 @@ impl Channel {
 pub(super) fn shares(budget: &TorqueBudget) -> Vec<Share> {
     let matters = |part: &&BudgetPart| part.variance != 0.0 && part.variance.is_finite();
     let parts = budget.parts().iter().filter(matters);
-    let mut all: Vec<(Vec<String>, f64)> = parts
-        .map(|part| (vec![name(part)], part.variance))
+    let mut all: Vec<(Vec<String>, f64, Source)> = parts
+        .map(|part| {
+            let source = part.source.get().unwrap_or(Source::Others);
+            (vec![name(part)], part.variance, source)
+        })
         .collect();
-    while let Some(negative) = all.iter().position(|own| own.1 < 0.0) {
-        let (names, variance) = all.swap_remove(negative);
-        let Some(largest) = all.iter_mut().max_by(|a, b| a.1.total_cmp(&b.1)) else {
-            break;
-        };
-        largest.0.extend(names);
-        largest.1 += variance;
+    // Only these are ever correlated.
+    let is_identified =
+        |source: Source| matches!(source, Source::Offset | Source::Gain | Source::Link);
+    while let Some(negative) = all
+        .iter()
+        .position(|own| own.1 < 0.0 && is_identified(own.2))
+    {
+        let (names, variance, source) = all.swap_remove(negative);
+        let others = all
+            .iter_mut()
+            .filter(|own| is_identified(own.2) && own.1 >= 0.0);
+        match others.max_by(|a, b| a.1.total_cmp(&b.1)) {
+            Some(largest) => {
+                largest.0.extend(names);
+                largest.1 += variance;
+            }
+            None => {
+                all.push((names, variance, source));
+                break;
+            }
+        }
     }
     all.sort_by(|a, b| b.1.total_cmp(&a.1));
-    let together = |(names, variance): (Vec<String>, f64)| Share {
+    let together = |(names, variance, source): (Vec<String>, f64, Source)| Share {
         name: match names.as_slice() {
             [one] => one.clone(),
             all => format!("{}, correlated", all.join(", ")),
         },
         variance,
+        source,
     };
     all.into_iter().map(together).collect()
 }
@@ -565,6 +619,7 @@ mod tests {
             (Source::Gain, "ft", -7.0),
             (Source::Noise, "ft", 1.0),
             (Source::Base, "", 0.0),
+            (Source::Position, "elbow", 7.0),
         ]);
         let shares = shares(&budget);
         let parts: Vec<(&str, f64)> = (shares.iter())
@@ -572,8 +627,12 @@ mod tests {
             .collect();
         let together = "the inertial parameters of hand, the offset of ft, the calibration of ft, \
                         correlated";
-        assert_eq!(parts, [(together, 2.0), ("the noise of ft", 1.0)]);
-        assert!((percent(&shares[0], &budget) - 200.0 / 3.0).abs() < 1e-9);
+        let encoder = "the encoder of elbow (zero and noise)";
+        assert_eq!(
+            parts,
+            [(encoder, 7.0), (together, 2.0), ("the noise of ft", 1.0)]
+        );
+        assert!((percent(&shares[0], &budget) - 70.0).abs() < 1e-9);
     }
 
     #[test]
@@ -584,7 +643,7 @@ mod tests {
             name: name.to_owned(),
             bus: bus.to_owned(),
             state: state.to_owned(),
-            is_well: false,
+            level: Level::Error,
         };
         let head = |system: System| {
             let stale = withheld(Reason::Stale, TorqueBudget::new());
@@ -676,9 +735,10 @@ mod tests {
             "{story:?}"
         );
         assert!(
-            story
-                .head
-                .ends_with("100 % of the variance is the inertial parameters of hand")
+            story.head.ends_with(
+                "100 % of the variance is the inertial parameters of hand; wrist has hardly moved"
+            ),
+            "{story:?}"
         );
         assert_eq!(story.advice, "move wrist, without a contact");
         own.deviation = f64::INFINITY;
@@ -692,9 +752,9 @@ mod tests {
     }
 
     #[test]
-    fn without_estimates_the_first_silent_channel_counts() {
+    fn without_estimates_the_trigger_counts() {
         let channels = vec![
-            channel("wrist", "motor_b", "can1", false),
+            channel("wrist", "motor_b", "can1", true),
             channel("ft", "strain", "can0", true),
             channel("imu", "imu", "can0", false),
         ];
@@ -702,15 +762,31 @@ mod tests {
             channels,
             ..System::default()
         };
-        let story = known(None, None, system).story();
+        let story = known(None, Some("ft"), system.clone()).story();
         assert_eq!(
             story.head,
             "elbow has no torque: board strain on bus can0 is silent"
         );
-        let story = known(None, None, System::default()).story();
+        let story = known(None, Some("imu"), system).story();
         assert_eq!(
             story.head,
             "elbow has no torque: the estimator makes no estimate"
+        );
+    }
+
+    #[test]
+    fn what_is_stale_but_not_silent_comes_too_rarely() {
+        let mut slow = channel("elbow", "motor_a", "can0", false);
+        slow.age = Some(0.02);
+        let system = System {
+            channels: vec![slow],
+            ..System::default()
+        };
+        let stale = withheld(Reason::Stale, TorqueBudget::new());
+        let story = known(Some(stale), Some("elbow"), system).story();
+        assert_eq!(
+            story.head,
+            "elbow is withheld: samples of elbow come too rarely"
         );
     }
 }

@@ -144,10 +144,10 @@ fn keys_replace_the_models_ranges() {
 /// The table of the page: upper ends of the ranges, and a speed of 10 electrical turns per minute.
 #[test]
 fn models_have_the_numbers_of_the_page() {
-    let page = include_str!("../../src/cubemars.rs");
+    let page = include_str!("../../../docs/book/src/devices/cubemars.md");
     let mut models = 0;
-    for row in page.lines().filter(|line| line.starts_with("//! | AK")) {
-        let row = row.trim_start_matches("//! | ").trim_end_matches(" |");
+    for row in page.lines().filter(|line| line.starts_with("| AK")) {
+        let row = row.trim_start_matches("| ").trim_end_matches(" |");
         let cells: Vec<&str> = row.split(" | ").collect();
         let number = |cell: usize| cells[cell].parse::<f64>().unwrap();
         let keys = format!("model = {:?}\n", cells[0]);
@@ -314,7 +314,7 @@ fn frames_that_are_none_of_the_protocol_are_counted() {
 
 #[test]
 fn the_keys_of_the_page_are_legal_and_nothing_is_sent() {
-    let keys = shown_keys(include_str!("../../src/cubemars.rs"));
+    let keys = shown_keys(include_str!("../../../docs/book/src/devices/cubemars.md"));
     assert!(keys.contains("celsius_at_zero"));
     let still = Reading::Joint(JointState {
         position: 1.0,

@@ -148,10 +148,10 @@ fn fields_are_where_other_programs_have_them() {
 /// The table of the page.
 #[test]
 fn models_have_the_numbers_of_the_page() {
-    let page = include_str!("../../src/damiao.rs");
+    let page = include_str!("../../../docs/book/src/devices/damiao.md");
     let mut models = 0;
-    for row in page.lines().filter(|line| line.starts_with("//! | DM")) {
-        let row = row.trim_start_matches("//! | ").trim_end_matches(" |");
+    for row in page.lines().filter(|line| line.starts_with("| DM")) {
+        let row = row.trim_start_matches("| ").trim_end_matches(" |");
         let cells: Vec<&str> = row.split(" | ").collect();
         let number = |cell: usize| cells[cell].parse::<f64>().unwrap();
         let mut device = motor(&format!("model = {:?}", cells[0]), 1, Mode::Listen);
@@ -425,7 +425,7 @@ fn frames_that_are_none_of_the_protocol_are_counted() {
 
 #[test]
 fn the_keys_of_the_page_are_legal() {
-    let keys = shown_keys(include_str!("../../src/damiao.rs"));
+    let keys = shown_keys(include_str!("../../../docs/book/src/devices/damiao.md"));
     assert!(keys.contains("request_period_ms"));
     let mut rig = Rig::new("damiao", &keys, &[0], still());
     rig.run(100);

@@ -189,7 +189,7 @@ fn frames_of_a_wrong_form_are_counted() {
 
 #[test]
 fn the_keys_of_the_page_are_legal_and_nothing_is_sent() {
-    let keys = shown_keys(include_str!("../../src/icub_mc4.rs"));
+    let keys = shown_keys(include_str!("../../../docs/book/src/devices/icub_mc4.md"));
     assert!(keys.contains("velocity_shift"));
     let still = JointState {
         position: 1.0,

@@ -21,14 +21,10 @@ pub(crate) fn options(driver: &str, keys: &str) -> Options {
     }
 }
 
-/// The keys that the page of a driver shows, from its source.
-pub(crate) fn shown_keys(source: &str) -> String {
-    let block = source
-        .split("//! ```toml\n")
-        .nth(1)
-        .expect("a block of keys");
-    let block = block.split("//! ```\n").next().unwrap_or_default();
-    block.replace("//!", "")
+/// The keys that the page of a driver shows.
+pub(crate) fn shown_keys(page: &str) -> &str {
+    let block = page.split("```toml\n").nth(1).expect("a block of keys");
+    block.split("```\n").next().unwrap_or_default()
 }
 
 /// A device at `address` with a maximum silence of 50 ms.

@@ -522,7 +522,9 @@ proptest! {
 
 #[test]
 fn the_keys_on_the_page_of_an_rft_are_its_defaults() {
-    let shown = shown_keys(include_str!("../../src/robotous_rft.rs"));
+    let shown = shown_keys(include_str!(
+        "../../../docs/book/src/devices/robotous_rft.md"
+    ));
     assert_eq!(options("robotous_rft", &shown), options("robotous_rft", ""));
 }
 
@@ -684,7 +686,9 @@ fn wrong_keys_of_an_aft_are_refused() {
         };
         assert_eq!(refused("aidin_aft200", "", address), wrong);
     }
-    let shown = shown_keys(include_str!("../../src/aidin_aft200.rs"));
+    let shown = shown_keys(include_str!(
+        "../../../docs/book/src/devices/aidin_aft200.md"
+    ));
     assert_eq!(options("aidin_aft200", &shown), options("aidin_aft200", ""));
     assert_eq!(options("aidin_aft200", "").default_address(), Some(1));
 }

@@ -122,15 +122,15 @@ fn frames_are_read_as_other_programs_read_them() {
 /// The table of the page; upper ends of the ranges in both protocols.
 #[test]
 fn models_have_the_numbers_of_the_page() {
-    let page = include_str!("../../src/robstride.rs");
+    let page = include_str!("../../../docs/book/src/devices/robstride.md");
     let is_row = |line: &&str| {
-        ["//! | RS", "//! | EL", "//! | Cyb"]
+        ["| RS", "| EL", "| Cyb"]
             .iter()
             .any(|s| line.starts_with(s))
     };
     let mut models = 0;
     for row in page.lines().filter(is_row) {
-        let row = row.trim_start_matches("//! | ").trim_end_matches(" |");
+        let row = row.trim_start_matches("| ").trim_end_matches(" |");
         let cells: Vec<&str> = row.split(" | ").collect();
         let numbers: Vec<f64> = (cells[1].split(", "))
             .chain([cells[2]])
@@ -365,7 +365,7 @@ fn frames_that_are_none_of_the_protocol_are_counted() {
 
 #[test]
 fn the_keys_of_the_page_are_legal() {
-    let keys = shown_keys(include_str!("../../src/robstride.rs"));
+    let keys = shown_keys(include_str!("../../../docs/book/src/devices/robstride.md"));
     assert!(keys.contains("torque_constant"));
     let mut rig = Rig::new("robstride", &keys, &[0], still());
     rig.run(100);

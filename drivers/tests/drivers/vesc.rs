@@ -179,7 +179,7 @@ fn frames_that_are_none_of_the_protocol_are_counted() {
 
 #[test]
 fn nothing_is_sent() {
-    let keys = shown_keys(include_str!("../../src/vesc.rs"));
+    let keys = shown_keys(include_str!("../../../docs/book/src/devices/vesc.md"));
     assert!(keys.contains("gear_ratio"));
     let still = Reading::Joint(JointState {
         position: 1.0,

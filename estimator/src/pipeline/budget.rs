@@ -10,7 +10,9 @@
 
 use super::Pipeline;
 use core::fmt::Write as _;
-use proprio_dynamics::PlaceErrors;
+use proprio_dynamics::model::{JointKind, Model};
+use proprio_dynamics::{PlaceErrors, SensorSet};
+use proprio_identification::robot::ChannelRole;
 use proprio_topics::{BudgetPart, JointTorque, Line, Name, Reason, Residual, Source, TorqueBudget};
 
 impl Pipeline {
@@ -53,10 +55,14 @@ impl Pipeline {
         .sum();
         let (alternative, step) = (doubt.map_or(0.0, |d| d.deviation), of(steps.torque()));
         let least = alternative.max(step);
-        let deviation = own.sqrt().max(least);
+        let deviation = match own.is_nan() {
+            true => f64::NAN,
+            false => own.sqrt().max(least),
+        };
         **budget = TorqueBudget::new();
         budget.header.acquired = estimate.t;
         budget.joint = u32::try_from(joint).ok()?;
+        budget.is_force = u32::from(is_prismatic(&robot.model, dof));
         budget.torque = torque.copied().unwrap_or(JointTorque::ABSENT);
         budget.bound = setup
             .max_deviation
@@ -82,7 +88,11 @@ impl Pipeline {
         for number in rests_on.links.iter() {
             add(Source::Link, robot.model.link_name(number), 0.0);
         }
-        for number in rests_on.dofs.iter() {
+        let is_measured = |number: usize| {
+            let role = ChannelRole::Joint(number);
+            robot.channels.iter().any(|channel| channel.role == role)
+        };
+        for number in rests_on.dofs.iter().filter(|number| is_measured(*number)) {
             add(Source::Position, robot.model.dof_name(number), 0.0);
         }
         for number in rests_on.contacts.iter() {
@@ -135,8 +145,10 @@ impl Pipeline {
                 part.source == Source::Position
                     && part.name.as_str() == robot.model.dof_name(number)
             });
-            let moved = number.and_then(|number| travel.get(number));
-            part.travel = moved.map_or(0.0, |[least, most]| (most - least).max(0.0));
+            part.travel = number.map_or(0.0, |number| {
+                let [least, most] = travel.get(number).copied().unwrap_or_default();
+                (most - least).max(0.0) / range(&robot.model, number)
+            });
         }
         budget.sort();
         if let Some(leading) = doubt.and_then(|doubt| doubt.leading) {
@@ -144,18 +156,43 @@ impl Pipeline {
         }
         let reason = budget.torque.reason;
         let is_disturbed = reason == Reason::Unexplained || reason == Reason::Contradicted;
-        let number = structure
-            .moved_by(dof)
-            .first()
-            .and_then(|link| structure.subtree_of(*link));
-        if let Some(number) = number.filter(|_| is_disturbed)
-            && let Some(top) = robot.subtree_names().nth(number)
-            && let Some(residual) = estimate.contacts.residuals().get(number)
-        {
-            budget.unexplained = told(top, residual);
+        if is_disturbed {
+            // Of the sub-trees of its links, and of those at the same sensors, the one that is
+            // disturbed the most.
+            let subtrees = structure.subtrees();
+            let own = structure.moved_by(dof).iter();
+            let own = own.filter_map(|link| subtrees.get(structure.subtree_of(*link)?));
+            let sensors = own.fold(SensorSet::EMPTY, |all, own| all.union(&own.sensors));
+            let residuals = estimate.contacts.residuals().iter().zip(subtrees);
+            let worst = residuals
+                .zip(robot.subtree_names())
+                .filter(|((residual, subtree), _)| {
+                    !subtree.sensors.intersection(&sensors).is_empty()
+                        && residual.significance.is_finite()
+                })
+                .max_by(|((a, _), _), ((b, _), _)| a.significance.total_cmp(&b.significance));
+            if let Some(((residual, _), top)) = worst {
+                budget.unexplained = told(top, residual);
+            }
         }
         Some(budget)
     }
+}
+
+/// The range of a joint; one without limits counts as if it had 2 rad or 0.2 m.
+fn range(model: &Model, dof: usize) -> f64 {
+    let joint = model.dof_joint(dof);
+    let limits = joint.and_then(|joint| model.limits(joint));
+    let range = limits.map(|own| own.upper - own.lower);
+    let range = range.filter(|range| range.is_finite() && *range > 0.0);
+    range.unwrap_or(if is_prismatic(model, dof) { 0.2 } else { 2.0 })
+}
+
+fn is_prismatic(model: &Model, dof: usize) -> bool {
+    let joint = model
+        .dof_joint(dof)
+        .and_then(|joint| model.joints().get(joint));
+    joint.is_some_and(|joint| matches!(joint.kind, JointKind::Prismatic(_)))
 }
 
 /// What a residual is.

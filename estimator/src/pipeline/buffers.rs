@@ -26,6 +26,15 @@ impl ChannelBuffer {
             Self::Imu(h, ..) => h.newest(),
         }
     }
+
+    /// The stamp of the last sample up to `t`.
+    pub(super) fn newest_at(&self, t: Nanos) -> Option<Nanos> {
+        match self {
+            Self::Joint(h, _) => h.within(Nanos::MIN, t).next().map(|own| own.0),
+            Self::Sensor(h, ..) => h.within(Nanos::MIN, t).next().map(|own| own.0),
+            Self::Imu(h, ..) => h.within(Nanos::MIN, t).next().map(|own| own.0),
+        }
+    }
 }
 
 /// Judges the readings of one channel by those before it.

@@ -198,6 +198,16 @@ impl Pipeline {
         self.counts.not_finite += u64::from(!is_good);
     }
 
+    /// The stamp of the last sample of channel number `channel` up to `t`, as far as samples are
+    /// kept; of a skin, of its newest.
+    #[must_use]
+    pub fn newest_at(&self, channel: usize, t: Nanos) -> Option<Nanos> {
+        match self.buffers.get(channel) {
+            Some(buffer) => buffer.newest_at(t),
+            None => self.newest(channel),
+        }
+    }
+
     /// The stamp of the newest sample of channel number `channel`, of a skin too.
     #[must_use]
     pub fn newest(&self, channel: usize) -> Option<Nanos> {

@@ -76,8 +76,8 @@ pub struct BudgetPart {
     /// error does not matter or is not known. Negative if its error cancels a part of others that
     /// are correlated with it: the mass of a link, and the offset that was identified with it.
     pub variance: f64,
-    /// Of a position: how far the joint has moved since the estimator's start \[rad or m\].
-    /// Otherwise zero.
+    /// Of a position: how far the joint has moved since the estimator's start, as a share of its
+    /// range (of 2 rad or 0.2 m, if the URDF has no limits). Otherwise zero.
     pub travel: f64,
     /// What it is.
     pub source: Code<Source>,
@@ -149,6 +149,10 @@ pub struct TorqueBudget {
     pub joint: u32,
     /// Number of valid entries in `parts`.
     pub count: u32,
+    /// 1 if the joint is prismatic: then it is a force \[N\].
+    pub is_force: u32,
+    /// Unused, zero.
+    pub reserved: u32,
     /// What is likelier than the configured setup, if the readings contradict that; else empty.
     pub likelier: Line,
     /// What the F/T readings of its sub-tree have that nothing explains; else empty.
@@ -183,10 +187,18 @@ impl TorqueBudget {
             bound: f64::INFINITY,
             joint: 0,
             count: 0,
+            is_force: 0,
+            reserved: 0,
             likelier: Line::EMPTY,
             unexplained: Line::EMPTY,
             parts: [BudgetPart::NONE; Self::CAPACITY],
         }
+    }
+
+    /// The unit of the torque.
+    #[must_use]
+    pub const fn unit(&self) -> &'static str {
+        if self.is_force == 0 { "Nm" } else { "N" }
     }
 
     /// The valid parts.
@@ -232,7 +244,7 @@ impl Default for TorqueBudget {
 
 const _: () = assert!(size_of::<BudgetPart>() == 88 && size_of::<Line>() == 256);
 const _: () =
-    assert!(size_of::<TorqueBudget>() == 56 + 32 + 24 + 2 * 256 + 88 * TorqueBudget::CAPACITY);
+    assert!(size_of::<TorqueBudget>() == 56 + 32 + 32 + 2 * 256 + 88 * TorqueBudget::CAPACITY);
 
 #[cfg(test)]
 mod tests {

@@ -75,6 +75,9 @@ coded!(Publisher {
     Estimator = "estimator",
 });
 
+/// The origin of the channel whose samples are the instants of the estimates.
+pub const TRIGGER: &str = "trigger";
+
 /// What an entry's number is an index of.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
@@ -103,7 +106,8 @@ pub struct Entry {
     /// Its name.
     pub name: Name,
     /// What it belongs to: for a contact or a sub-tree, the frame its wrench is expressed in (axes
-    /// and point); for a channel of the gateway, its device. Otherwise empty.
+    /// and point); for a channel of the gateway, its device; for the channel of the estimator whose
+    /// samples are the instants of the estimates, [`TRIGGER`]. Otherwise empty.
     pub origin: Name,
     /// Maximum silence: the longest normal time between two samples \[ns\]; 0 where it has no
     /// meaning.

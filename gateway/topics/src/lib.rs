@@ -53,7 +53,9 @@ pub mod time;
 
 pub use budget::{BudgetPart, Line, Source, TorqueBudget};
 pub use code::{Code, Coded};
-pub use description::{Description, Entry, Name, Publisher, ROBOT_NAME, Role, is_robot_name};
+pub use description::{
+    Description, Entry, Name, Publisher, ROBOT_NAME, Role, TRIGGER, is_robot_name,
+};
 pub use estimate::{
     ContactDeclaration, ContactEstimate, ContactState, ContactWrench, JointTorque, NO_CAUSE,
     NO_CONTACT, Reason, Residual, TorqueEstimate,
