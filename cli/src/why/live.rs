@@ -53,7 +53,7 @@ pub(super) fn know(
         }
         _ => None,
     };
-    let mut channels = names.iter().flat_map(|names| names.entries());
+    let mut channels = names.iter().flat_map(Description::entries);
     let cause = channels.find(|entry| {
         let is_cause = match &budget {
             Some(budget) => entry.index == budget.torque.cause,

@@ -321,7 +321,7 @@ fn the_keys_of_the_page_are_legal_and_nothing_is_sent() {
         velocity: 0.0,
         ..JointState::ABSENT
     });
-    let mut rig = Rig::new("cubemars", &keys, &[0], (0, still));
+    let mut rig = Rig::new("cubemars", keys, &[0], (0, still));
     rig.run(100);
     assert_eq!(rig.device.state(), State::Streaming);
     assert_eq!(joints(&rig.readings).len(), 50);

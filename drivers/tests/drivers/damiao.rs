@@ -427,7 +427,7 @@ fn frames_that_are_none_of_the_protocol_are_counted() {
 fn the_keys_of_the_page_are_legal() {
     let keys = shown_keys(include_str!("../../../docs/book/src/devices/damiao.md"));
     assert!(keys.contains("request_period_ms"));
-    let mut rig = Rig::new("damiao", &keys, &[0], still());
+    let mut rig = Rig::new("damiao", keys, &[0], still());
     rig.run(100);
     assert_eq!(rig.device.state(), State::Streaming);
 }

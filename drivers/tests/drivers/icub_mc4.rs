@@ -196,7 +196,7 @@ fn the_keys_of_the_page_are_legal_and_nothing_is_sent() {
         velocity: 0.5,
         ..JointState::ABSENT
     };
-    let mut rig = Rig::new("icub_mc4", &keys, &[1], (1, Reading::Joint(still)));
+    let mut rig = Rig::new("icub_mc4", keys, &[1], (1, Reading::Joint(still)));
     rig.run(100);
     assert_eq!(
         (rig.device.state(), rig.readings.len()),

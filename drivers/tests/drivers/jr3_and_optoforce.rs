@@ -693,7 +693,7 @@ fn wrong_keys_of_a_jr3_are_refused() {
         assert_eq!(refused("jr3_can", "", address), wrong);
     }
     let shown = shown_keys(include_str!("../../../docs/book/src/devices/jr3_can.md"));
-    assert_eq!(options("jr3_can", &shown), options("jr3_can", JR3));
+    assert_eq!(options("jr3_can", shown), options("jr3_can", JR3));
     assert_eq!(options("jr3_can", "").default_address(), Some(1));
 }
 
@@ -1240,7 +1240,7 @@ fn wrong_keys_of_an_optoforce_are_refused() {
     let shown = shown_keys(include_str!(
         "../../../docs/book/src/devices/optoforce_daq.md"
     ));
-    let shown = options("optoforce_daq", &shown);
+    let shown = options("optoforce_daq", shown);
     let same =
         "counts_per_newton = [26.42, 28.80, 3.02]\nrate_hz = 100\nfilter_hz = 15\nzero = false";
     assert_eq!(shown, options("optoforce_daq", same));

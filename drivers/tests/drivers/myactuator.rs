@@ -363,7 +363,7 @@ fn frames_that_are_none_of_the_protocol_are_counted() {
 fn the_keys_of_the_page_are_legal() {
     let keys = shown_keys(include_str!("../../../docs/book/src/devices/myactuator.md"));
     assert!(keys.contains("encoder_bits"));
-    let mut rig = Rig::new("myactuator", &keys, &[0], still());
+    let mut rig = Rig::new("myactuator", keys, &[0], still());
     rig.run(100);
     assert_eq!(rig.device.state(), State::Streaming);
 }

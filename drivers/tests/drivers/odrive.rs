@@ -471,7 +471,7 @@ fn a_silence_ends_what_was_held() {
 fn the_keys_of_the_page_are_legal() {
     let keys = shown_keys(include_str!("../../../docs/book/src/devices/odrive.md"));
     assert!(keys.contains("request_period_ms = 10"));
-    let mut rig = Rig::new("odrive", &keys, &[0], still());
+    let mut rig = Rig::new("odrive", keys, &[0], still());
     rig.run(50);
     assert_eq!(rig.device.state(), State::Streaming);
 }

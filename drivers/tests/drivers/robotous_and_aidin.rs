@@ -525,7 +525,7 @@ fn the_keys_on_the_page_of_an_rft_are_its_defaults() {
     let shown = shown_keys(include_str!(
         "../../../docs/book/src/devices/robotous_rft.md"
     ));
-    assert_eq!(options("robotous_rft", &shown), options("robotous_rft", ""));
+    assert_eq!(options("robotous_rft", shown), options("robotous_rft", ""));
 }
 
 /// The values are those that the README of rise-lab-skku/rise-aft-can shows of its sensor; the
@@ -689,7 +689,7 @@ fn wrong_keys_of_an_aft_are_refused() {
     let shown = shown_keys(include_str!(
         "../../../docs/book/src/devices/aidin_aft200.md"
     ));
-    assert_eq!(options("aidin_aft200", &shown), options("aidin_aft200", ""));
+    assert_eq!(options("aidin_aft200", shown), options("aidin_aft200", ""));
     assert_eq!(options("aidin_aft200", "").default_address(), Some(1));
 }
 

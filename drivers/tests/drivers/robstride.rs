@@ -367,7 +367,7 @@ fn frames_that_are_none_of_the_protocol_are_counted() {
 fn the_keys_of_the_page_are_legal() {
     let keys = shown_keys(include_str!("../../../docs/book/src/devices/robstride.md"));
     assert!(keys.contains("torque_constant"));
-    let mut rig = Rig::new("robstride", &keys, &[0], still());
+    let mut rig = Rig::new("robstride", keys, &[0], still());
     rig.run(100);
     assert_eq!(rig.device.state(), State::Streaming);
 }

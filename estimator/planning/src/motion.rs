@@ -14,7 +14,7 @@
 //! acceleration. (Swevers et al., "Optimal robot excitation and identification", T-RA 1997, use
 //! the series without a fade.)
 //!
-//! Limits hold between the checked instants too: these are [`GRID`] apart, and what a harmonic can
+//! Limits hold between the checked instants too: these are `GRID` apart, and what a harmonic can
 //! rise in between is within the [`MARGIN`] that is kept.
 
 use crate::workspace::State;
