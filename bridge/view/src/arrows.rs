@@ -35,7 +35,7 @@ pub(crate) fn scene(
         match arrow(contact) {
             Some((arrow, force)) => scene.entities.push(SceneEntity {
                 timestamp,
-                frame_id: entry.frame.as_str().to_owned(),
+                frame_id: entry.origin.as_str().to_owned(),
                 id,
                 lifetime: Some(Duration::saturating_from_secs_f64(lifetime.seconds())),
                 frame_locked: true,

@@ -68,14 +68,17 @@ impl Model {
                 pose,
             })
         });
-        let fixed = self.dynamics.folded_links().filter_map(|(parent, child)| {
-            let pose = between(parent, self.dynamics.frame(child)?.pose)?;
-            Some(Transform {
-                parent,
-                child,
-                pose,
-            })
-        });
+        let fixed = self
+            .dynamics
+            .folded_joints()
+            .filter_map(|(_, [parent, child])| {
+                let pose = between(parent, self.dynamics.frame(child)?.pose)?;
+                Some(Transform {
+                    parent,
+                    child,
+                    pose,
+                })
+            });
         moving.chain(fixed).collect()
     }
 }
