@@ -80,8 +80,7 @@ enum Verb {
     Status(status::Status),
     /// Show a running robot on the whole terminal: torques, contacts, channels, buses
     Top(top::Top),
-    /// Say why a torque is what it is: what it rests on, what its deviation is made of, and why it
-    /// is withheld
+    /// Say why a torque is what it is, how uncertain it is and why, or why it is withheld
     Why(why::Args),
     /// Print the samples of a channel, the torques or the contacts as they come
     Echo(echo::Echo),
@@ -97,7 +96,7 @@ enum Verb {
     Doctor(doctor::Args),
     /// Install this program, its systemd units and a robot's configuration
     Install(install::Args),
-    /// Show a page of the book: a key, a driver, a reason, a verb; `help topics` lists the pages
+    /// Show a page of the book: a key, a driver, a reason, a verb; `help topics` lists all
     Help(help::Args),
     /// Print the completions of a shell: `source <(proprio completions bash)`
     Completions {
