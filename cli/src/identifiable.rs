@@ -2,7 +2,7 @@
 //! further sensor, or the motion of which joint, would tell more.
 
 use anyhow::Context;
-use proprio_dynamics::model::{JointKind, Model};
+use proprio_dynamics::model::Model;
 use proprio_estimator::config::{Config, ConfigError, ForceTorque};
 use proprio_estimator::setup::{Setup, nearest};
 use proprio_identification::{Robot, parallel};
@@ -174,13 +174,7 @@ pub(crate) fn without(robot: &Robot, absent: &[String]) -> Result<Robot, String>
 
 /// The unit of a torque.
 pub(crate) fn unit(model: &Model, dof: usize) -> &'static str {
-    let joint = model
-        .dof_joint(dof)
-        .and_then(|joint| model.joints().get(joint));
-    match joint.map(|joint| joint.kind) {
-        Some(JointKind::Prismatic(_)) => "N",
-        _ => "Nm",
-    }
+    if model.is_prismatic(dof) { "N" } else { "Nm" }
 }
 
 /// A number with two digits.

@@ -41,7 +41,7 @@ fn robots(domain: &Domain, name: Option<&str>) -> anyhow::Result<Vec<RobotPresen
 }
 
 /// The newest payload of a topic with history.
-fn newest<T: Topic>(domain: &Domain, robot: &str) -> Result<Option<T>, PortError> {
+pub(crate) fn newest<T: Topic>(domain: &Domain, robot: &str) -> Result<Option<T>, PortError> {
     let found = first_of(domain, robot, |reader: &mut Reader<T>| {
         reader.latest().ok()?
     })?;

@@ -91,7 +91,7 @@ use estimate::root_of_squares;
 use identification::OnlineIdentification;
 use motion::{ENCODER_OFFSET_STD, MotionErrors};
 use prediction::{Extrapolated, Predictor};
-use proprio_dynamics::model::{JointKind, Model};
+use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
 use proprio_dynamics::{
     ContactSet, Dependence, FrameMotion, Kinematics, Noise, PlaceErrors, SensorCut, Solver,
@@ -612,12 +612,6 @@ fn predicted<const N: usize, const D: usize>(
 
 /// Per degree of freedom, the standard deviation of the encoder offset \[rad or m\].
 fn encoder_offset_std(model: &Model) -> Vec<f64> {
-    let of_dof = |dof: usize| {
-        let kind = model
-            .dof_joint(dof)
-            .and_then(|joint| model.joints().get(joint))
-            .map(|joint| &joint.kind);
-        ENCODER_OFFSET_STD[usize::from(matches!(kind, Some(JointKind::Prismatic(_))))]
-    };
+    let of_dof = |dof| ENCODER_OFFSET_STD[usize::from(model.is_prismatic(dof))];
     (0..model.dof_count()).map(of_dof).collect()
 }

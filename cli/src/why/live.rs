@@ -1,8 +1,9 @@
 //! What a running system says of a torque: its budget, and the state of boards and buses.
 
 use super::story::{Channel, Known, Part, System};
+use crate::status::newest;
 use anyhow::{anyhow, bail};
-use proprio_bridge::{Described, Level, bus_state, device_state, first_of, next, one_robot, open};
+use proprio_bridge::{Described, Level, bus_state, device_state, next, one_robot, open};
 use proprio_estimator::setup::nearest;
 use proprio_topics::ipc::{Domain, DomainConfig, PortError, Presence, Reader, monotonic};
 use proprio_topics::{
@@ -63,14 +64,12 @@ pub(super) fn know(
         entry.role == Role::Channel && is_cause
     });
     let cause = cause.map(|entry| entry.name.as_str().to_owned());
-    let health = first_of(&domain, &robot, |reader: &mut Reader<EstimatorHealth>| {
-        reader.latest().ok()?
-    })?;
+    let health = newest::<EstimatorHealth>(&domain, &robot)?;
     Ok(Known {
         joint: joint.to_owned(),
         budget,
         cause,
-        identifies: health.is_some_and(|(_, health)| health.identification.groups > 0),
+        identifies: health.is_some_and(|health| health.identification.groups > 0),
         system: System {
             trouble,
             ..system(&domain, &robot, names.as_ref())?
@@ -137,11 +136,9 @@ fn torque(domain: &Domain, robot: &str, joint: u32) -> Option<TorqueBudget> {
 
 /// The state of channels, boards and buses; those first that the estimator reads.
 fn system(domain: &Domain, robot: &str, read: Option<&Description>) -> anyhow::Result<System> {
-    let health = first_of(domain, robot, |reader: &mut Reader<GatewayHealth>| {
-        reader.latest().ok()?
-    })?;
+    let health = newest::<GatewayHealth>(domain, robot)?;
     let names = Described::by(domain, robot, Publisher::Gateway)?;
-    let (Some((_, health)), Some(names)) = (health, names) else {
+    let (Some(health), Some(names)) = (health, names) else {
         return Ok(System::default());
     };
     let bus = |number: u32| {

@@ -411,6 +411,13 @@ impl Model {
         self.dofs.get(dof).copied()
     }
 
+    /// Whether the joint that a degree of freedom is named after is prismatic: its torque is a
+    /// force \[N\].
+    pub fn is_prismatic(&self, dof: usize) -> bool {
+        let joint = self.dof_joint(dof).and_then(|joint| self.joints.get(joint));
+        joint.is_some_and(|joint| matches!(joint.kind, JointKind::Prismatic(_)))
+    }
+
     /// Name of the joint that has this degree of freedom. Empty if there is no such dof.
     pub fn dof_name(&self, dof: usize) -> &str {
         self.dof_joint(dof)

@@ -6,7 +6,7 @@
 use fastrand::Rng;
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::calibration::Unknown;
-use proprio_dynamics::model::{JointKind, Limits, Model};
+use proprio_dynamics::model::{Limits, Model};
 use proprio_dynamics::regressor::identifiable::Column;
 use proprio_dynamics::regressor::{EstimateRows, LINK_PARAMETERS};
 use proprio_dynamics::spatial::{Vec3, Wrench};
@@ -53,11 +53,7 @@ pub fn measured(robot: &Robot) -> impl Iterator<Item = usize> {
 #[must_use]
 pub fn range(model: &Model, dof: usize) -> Limits {
     let joint = model.dof_joint(dof).unwrap_or_default();
-    let is_prismatic = matches!(
-        model.joints().get(joint).map(|joint| joint.kind),
-        Some(JointKind::Prismatic(_))
-    );
-    let half = if is_prismatic { 0.3 } else { PI };
+    let half = if model.is_prismatic(dof) { 0.3 } else { PI };
     let limits = model.limits(joint).filter(|own| own.upper > own.lower);
     limits.unwrap_or(Limits {
         lower: -half,
@@ -175,8 +171,7 @@ fn states(robot: &Robot, count: usize) -> Vec<State> {
             let mut within = |low: f64, high: f64| low + (high - low) * rng.f64();
             let Limits { lower, upper } = range(model, dof);
             let joint = model.dof_joint(dof).unwrap_or_default();
-            let is_prismatic = matches!(model.joints()[joint].kind, JointKind::Prismatic(_));
-            let usual = SPEED[usize::from(is_prismatic)];
+            let usual = SPEED[usize::from(model.is_prismatic(dof))];
             let speed = model.velocity(joint).unwrap_or(usual).min(usual) / 2.0;
             let drawn = [
                 within(lower, upper),

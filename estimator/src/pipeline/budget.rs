@@ -10,7 +10,7 @@
 
 use super::Pipeline;
 use core::fmt::Write as _;
-use proprio_dynamics::model::{JointKind, Model};
+use proprio_dynamics::model::Model;
 use proprio_dynamics::{PlaceErrors, SensorSet};
 use proprio_identification::robot::ChannelRole;
 use proprio_topics::{BudgetPart, JointTorque, Line, Name, Reason, Residual, Source, TorqueBudget};
@@ -62,7 +62,7 @@ impl Pipeline {
         **budget = TorqueBudget::new();
         budget.header.acquired = estimate.t;
         budget.joint = u32::try_from(joint).ok()?;
-        budget.is_force = u32::from(is_prismatic(&robot.model, dof));
+        budget.is_force = u32::from(robot.model.is_prismatic(dof));
         budget.torque = torque.copied().unwrap_or(JointTorque::ABSENT);
         budget.bound = setup
             .max_deviation
@@ -70,30 +70,35 @@ impl Pipeline {
             .copied()
             .unwrap_or(f64::INFINITY);
         budget.deviation = deviation;
-        let mut add = |source: Source, name: &str, variance: f64| {
+        let part = |source: Source, name: &str, variance: f64| BudgetPart {
+            name: Name::new(name).unwrap_or(Name::EMPTY),
+            variance,
+            source: source.in_memory(),
+            ..BudgetPart::NONE
+        };
+        let rests_on = dependences.torques.get(dof).copied().unwrap_or_default();
+        let is_measured = |number: usize| {
+            let role = ChannelRole::Joint(number);
+            robot.channels.iter().any(|channel| channel.role == role)
+        };
+        for number in rests_on.dofs.iter().filter(|number| is_measured(*number)) {
+            let [least, most] = travel.get(number).copied().unwrap_or_default();
             budget.add(BudgetPart {
-                name: Name::new(name).unwrap_or(Name::EMPTY),
-                variance,
-                source: source.in_memory(),
-                ..BudgetPart::NONE
+                travel: (most - least).max(0.0) / range(&robot.model, number),
+                ..part(Source::Position, robot.model.dof_name(number), 0.0)
             });
+        }
+        let mut add = |source: Source, name: &str, variance: f64| {
+            budget.add(part(source, name, variance));
         };
         let sensor = |number: usize| robot.sensor_names().nth(number).unwrap_or_default();
         let contact = |number: usize| robot.contact_names().nth(number).unwrap_or_default();
-        let rests_on = dependences.torques.get(dof).copied().unwrap_or_default();
         for number in rests_on.sensors.iter() {
             let noise = solver.torque_noise(structure, dof, number);
             add(Source::Noise, sensor(number), noise);
         }
         for number in rests_on.links.iter() {
             add(Source::Link, robot.model.link_name(number), 0.0);
-        }
-        let is_measured = |number: usize| {
-            let role = ChannelRole::Joint(number);
-            robot.channels.iter().any(|channel| channel.role == role)
-        };
-        for number in rests_on.dofs.iter().filter(|number| is_measured(*number)) {
-            add(Source::Position, robot.model.dof_name(number), 0.0);
         }
         for number in rests_on.contacts.iter() {
             add(Source::Present, contact(number), 0.0);
@@ -140,16 +145,6 @@ impl Pipeline {
             };
             add(source, "", least * least - own);
         }
-        for part in budget.parts.iter_mut().take(budget.count as usize) {
-            let number = rests_on.dofs.iter().find(|&number| {
-                part.source == Source::Position
-                    && part.name.as_str() == robot.model.dof_name(number)
-            });
-            part.travel = number.map_or(0.0, |number| {
-                let [least, most] = travel.get(number).copied().unwrap_or_default();
-                (most - least).max(0.0) / range(&robot.model, number)
-            });
-        }
         budget.sort();
         if let Some(leading) = doubt.and_then(|doubt| doubt.leading) {
             budget.likelier = line(format_args!("{}", leading.describe(robot)));
@@ -185,14 +180,7 @@ fn range(model: &Model, dof: usize) -> f64 {
     let limits = joint.and_then(|joint| model.limits(joint));
     let range = limits.map(|own| own.upper - own.lower);
     let range = range.filter(|range| range.is_finite() && *range > 0.0);
-    range.unwrap_or(if is_prismatic(model, dof) { 0.2 } else { 2.0 })
-}
-
-fn is_prismatic(model: &Model, dof: usize) -> bool {
-    let joint = model
-        .dof_joint(dof)
-        .and_then(|joint| model.joints().get(joint));
-    joint.is_some_and(|joint| matches!(joint.kind, JointKind::Prismatic(_)))
+    range.unwrap_or(if model.is_prismatic(dof) { 0.2 } else { 2.0 })
 }
 
 /// What a residual is.

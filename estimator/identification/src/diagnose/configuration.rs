@@ -37,7 +37,7 @@ mod mounting;
 
 use crate::dataset::Role;
 use crate::dataset::observation::{Annotated, Observation};
-use crate::diagnose::configuration::fault::{Compared, Fault, slides, torque_faults, wrench_fault};
+use crate::diagnose::configuration::fault::{Compared, Fault, torque_faults, wrench_fault};
 use crate::diagnose::configuration::mounting::{Mounting, mountings};
 use crate::finding::{Finding, FindingCode};
 use crate::hypothesis::accepted;
@@ -363,7 +363,9 @@ impl Evidence {
             .iter()
             .map(|group| Compared::new(&group.gram, group.rows, &torque))
             .collect();
-        let slides: Vec<bool> = (0..compared.len()).map(|dof| slides(robot, dof)).collect();
+        let slides: Vec<bool> = (0..compared.len())
+            .map(|dof| robot.model.is_prismatic(dof))
+            .collect();
         let faults = torque_faults(&compared, &slides).into_iter().enumerate();
         faults
             .filter_map(|(dof, fault)| Some((dof, fault?)))

@@ -4,7 +4,6 @@
 use crate::finding::{Finding, FindingCode, Severity};
 use crate::robot::Robot;
 use nalgebra::{DMatrix, DVector};
-use proprio_dynamics::model::JointKind;
 
 /// Fewest values for a comparison with the prediction.
 const MIN_VALUES: f64 = 50.0;
@@ -129,7 +128,7 @@ impl Fault {
     /// Why a joint's torque is left out, and the finding.
     pub(super) fn of_torque(self, robot: &Robot, dof: usize) -> (String, Finding) {
         let joint = robot.model.dof_name(dof);
-        let (unit, units) = if slides(robot, dof) {
+        let (unit, units) = if robot.model.is_prismatic(dof) {
             ("N", "newtons")
         } else {
             ("Nm", "newton metres")
@@ -194,13 +193,6 @@ impl Fault {
             ),
         )
     }
-}
-
-/// Whether a joint is prismatic.
-pub(super) fn slides(robot: &Robot, dof: usize) -> bool {
-    let joint = robot.model.dof_joint(dof);
-    let joint = joint.map(|joint| robot.model.joints()[joint]);
-    joint.is_some_and(|joint| matches!(joint.kind, JointKind::Prismatic(_)))
 }
 
 #[cfg(test)]
