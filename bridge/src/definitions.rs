@@ -80,6 +80,27 @@ pub fn torques() -> Definition {
     Definition::new("proprio_msgs/msg/Torques", text)
 }
 
+/// The torques of drives, and whether they agree.
+#[must_use]
+pub fn drives() -> Definition {
+    let text = "# What the joints' drives report, less friction and rotor [Nm, N], beside the torques\n\
+                # from the force/torque sensors.\n\
+                # CLOCK_MONOTONIC [ns]\n\
+                int64 acquired\n\
+                string[] joint\n\
+                # NaN: it reports nothing\n\
+                float64[] torque\n\
+                float64[] standard_deviation\n\
+                # unknown, agrees or disagrees\n\
+                string[] agreement\n\
+                # The smoothed difference, in deviations of both together.\n\
+                float64[] deviate\n\
+                # What may have caused disagreements: contact, sensor or drive, and its name.\n\
+                string[] candidate\n\
+                string[] candidate_name\n";
+    Definition::new("proprio_msgs/msg/Drives", text)
+}
+
 /// The torque of one joint, with a band for plots.
 #[must_use]
 pub fn joint_torque() -> Definition {

@@ -5,8 +5,8 @@ use crate::described::{Described, next};
 use proprio_topics::csv::{Series, Value, What};
 use proprio_topics::ipc::{Domain, DomainConfig, DomainError, PortError, Reader, TakeError, Topic};
 use proprio_topics::{
-    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth, MAX_CHANNELS,
-    Nanos, Publisher, Role, Sample, TorqueEstimate,
+    ContactDeclaration, ContactEstimate, Description, DriveEstimate, EstimatorHealth,
+    GatewayHealth, MAX_CHANNELS, Nanos, Publisher, Role, Sample, TorqueEstimate,
 };
 use std::rc::Rc;
 use std::sync::atomic::AtomicBool;
@@ -100,6 +100,8 @@ pub enum Heard {
     Torques(Box<TorqueEstimate>, Rc<Description>),
     /// Contact wrenches, likewise.
     Contacts(Box<ContactEstimate>, Rc<Description>),
+    /// What the drives say of the torques, likewise.
+    Drives(Box<DriveEstimate>, Rc<Description>),
     /// How the gateway is.
     Gateway(Box<GatewayHealth>),
     /// How the estimator is.
@@ -137,6 +139,8 @@ impl Names {
 struct Estimates {
     torques: Reader<TorqueEstimate>,
     contacts: Reader<ContactEstimate>,
+    /// None if no drive is known.
+    drives: Option<Reader<DriveEstimate>>,
     health: Option<Reader<EstimatorHealth>>,
     names: Names,
 }
@@ -147,6 +151,7 @@ impl Estimates {
         Some(Self {
             torques: Reader::open(domain, robot).ok()?,
             contacts: Reader::open(domain, robot).ok()?,
+            drives: Reader::open(domain, robot).ok(),
             health: Reader::open(domain, robot).ok(),
             names: Names {
                 described: Described::to_come(domain, robot, Publisher::Estimator).ok()?,
@@ -318,11 +323,14 @@ impl Listener {
         self.lost + self.samples.lost()
     }
 
-    /// Estimates (torques, and contacts) that came too fast to be read, or before the names of
+    /// Estimates (torques, contacts, drives) that came too fast to be read, or before the names of
     /// their estimator, and are lost.
     #[must_use]
     pub fn lost_estimates(&self) -> u64 {
-        let of = |estimates: &Estimates| estimates.torques.lost() + estimates.contacts.lost();
+        let of = |estimates: &Estimates| {
+            let drives = estimates.drives.as_ref().map_or(0, Reader::lost);
+            estimates.torques.lost() + estimates.contacts.lost() + drives
+        };
         self.lost_estimates + self.estimates.as_ref().map_or(0, of)
     }
 
@@ -428,6 +436,7 @@ impl Listener {
         if let Some(Estimates {
             torques,
             contacts,
+            drives,
             health,
             names,
         }) = &mut self.estimates
@@ -435,6 +444,9 @@ impl Listener {
             let lost = &mut self.lost_estimates;
             *lost += gather_named(torques, names, Heard::Torques, inbox)?;
             *lost += gather_named(contacts, names, Heard::Contacts, inbox)?;
+            if let Some(drives) = drives {
+                *lost += gather_named(drives, names, Heard::Drives, inbox)?;
+            }
             gather_health(health, Heard::Estimator, inbox)?;
         }
         Ok(())

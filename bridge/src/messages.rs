@@ -6,8 +6,9 @@ use crate::diagnostics;
 use crate::listener::Heard;
 use proprio_topics::csv::{Series, Value, What};
 use proprio_topics::{
-    ContactEstimate, ContactState, Description, Entry, EstimatorHealth, GatewayHealth, Imu,
-    JointState, JointTorque, Kind, Nanos, Quality, Reading, Role, TorqueEstimate, Wrench,
+    Agreement, Candidate, ContactEstimate, ContactState, Description, DriveEstimate, Entry,
+    EstimatorHealth, GatewayHealth, Imu, JointState, JointTorque, Kind, Nanos, Quality, Reading,
+    Role, TorqueEstimate, Wrench,
 };
 use std::collections::BTreeMap;
 
@@ -246,6 +247,7 @@ impl<S: Sink> Messages<S> {
             Heard::Value(series, value) => self.value(t, *series, value),
             Heard::Torques(torques, names) => self.torques(names, torques),
             Heard::Contacts(contacts, names) => self.contacts(names, contacts),
+            Heard::Drives(drives, names) => self.drives(names, drives),
             Heard::Gateway(health) => {
                 self.gateway = Some(health.clone());
                 Ok(())
@@ -453,6 +455,42 @@ impl<S: Sink> Messages<S> {
             self.wrench("external", entry, t, residual.force, residual.torque)?;
         }
         Ok(())
+    }
+
+    /// What the drives say of the torques of an instant, of the estimator that sent `names`.
+    ///
+    /// # Errors
+    /// Those of the sink.
+    pub fn drives(
+        &mut self,
+        names: &Description,
+        estimate: &DriveEstimate,
+    ) -> Result<(), S::Error> {
+        let t = estimate.header.acquired;
+        let (drives, candidates) = (estimate.drives(), estimate.candidates());
+        self.send("/drives", definitions::drives, t, |_| {
+            let mut message = Message::new();
+            message.i64(t.0);
+            message.count(drives.len());
+            (drives.iter()).for_each(|own| message.text(name(names, Role::Joint, own.joint)));
+            message.count(drives.len());
+            drives.iter().for_each(|own| message.f64s(&[own.torque]));
+            message.count(drives.len());
+            (drives.iter()).for_each(|own| message.f64s(&[own.standard_deviation]));
+            message.count(drives.len());
+            for own in drives {
+                message.text(own.agreement.get().map_or("?", Agreement::word));
+            }
+            message.count(drives.len());
+            drives.iter().for_each(|own| message.f64s(&[own.deviate]));
+            message.count(candidates.len());
+            for own in candidates {
+                message.text(own.kind.get().map_or("?", Candidate::word));
+            }
+            message.count(candidates.len());
+            (candidates.iter()).for_each(|own| message.text(own.name.as_str()));
+            message
+        })
     }
 
     /// A wrench \[N, Nm\] on the topic `/<what>/<name>`, in the frame of its entry.

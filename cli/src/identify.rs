@@ -7,6 +7,7 @@
 //! program exits with 1.
 
 pub(crate) mod advice;
+mod drives;
 #[cfg(test)]
 mod example;
 mod logs;
@@ -139,15 +140,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let outcome = result?;
 
     let advice = Advice::of(&outcome);
-    let json = summary::summary(&outcome, &advice);
-    let mut text = serde_json::to_string_pretty(&json)?;
-    text.push('\n');
+    let mut json = summary::summary(&outcome, &advice);
+    let mut found = Vec::new();
     if advice.grade != Grade::Reject {
-        let parameters = export::parameters(
+        let mut parameters = export::parameters(
             &outcome,
             &setup.robot,
             concat!("proprio ", env!("CARGO_PKG_VERSION")),
         )?;
+        found = drives::identify(&setup, &parameters, &outcome, &files, &args.config)?;
+        let drives = found.iter().filter_map(|(_, drive)| drive.as_ref().ok());
+        parameters.set_drives(&drives.cloned().collect::<Vec<_>>())?;
         let file = out.join("parameters.toml");
         parameters
             .save(&file)
@@ -157,6 +160,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             .with_context(|| config.model.display().to_string())?;
         write(out, "identified.urdf", &urdf)?;
     }
+    json["drives"] = drives::in_json(&found);
+    let mut text = serde_json::to_string_pretty(&json)?;
+    text.push('\n');
     // The summary is written last: if it exists, the others do.
     write(out, "report.html", &page::page(&outcome, &advice))?;
     write(out, "summary.json", &text)?;
@@ -168,10 +174,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             sentence(&finding.text)
         );
     }
+    for warning in drives::warnings(&found) {
+        eprintln!("warning: {warning}");
+    }
     if args.json {
         print_line!("{json}");
     } else {
-        print_outcome(&outcome, &advice, out);
+        print_outcome(&outcome, &advice, &found, out);
     }
     if let Verdict::Nothing(reason) = &outcome.verdict {
         bail!(
@@ -207,13 +216,16 @@ fn write(folder: &Path, name: &str, text: &str) -> anyhow::Result<()> {
 }
 
 /// The result in a few lines.
-fn print_outcome(outcome: &Outcome, advice: &Advice, out: &Path) {
+fn print_outcome(outcome: &Outcome, advice: &Advice, found: &[drives::Found], out: &Path) {
     print_line!(
         "{}: {}",
         outcome.robot,
         advice.grade.headline().to_lowercase()
     );
     for line in &advice.why {
+        print_line!("  {line}");
+    }
+    if let Some(line) = drives::line(found) {
         print_line!("  {line}");
     }
     if !advice.next.is_empty() {

@@ -94,6 +94,9 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     if !story.advice.is_empty() {
         print_line!("  what to do: {}", story.advice);
     }
+    if !known.opinion.is_empty() {
+        print_line!("  second opinion: {}", known.opinion);
+    }
     if let Some(budget) = &known.budget {
         print_budget(budget);
     }
@@ -228,6 +231,7 @@ fn in_json(known: &Known, story: &Story, at: Option<Nanos>, spells: &[Spell]) ->
     json!({
         "joint": known.joint, "t": at.map(Nanos::seconds), "why": story.head,
         "because": story.because, "advice": story.advice, "cause": known.cause, "budget": budget,
+        "opinion": (!known.opinion.is_empty()).then_some(&known.opinion),
         "times": times.collect::<Vec<_>>(),
     })
 }

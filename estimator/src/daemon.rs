@@ -22,9 +22,9 @@ use proprio_topics::ipc::{
     monotonic, open_files_remedy,
 };
 use proprio_topics::{
-    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
-    IdentificationHealth, InertiaEstimate, Nanos, Publisher, Role, Sample, TorqueBudget,
-    TorqueEstimate, realtime,
+    ContactDeclaration, ContactEstimate, Description, DriveEstimate, EstimatorHealth,
+    GatewayHealth, IdentificationHealth, InertiaEstimate, Nanos, Publisher, Role, Sample,
+    TorqueBudget, TorqueEstimate, realtime,
 };
 use sd_notify::NotifyState;
 use std::io::Write as _;
@@ -231,6 +231,8 @@ struct Ports {
     torques: Writer<TorqueEstimate>,
     contacts: Writer<ContactEstimate>,
     budgets: Writer<TorqueBudget>,
+    /// What the drives say of the torques; none if no drive is known.
+    drives: Option<Writer<DriveEstimate>>,
     /// The identified parameters; none if identification is off.
     inertias: Option<Writer<InertiaEstimate>>,
     health: Writer<EstimatorHealth>,
@@ -256,6 +258,10 @@ impl Ports {
             torques: Writer::create(&domain, robot, epoch)?,
             contacts: Writer::create(&domain, robot, epoch)?,
             budgets: Writer::create(&domain, robot, epoch)?,
+            drives: match setup.drives.is_empty() {
+                true => None,
+                false => Some(Writer::create(&domain, robot, epoch)?),
+            },
             inertias: match identifies {
                 true => Some(Writer::create(&domain, robot, epoch)?),
                 false => None,
@@ -510,6 +516,9 @@ impl DataPlane {
                 // There is one job, so the queue has room. If the thread has ended, the error is
                 // reported elsewhere.
                 let _ = jobs.try_send(job);
+            }
+            if let (Some(writer), Some(drives)) = (&mut self.ports.drives, self.pipeline.drives()) {
+                self.health.publish_failures += u64::from(writer.send(drives, now).is_err());
             }
             self.publish_budget(now);
         }

@@ -29,6 +29,8 @@
 //! - Parameters: [`inertial`] holds the parameters in use, [`parameters`] is the file
 //!   parameters.toml, [`export`] writes it from an identification result.
 //! - Uncertainty: [`propagation`] turns the covariance of the parameters into standard deviations.
+//! - Drives: [`drive`] identifies what joints' drives report from the torques of the F/T sensors;
+//!   the pipeline compares both.
 //! - Programs: [`daemon`] and [`offline`] run the pipeline, [`check`] and `description` print what
 //!   `--check` shows, [`assessment`] measures the accuracy of a run, `first_look` tests the first
 //!   samples for implausible readings, `gateway_log` says who is missing, [`files`] replaces files
@@ -44,6 +46,7 @@ pub mod config;
 pub mod daemon;
 mod description;
 pub mod differentiate;
+pub mod drive;
 pub mod export;
 pub mod files;
 mod first_look;

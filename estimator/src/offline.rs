@@ -16,6 +16,9 @@
 //! | `reason/<joint>` | why it is not valid: a word, and the channel at fault after a colon |
 //! | `residual/<link>/fx fy fz tx ty tz` | \[N, Nm\], the residual of a sub-tree; see below |
 //! | `residual/<link>/significance` | its normal deviate; empty where it cannot be tested |
+//! | `drive/<joint>` | the torque by the drive ([`crate::drive`]), if its drive is known |
+//! | `drive_std/<joint>` | its standard deviation |
+//! | `agreement/<joint>` | whether it `agrees` or `disagrees`; empty if they cannot be compared |
 //! | `residual/<link>/reason` | its cause: the contact detected there, or `unexplained` |
 //!
 //! Cells of a withheld torque or wrench are empty; of a torque that is `uncertain` alone, the
@@ -32,7 +35,10 @@ use crate::reading::{MissingChannels, Target, check_columns, check_skins, target
 use crate::setup::Setup;
 use proprio_identification::online::Hypothesis;
 use proprio_topics::csv::{Item, Reader, Report, Row, Value, What};
-use proprio_topics::{ContactWrench, JointTorque, Kind, NO_CAUSE, Nanos, Reason, Residual};
+use proprio_topics::{
+    Agreement, ContactWrench, DriveEstimate, DriveTorque, JointTorque, Kind, NO_CAUSE, Nanos,
+    Reason, Residual,
+};
 use std::collections::BTreeMap;
 use std::io::{self, Read, Write};
 use std::ops::ControlFlow;
@@ -121,7 +127,7 @@ pub fn estimate(
             table = Some(Table::new(out, pipeline.setup())?);
         }
         if let Some(table) = &mut table {
-            table.write(pipeline.last_estimate(), is_stamped)?;
+            table.write(pipeline.last_estimate(), pipeline.drives(), is_stamped)?;
         }
         if let Some(assessor) = &mut assessor {
             let t = pipeline.last_estimate().t;
@@ -236,6 +242,8 @@ pub struct Table<W> {
     joints: usize,
     contacts: Vec<String>,
     subtrees: usize,
+    /// How many drives are known.
+    drives: usize,
     text: Vec<u8>,
     rows: u64,
     withheld: BTreeMap<&'static str, u64>,
@@ -273,6 +281,12 @@ impl<W: Write> Table<W> {
             let columns = "/fx /fy /fz /tx /ty /tz /significance /reason".split(' ');
             columns.for_each(|field| add("residual", top, field));
         }
+        let drives: Vec<&str> = (setup.robot.joint_names())
+            .filter(|joint| setup.drives.iter().any(|drive| drive.joint == *joint))
+            .collect();
+        for part in ["drive", "drive_std", "agreement"] {
+            drives.iter().for_each(|joint| add(part, joint, ""));
+        }
         header.push(b'\n');
         out.write_all(&header)?;
         let channels = setup.channels().map(|(_, name)| name.to_owned()).collect();
@@ -282,17 +296,23 @@ impl<W: Write> Table<W> {
             joints: joints.len(),
             contacts: contacts.iter().map(|&name| name.to_owned()).collect(),
             subtrees: subtrees.len(),
+            drives: drives.len(),
             text: Vec::new(),
             rows: 0,
             withheld: BTreeMap::new(),
         })
     }
 
-    /// Writes one estimate, with its instant if the log is `stamped`.
+    /// Writes one estimate and what the drives say of it, with its instant if the log is `stamped`.
     ///
     /// # Errors
     /// If the output cannot be written.
-    pub fn write(&mut self, estimate: &Estimate, stamped: bool) -> io::Result<()> {
+    pub fn write(
+        &mut self,
+        estimate: &Estimate,
+        drives: Option<&DriveEstimate>,
+        stamped: bool,
+    ) -> io::Result<()> {
         let joints = || {
             (0..self.joints).map(|i| {
                 estimate
@@ -368,6 +388,16 @@ impl<W: Write> Table<W> {
             let contact = contact.or((residual.unexplained == 1).then_some("unexplained"));
             self.text
                 .extend_from_slice(contact.unwrap_or_default().as_bytes());
+        }
+        let drives = drives.map(DriveEstimate::drives).unwrap_or_default();
+        let drives = || (0..self.drives).map(|i| drives.get(i).unwrap_or(&DriveTorque::ABSENT));
+        drives().for_each(|own| number(&mut self.text, own.torque));
+        drives().for_each(|own| number(&mut self.text, own.standard_deviation));
+        for own in drives() {
+            self.text.push(b',');
+            let agreement = own.agreement.get().filter(|own| *own != Agreement::Unknown);
+            let word = agreement.map_or("", Agreement::word);
+            self.text.extend_from_slice(word.as_bytes());
         }
         self.text.push(b'\n');
         self.rows += 1;

@@ -14,6 +14,7 @@ mod file;
 
 use std::io;
 
+use crate::drive::Drive;
 use nalgebra::DMatrix;
 use proprio_topics::Nanos;
 use serde::Deserialize;
@@ -38,6 +39,7 @@ pub struct Parameters {
     links: Vec<Link>,
     sensors: Vec<Offset>,
     joints: Vec<Friction>,
+    drives: Vec<Drive>,
     /// Standard deviation of each column.
     deviations: Vec<f64>,
     /// The upper triangular root of the correlation, column by column, each down to its diagonal,
@@ -275,6 +277,7 @@ impl Parameters {
                 .collect(),
             sensors: Vec::new(),
             joints: Vec::new(),
+            drives: Vec::new(),
             deviations: Vec::new(),
             correlation: Vec::new(),
         }
@@ -374,6 +377,21 @@ impl Parameters {
         Ok(())
     }
 
+    /// Sets the drives of joints.
+    ///
+    /// # Errors
+    /// A number is not finite, a variance is negative, or a constant is zero. Nothing is changed
+    /// then.
+    pub fn set_drives(&mut self, drives: &[Drive]) -> Result<(), ParametersError> {
+        let new = Self {
+            drives: drives.to_vec(),
+            ..self.clone()
+        };
+        new.check()?;
+        *self = new;
+        Ok(())
+    }
+
     /// The name of the robot.
     #[must_use]
     pub fn robot(&self) -> &str {
@@ -453,6 +471,12 @@ impl Parameters {
     #[must_use]
     pub fn friction(&self) -> &[Friction] {
         &self.joints
+    }
+
+    /// The drives that the torques are compared with.
+    #[must_use]
+    pub fn drives(&self) -> &[Drive] {
+        &self.drives
     }
 
     /// The covariance's root: upper triangular `U` with `P = U^T U`.
@@ -561,14 +585,12 @@ impl Parameters {
                 });
             }
         }
-        match self
-            .joints
-            .iter()
-            .find(|joint| robot.model.dof(&joint.joint).is_none())
-        {
+        let joints = self.joints.iter().map(|joint| &joint.joint);
+        let mut joints = joints.chain(self.drives.iter().map(|drive| &drive.joint));
+        match joints.find(|joint| robot.model.dof(joint).is_none()) {
             Some(joint) => Err(ParametersError::Unknown {
                 what: "joint",
-                name: joint.joint.clone(),
+                name: joint.clone(),
             }),
             None => Ok(()),
         }
@@ -635,6 +657,17 @@ impl Parameters {
                 finite(&at, &[rotor.inertia, rotor.deviation.sqrt()])?;
             }
         }
+        for drive in &self.drives {
+            let at = || format!("drive {}", drive.joint);
+            new_name(&at())?;
+            finite(&at, &drive.parameters)?;
+            finite(&at, drive.covariance.as_slice())?;
+            // The square root of a negative number is NaN; so is the quotient of two zeros.
+            let variances = drive.covariance.diagonal().map(f64::sqrt);
+            finite(&at, variances.as_slice())?;
+            finite(&at, &drive.inherited.map(f64::sqrt))?;
+            finite(&at, &[drive.noise.sqrt(), 1.0 / drive.parameters[0]])?;
+        }
         // The square root of a negative number is NaN.
         let roots: Vec<f64> = self.deviations.iter().map(|d| d.sqrt()).collect();
         finite(&|| "a standard deviation".into(), &roots)
@@ -679,6 +712,7 @@ mod tests {
             links: Vec::new(),
             sensors: Vec::new(),
             joints: Vec::new(),
+            drives: Vec::new(),
             deviations: Vec::new(),
             correlation: Vec::new(),
         }

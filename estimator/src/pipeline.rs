@@ -20,6 +20,8 @@
 //! 6. Every torque and contact wrench is written with its validity and reason (`validity`,
 //!    `estimate`). Who asks, hears what a torque rests on, and how much of its variance each of
 //!    these inputs causes (`budget`).
+//! 7. Where a joint's drive reports a torque or a current, the two are compared (`drives`,
+//!    [`crate::drive`]).
 //!
 //! # Alignment
 //! Each stamp `t` of the trigger channel gives exactly one estimate, in order. What follows is
@@ -66,6 +68,7 @@ mod budget;
 mod buffers;
 mod channels;
 mod contacts;
+mod drives;
 mod estimate;
 mod identification;
 mod input;
@@ -87,6 +90,7 @@ use crate::setup::Setup;
 use buffers::{ChannelBuffer, OrReason, Sanity, stale, temperature_at};
 use channels::{imu_at, joint_at, wrench_at};
 use contacts::Contacts;
+use drives::Drives;
 use estimate::root_of_squares;
 use identification::OnlineIdentification;
 use motion::{ENCODER_OFFSET_STD, MotionErrors};
@@ -161,6 +165,8 @@ pub struct Pipeline {
     refusal: Option<OnlineError>,
     estimate: Box<Estimate>,
     budget: Box<TorqueBudget>,
+    /// What the drives say of the torques.
+    drives: Option<Box<Drives>>,
 }
 
 impl Pipeline {
@@ -272,6 +278,7 @@ impl Pipeline {
             refusal,
             estimate,
             budget: Box::default(),
+            drives: Drives::new(&setup),
             setup,
         }
     }
@@ -388,6 +395,7 @@ impl Pipeline {
         self.released = t;
         self.identify(t);
         self.compute_estimate(t);
+        self.compare_drives();
         Some(&self.estimate)
     }
 
@@ -440,6 +448,16 @@ impl Pipeline {
         motion
     }
 
+    /// The last stamp whose samples may be used for an estimate at `t`.
+    fn until(&self, t: Nanos) -> Nanos {
+        match self.setup.timing {
+            // Half of the wait: a sample that may be used can then arrive late by the other half.
+            Timing::Aligned => t + Nanos(self.setup.max_wait.0 / 2),
+            // What has arrived, and never more is known.
+            Timing::Immediate => Nanos::MAX,
+        }
+    }
+
     /// Evaluates every channel at `t`. Returns the motion of the base link, and the IMU's motion
     /// and pose if there is one.
     fn evaluate_channels(
@@ -447,12 +465,7 @@ impl Pipeline {
         t: Nanos,
         active: &ContactSet,
     ) -> (FrameMotion, Option<(FrameMotion, Pose)>) {
-        // Half of the wait: a sample that may be used can then arrive late by the other half.
-        let until = match self.setup.timing {
-            Timing::Aligned => t + Nanos(self.setup.max_wait.0 / 2),
-            // What has arrived, and never more is known.
-            Timing::Immediate => Nanos::MAX,
-        };
+        let until = self.until(t);
         let mut base = self.place_base(active);
         let mut imu = None;
         for ((buffer, channel), fault) in self

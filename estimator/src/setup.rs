@@ -6,6 +6,7 @@ use crate::config::{
     STANDARD_GRAVITY, SensorFrame, Timing,
 };
 use crate::differentiate::Settings;
+use crate::drive::Drive;
 use crate::inertial::InertialState;
 use crate::parameters::{Parameters, ParametersError};
 use crate::plausible;
@@ -51,6 +52,11 @@ pub struct Setup {
     pub joint_settings: Settings,
     /// How angular velocities are differentiated.
     pub gyro_settings: Settings,
+    /// The drives that the torques are compared with: those of the identified parameters.
+    pub drives: Vec<Drive>,
+    /// Whether the reports of all drives are kept, so that drives can be identified from them
+    /// ([`crate::pipeline::Pipeline::drive_rows`]).
+    pub learns_drives: bool,
     /// Whether parameters are identified on-line.
     pub identifies: bool,
     /// The time between two on-line identification instants.
@@ -338,6 +344,8 @@ impl Setup {
             skins,
             joint_settings: settings(position_noise_rad),
             gyro_settings: settings(angular_velocity_noise_radps),
+            drives: Vec::new(),
+            learns_drives: false,
             identifies: identification.enabled,
             identification_period: Nanos::from_seconds(1.0 / identification.rate_hz),
             warnings,
@@ -350,13 +358,15 @@ impl Setup {
         Ok(setup)
     }
 
-    /// Takes identified inertial parameters and F/T offsets ([`InertialState::apply`]).
+    /// Takes identified inertial parameters, F/T offsets ([`InertialState::apply`]) and drives.
     ///
     /// # Errors
     /// They belong to another robot, or were identified with another model. Nothing is changed
     /// then.
     pub fn apply(&mut self, parameters: &Parameters) -> Result<(), ParametersError> {
-        self.state.apply(&self.robot, parameters)
+        self.state.apply(&self.robot, parameters)?;
+        self.drives = parameters.drives().to_vec();
+        Ok(())
     }
 
     /// The robot with the parameters and calibrations in use as those of its URDF and

@@ -16,11 +16,13 @@
 //!   libraries).
 //! - [`settings`]: the settings of a simulation.
 //! - [`simulator`]: the boards, without links and without a clock; [`fault`]: faults on request.
+//! - [`drive`]: what drives report of the torques of their joints.
 //! - [`mod@cad`]: a deliberately wrong URDF for the estimator.
 //! - [`mod@run`]: live, on CAN interfaces or virtual buses; [`record`]: offline, a whole session as
 //!   a CAN log.
 
 pub mod cad;
+pub mod drive;
 pub mod fault;
 mod noise;
 pub mod record;

@@ -12,11 +12,11 @@
 //! instant it is sent*: if the simulating machine was delayed, readings are missing, as if the
 //! board had skipped them, but none is old.
 
+use crate::drive::DriveTruth;
 use crate::fault::{Fault, FaultError, Window};
 use crate::noise::Random;
 use crate::robot::{Robot, RobotError};
 use crate::settings::Settings;
-use crate::trajectory::Point;
 use crate::truth::Simulation;
 use proprio_drivers::{Board, Frame, Frames, Options, Spec};
 use proprio_gateway::joints::{Inverse, Layout};
@@ -364,8 +364,8 @@ impl BusSimulator {
 /// The quantity that an output of a board measures.
 #[derive(Debug, Clone)]
 enum Source {
-    /// A shaft, which the joints of these numbers in the simulation turn.
-    Shaft(Inverse, Vec<usize>),
+    /// A shaft, which the joints of these numbers in the simulation turn, and its drives.
+    Shaft(Inverse, Vec<(usize, DriveTruth)>),
     /// F/T sensor of this number, with its noise.
     Wrench(usize, [f64; 3], [f64; 3]),
     /// IMU of this number.
@@ -607,10 +607,11 @@ fn sources(
                 let number = |channel: &u32| {
                     let no_joint = "the URDF has no moving joint of that name";
                     let joint = simulation.joint(name(*channel));
-                    joint.ok_or_else(|| missing(name(*channel), no_joint))
+                    let joint = joint.ok_or_else(|| missing(name(*channel), no_joint))?;
+                    Ok((joint, DriveTruth::new(&robot.model, name(*channel))))
                 };
                 let joints = inverse.channels.iter().map(number);
-                let joints = joints.collect::<Result<_, _>>()?;
+                let joints = joints.collect::<Result<_, RobotError>>()?;
                 Source::Shaft(inverse, joints)
             }
             Kind::Wrench => {
@@ -666,16 +667,18 @@ fn measure(
                 continue;
             }
             Source::Shaft(ref inverse, ref joints) => {
-                let points = joints
-                    .iter()
-                    .filter_map(|joint| simulation.motion(*joint, t));
-                let state = |point: Point| JointState {
-                    position: point.position,
-                    velocity: point.velocity,
-                    acceleration: point.acceleration,
-                    ..JointState::ABSENT
-                };
-                let states: Vec<JointState> = points.map(state).collect();
+                let states = joints.iter().filter_map(|(joint, drive)| {
+                    let truth = simulation.at(t).joints.get(*joint)?;
+                    let torque = drive.torque(truth);
+                    Some(JointState {
+                        position: truth.position,
+                        velocity: truth.velocity,
+                        acceleration: truth.acceleration,
+                        torque,
+                        current: torque / drive.per_ampere,
+                    })
+                });
+                let states: Vec<JointState> = states.collect();
                 if states.len() < joints.len() {
                     continue;
                 }

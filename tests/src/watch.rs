@@ -258,7 +258,9 @@ impl Recorder {
     pub fn estimate_rows(&self, setup: &Setup) -> BTreeMap<String, String> {
         let mut table = Table::new(Vec::new(), setup).expect("memory can be written");
         for estimate in self.estimates.values() {
-            table.write(estimate, true).expect("memory can be written");
+            table
+                .write(estimate, None, true)
+                .expect("memory can be written");
         }
         rows(&String::from_utf8(table.into_inner()).expect("a table is text"))
     }

@@ -96,7 +96,7 @@ fn write_estimates(file: &Path, setup: &Setup, watched: &Watched) -> anyhow::Res
         torques.count = fill(&mut torques.joints, &seen.joints)?;
         contacts.count = fill(&mut contacts.contacts, &seen.contacts)?;
         contacts.residual_count = fill(&mut contacts.residuals, &seen.residuals)?;
-        table.write(&estimate, true)?;
+        table.write(&estimate, None, true)?;
     }
     table.into_inner().flush()?;
     Ok(())

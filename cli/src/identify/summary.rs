@@ -28,6 +28,7 @@
 //! | `findings` | {`log` or `null`, `severity`, `code`, `subject`, `text`}: below |
 //! | `links` | a list: below |
 //! | `base_parameters` | {`expression`, `unit`, `cad`, `identified`, `std`} |
+//! | `drives` | {joint: `signal`, `constant`, friction, `std`, `noise_nm`; or {`reason`}} |
 //! | `rotor_inertia` | {joint: {`kgm2`, `std`}}: inertia times the square of the gear ratio |
 //! | `calibration` | {sensor: ...}: below, where it was requested |
 //! | `channels` | noise: {`name`, `unit`, `std`, `autocorrelation_s`, `drift`: unit per s^½} |

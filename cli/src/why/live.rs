@@ -1,14 +1,14 @@
 //! What a running system says of a torque: its budget, and the state of boards and buses.
 
-use super::story::{Channel, Known, Part, System};
+use super::story::{Channel, Known, Part, System, opinion};
 use crate::status::newest;
 use anyhow::{anyhow, bail};
 use proprio_bridge::{Described, Level, bus_state, device_state, next, one_robot, open};
 use proprio_estimator::setup::nearest;
 use proprio_topics::ipc::{Domain, DomainConfig, PortError, Presence, Reader, monotonic};
 use proprio_topics::{
-    Description, EstimatorHealth, GatewayHealth, Nanos, Publisher, Reason, Role, TRIGGER,
-    TorqueBudget, TorqueEstimate,
+    Description, DriveEstimate, EstimatorHealth, GatewayHealth, Nanos, Publisher, Reason, Role,
+    TRIGGER, TorqueBudget, TorqueEstimate,
 };
 
 /// For how long budgets are listened to: the last one that tells of a withheld torque counts.
@@ -32,6 +32,8 @@ pub(super) fn know(
         Err(PortError::NotYet { .. }) => None,
         Err(error) => return Err(error.into()),
     };
+    // There are none if no drive is known.
+    let mut drives = Reader::<DriveEstimate>::open(&domain, &robot).ok();
     let presence = domain.robots().into_iter().find(|own| own.name == robot);
     let presence = presence.ok_or_else(|| anyhow!("robot {robot} has ended meanwhile"))?;
     let names = Described::by(&domain, &robot, Publisher::Estimator)?;
@@ -65,8 +67,13 @@ pub(super) fn know(
     });
     let cause = cause.map(|entry| entry.name.as_str().to_owned());
     let health = newest::<EstimatorHealth>(&domain, &robot)?;
+    let opinion = budget.as_ref().and_then(|budget| {
+        let drives = drives.as_mut().and_then(newest_of)?;
+        opinion(&drives, budget.joint, budget.unit())
+    });
     Ok(Known {
         joint: joint.to_owned(),
+        opinion: opinion.unwrap_or_default(),
         budget,
         cause,
         identifies: health.is_some_and(|health| health.identification.groups > 0),
@@ -111,6 +118,15 @@ fn listen(budgets: &mut Reader<TorqueBudget>, joint: u32) -> Option<TorqueBudget
         }
         budgets.wait(deadline);
     }
+}
+
+/// The newest that drives said while budgets were listened to.
+fn newest_of(drives: &mut Reader<DriveEstimate>) -> Option<DriveEstimate> {
+    let mut newest = None;
+    while let Ok(Some(estimate)) = next(drives) {
+        newest = Some(estimate);
+    }
+    newest
 }
 
 /// The torque of a joint without a budget: an estimator of an earlier version publishes none.

@@ -1,6 +1,6 @@
 //! What a log says of a torque: the estimator runs on it, up to the instant in question.
 
-use super::story::{Channel, Known, System};
+use super::story::{Channel, Known, System, opinion};
 use crate::convert::{Configured, input, unfit};
 use crate::samples;
 use anyhow::{Context, bail};
@@ -139,6 +139,12 @@ pub(super) fn know(
     };
     let known = Known {
         joint: joint.to_owned(),
+        opinion: match (gap, pipeline.drives(), budget) {
+            (None, Some(drives), Some(budget)) => {
+                opinion(drives, budget.joint, budget.unit()).unwrap_or_default()
+            }
+            _ => String::new(),
+        },
         budget,
         cause,
         system,

@@ -2,7 +2,9 @@
 //! do. Without input and output.
 
 use proprio_bridge::Level;
-use proprio_topics::{BudgetPart, Reason, Source, TorqueBudget};
+use proprio_topics::{
+    Agreement, BudgetPart, Candidate, DriveEstimate, Reason, Source, TorqueBudget,
+};
 use std::collections::BTreeSet;
 
 /// A channel of the system.
@@ -48,6 +50,8 @@ pub(super) struct Known {
     pub(super) budget: Option<TorqueBudget>,
     /// The channel that causes it to be withheld.
     pub(super) cause: Option<String>,
+    /// What the drive says of it, in a sentence; empty if its drive is not known.
+    pub(super) opinion: String,
     pub(super) system: System,
     /// Whether the estimator identifies.
     pub(super) identifies: bool,
@@ -71,6 +75,45 @@ pub(super) struct Share {
     pub(super) variance: f64,
     /// What it is, or the first of several.
     pub(super) source: Source,
+}
+
+/// What the drive of a joint says of its torque, in a sentence; `None` if its drive is not known.
+pub(super) fn opinion(estimate: &DriveEstimate, joint: u32, unit: &str) -> Option<String> {
+    let own = estimate.of_joint(joint)?;
+    let torque = match own.torque.is_finite() {
+        true => format!(
+            "{} +- {} {unit}",
+            digits(own.torque),
+            digits(own.standard_deviation)
+        ),
+        false => "nothing".to_owned(),
+    };
+    let verdict = match own.agreement.get().unwrap_or_default() {
+        Agreement::Unknown => return Some(format!("its drive says {torque}")),
+        Agreement::Agrees => "within both deviations".to_owned(),
+        Agreement::Disagrees => {
+            let ratio = match own.ratio.is_finite() {
+                true => format!(" ({} times what it should report)", digits(own.ratio)),
+                false => String::new(),
+            };
+            let candidates = estimate.candidates().iter().map(|own| {
+                let name = own.name.as_str();
+                match own.kind.get() {
+                    Some(Candidate::Contact) => format!("a contact on {name}"),
+                    Some(Candidate::Sensor) => format!("{name}, turned or with another gain"),
+                    _ => format!("the drive of {name}, in other units or with another friction"),
+                }
+            });
+            let candidates: Vec<String> = candidates.collect();
+            let candidates: Vec<&str> = candidates.iter().map(String::as_str).collect();
+            format!(
+                "{:.0} deviations away{ratio}; it may be {}",
+                own.deviate.abs(),
+                candidates.join("; or ")
+            )
+        }
+    };
+    Some(format!("its drive says {torque}, {verdict}"))
 }
 
 /// What to do if a daemon does not run.
@@ -586,6 +629,7 @@ mod tests {
     fn known(budget: Option<TorqueBudget>, cause: Option<&str>, system: System) -> Known {
         Known {
             joint: "elbow".to_owned(),
+            opinion: String::new(),
             budget,
             cause: cause.map(str::to_owned),
             system,

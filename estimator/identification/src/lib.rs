@@ -90,6 +90,7 @@ pub use dataset::{Dataset, Role};
 pub use diagnose::plausibility::implausible;
 pub use finding::{Finding, FindingCode, Severity};
 pub use fit::IdentifyError;
+pub use measurement::unknowns::COULOMB_SPEED;
 pub use payload::{Known, Payload, PayloadError, payload};
 pub use report::outcome::{
     BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, CovarianceRoot, Curve,

@@ -48,6 +48,22 @@
 //! `rotor_inertia_kgm2`, the inertia of the rotor times the square of the gear ratio (kg for a
 //! prismatic joint), and `rotor_inertia_std_kgm2`.
 //!
+//! `[[drive]]`, one for each joint whose drive was identified ([`crate::drive`]):
+//!
+//! | key | meaning |
+//! |---|---|
+//! | `joint` | the joint |
+//! | `signal` | what the drive reports: `"torque"` or `"current"` |
+//! | `constant` | torque of the joint by the reported torque, or by the current [Nm/A] |
+//! | `coulomb_nm`, `viscous_nms`, `load` | friction |
+//! | `rotor_inertia_kgm2`, `offset_nm` | inertia of the rotor; offset of the report |
+//! | `std` | standard deviations of these six, in this order, without what they inherit |
+//! | `correlation` | the correlations of each with those after it: 15 numbers |
+//! | `inherited_relative`, `inherited_nm` | errors of the torques that it was found from |
+//! | `noise_nm` | standard deviation of what the model does not explain |
+//!
+//! (N and m in place of Nm and rad for a prismatic joint.)
+//!
 //! `[correlation]`: `root`, see below.
 //!
 //! The ten parameters are `[m, h_x, h_y, h_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz]`
@@ -71,7 +87,9 @@ use super::{
     nanoseconds,
 };
 use crate::config::exactly;
+use crate::drive::{Drive, Signal};
 use crate::files;
+use nalgebra::Matrix6;
 use proprio_dynamics::calibration::{Calibration, Gain, Kind, force_first, gain_from_force_first};
 use proprio_dynamics::spatial::Wrench;
 use proprio_topics::Nanos;
@@ -240,6 +258,32 @@ impl fmt::Display for Parameters {
                 )?;
             }
         }
+        for drive in &self.drives {
+            let [constant, coulomb, viscous, load, rotor, offset] = drive.parameters;
+            let signal = match drive.signal {
+                Signal::Torque => "torque",
+                Signal::Current => "current",
+            };
+            let std: [f64; 6] = std::array::from_fn(|i| drive.covariance[(i, i)].max(0.0).sqrt());
+            let [relative, inherited] = drive.inherited;
+            let correlation: Vec<f64> = pairs()
+                .map(|(i, j)| match std[i] * std[j] {
+                    0.0 => 0.0,
+                    // Rounded, so that a file that is read and written again does not change.
+                    most => (UNIT * drive.covariance[(i, j)] / most).round() / UNIT,
+                })
+                .collect();
+            writeln!(
+                f,
+                "\n[[drive]]\njoint = {}\nsignal = \"{signal}\"\nconstant = {constant:?}\n\
+                 coulomb_nm = {coulomb:?}\nviscous_nms = {viscous:?}\nload = {load:?}\n\
+                 rotor_inertia_kgm2 = {rotor:?}\noffset_nm = {offset:?}\nstd = {std:?}\n\
+                 correlation = {correlation:?}\ninherited_relative = {relative:?}\n\
+                 inherited_nm = {inherited:?}\nnoise_nm = {:?}",
+                text(&drive.joint),
+                drive.noise
+            )?;
+        }
         f.write_str("\n[correlation]\nroot = [\n")?;
         let mut numbers = self.correlation.as_slice();
         for column in 0..self.deviations.len() {
@@ -275,6 +319,8 @@ struct File {
     sensor: Vec<FileSensor>,
     #[serde(default)]
     joint: Vec<FileJoint>,
+    #[serde(default)]
+    drive: Vec<FileDrive>,
     // The last section of the file: if it is missing, the file is truncated.
     correlation: Correlation,
 }
@@ -414,6 +460,55 @@ impl FileJoint {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
+struct FileDrive {
+    joint: String,
+    signal: Signal,
+    constant: f64,
+    coulomb_nm: f64,
+    viscous_nms: f64,
+    load: f64,
+    rotor_inertia_kgm2: f64,
+    offset_nm: f64,
+    std: Numbers<6>,
+    correlation: Numbers<15>,
+    inherited_relative: f64,
+    inherited_nm: f64,
+    noise_nm: f64,
+}
+
+impl FileDrive {
+    fn drive(self) -> Drive {
+        let std = self.std.0;
+        let mut covariance = Matrix6::from_diagonal(&std.map(|std| std * std).into());
+        for ((i, j), correlation) in pairs().zip(self.correlation.0) {
+            covariance[(i, j)] = correlation * std[i] * std[j];
+            covariance[(j, i)] = covariance[(i, j)];
+        }
+        Drive {
+            joint: self.joint,
+            signal: self.signal,
+            parameters: [
+                self.constant,
+                self.coulomb_nm,
+                self.viscous_nms,
+                self.load,
+                self.rotor_inertia_kgm2,
+                self.offset_nm,
+            ],
+            covariance,
+            inherited: [self.inherited_relative, self.inherited_nm],
+            noise: self.noise_nm,
+        }
+    }
+}
+
+/// The places of a drive's correlations.
+fn pairs() -> impl Iterator<Item = (usize, usize)> {
+    (0..6).flat_map(|i| (i + 1..6).map(move |j| (i, j)))
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
 struct Correlation {
     root: Vec<Vec<i32>>,
 }
@@ -506,6 +601,7 @@ impl File {
                 .into_iter()
                 .map(FileJoint::friction)
                 .collect::<Result<_, _>>()?,
+            drives: self.drive.into_iter().map(FileDrive::drive).collect(),
             correlation: self.correlation.root.concat(),
             deviations,
         };

@@ -8,6 +8,7 @@
 //! - [`estimate`]: joint torques and contact wrenches, each with a validity flag and, if it is not
 //!   valid, the reason.
 //! - [`budget`]: what a torque rests on, and how much of its variance each input causes.
+//! - [`drive`]: the torques that drives report, beside the estimated ones.
 //! - [`inertia`]: identified inertial parameters and F/T offsets, with their standard deviations
 //!   and the amount of data they come from.
 //! - [`description`]: what the channel, joint and contact numbers mean.
@@ -37,6 +38,7 @@ pub mod code;
 #[cfg(feature = "csv")]
 pub mod csv;
 pub mod description;
+pub mod drive;
 pub mod estimate;
 pub mod health;
 pub mod inertia;
@@ -56,6 +58,7 @@ pub use code::{Code, Coded};
 pub use description::{
     Description, Entry, Name, Publisher, ROBOT_NAME, Role, TRIGGER, is_robot_name,
 };
+pub use drive::{Agreement, Candidate, DriveEstimate, DriveTorque, NamedCandidate};
 pub use estimate::{
     ContactDeclaration, ContactEstimate, ContactState, ContactWrench, JointTorque, NO_CAUSE,
     NO_CONTACT, Reason, Residual, TorqueEstimate,

@@ -7,7 +7,7 @@ use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::spatial::Vec3;
 
 /// Speed over which the sign of Coulomb friction is smoothed [rad/s or m/s].
-pub(crate) const COULOMB_SPEED: f64 = 0.02;
+pub const COULOMB_SPEED: f64 = 0.02;
 
 /// Number of friction columns of a joint.
 pub(crate) const FRICTION: usize = 3;

@@ -10,8 +10,8 @@ use super::sweep::Place;
 use super::{DomainError, Topic};
 use crate::maps::{self, Mapping};
 use crate::{
-    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
-    InertiaEstimate, Sample, TorqueBudget, TorqueEstimate,
+    ContactDeclaration, ContactEstimate, Description, DriveEstimate, EstimatorHealth,
+    GatewayHealth, InertiaEstimate, Sample, TorqueBudget, TorqueEstimate,
 };
 use nix::fcntl::posix_fallocate;
 use nix::libc;
@@ -59,6 +59,7 @@ pub fn memory_needed() -> ([u64; 2], u64) {
         + needed::<ContactEstimate>()
         + needed::<InertiaEstimate>()
         + needed::<TorqueBudget>()
+        + needed::<DriveEstimate>()
         + needed::<ContactDeclaration>();
     ([robot, needed::<Sample>()], free())
 }

@@ -1,8 +1,8 @@
 //! The services: payload type, name and quality of service of each.
 
 use crate::{
-    ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth, Header,
-    InertiaEstimate, Sample, TorqueBudget, TorqueEstimate,
+    ContactDeclaration, ContactEstimate, Description, DriveEstimate, EstimatorHealth,
+    GatewayHealth, Header, InertiaEstimate, Sample, TorqueBudget, TorqueEstimate,
 };
 use core::fmt::Debug;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
@@ -177,6 +177,26 @@ topic!(
         subscribers: 4,
         nodes: NODES,
         buffer: 8,
+        history: 0
+    }
+);
+// For people and monitors: a reader that misses some sees the next one.
+topic!(
+    DriveEstimate,
+    "estimate/drive",
+    |e| {
+        within(e.count, &e.drives)
+            && within(e.candidate_count, &e.candidates)
+            && e.drives()
+                .iter()
+                .all(|own| own.agreement.get().is_some() && own.reason.get().is_some())
+            && e.candidates().iter().all(|own| own.kind.get().is_some())
+    },
+    QualityOfService {
+        publishers: 1,
+        subscribers: 8,
+        nodes: NODES,
+        buffer: 16,
         history: 0
     }
 );

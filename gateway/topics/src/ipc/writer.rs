@@ -344,8 +344,8 @@ mod tests {
     use super::*;
     use crate::ipc::DomainConfig;
     use crate::{
-        ContactDeclaration, ContactEstimate, Description, EstimatorHealth, GatewayHealth,
-        InertiaEstimate, Sample, TorqueBudget, TorqueEstimate,
+        ContactDeclaration, ContactEstimate, Description, DriveEstimate, EstimatorHealth,
+        GatewayHealth, InertiaEstimate, Sample, TorqueBudget, TorqueEstimate,
     };
     use std::fs;
 
@@ -379,6 +379,7 @@ mod tests {
             compared::<ContactEstimate>(),
             compared::<InertiaEstimate>(),
             compared::<TorqueBudget>(),
+            compared::<DriveEstimate>(),
             compared::<ContactDeclaration>(),
             compared::<GatewayHealth>(),
             compared::<EstimatorHealth>(),

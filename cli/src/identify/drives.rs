@@ -1,0 +1,109 @@
+//! The drives of the joints: what they report beside the torques of the F/T sensors
+//! ([`proprio_estimator::drive`]). They are identified last, with the parameters that were found.
+
+use super::logs::open;
+use anyhow::Context;
+use proprio_dynamics::spatial::Wrench;
+use proprio_estimator::drive::{self, Drive, Row, Signal, Unfit};
+use proprio_estimator::parameters::Parameters;
+use proprio_estimator::setup::Setup;
+use proprio_identification::{LogOutcome, Outcome, Role};
+use serde_json::{Value as Json, json};
+use std::path::{Path, PathBuf};
+
+/// A torque that a drive reports in Nm is that of the joint, but for the gear's and the sensor's
+/// errors: by as much.
+const SAME_UNIT: f64 = 0.3;
+
+/// A joint, and its drive or why there is none.
+pub(super) type Found = (String, Result<Drive, Unfit>);
+
+/// The drives of all joints whose drives report something, from the training logs `files`.
+pub(super) fn identify(
+    setup: &Setup,
+    parameters: &Parameters,
+    outcome: &Outcome,
+    files: &[(&PathBuf, Role)],
+    config: &Path,
+) -> anyhow::Result<Vec<Found>> {
+    let mut setup = setup.clone();
+    setup.apply(parameters)?;
+    let mut logs: Vec<Vec<Vec<Row>>> = Vec::new();
+    for ((file, role), log) in files.iter().zip(&outcome.logs) {
+        if *role == Role::Train {
+            set_offsets(&mut setup, log);
+            let table = open(file, config, &setup)?;
+            let rows = drive::rows(&setup, table);
+            logs.push(rows.with_context(|| file.display().to_string())?);
+        }
+    }
+    let robot = &setup.robot;
+    let of_joint = |dof: usize| {
+        let own: Vec<Vec<Row>> = (logs.iter_mut())
+            .filter_map(|log| log.get_mut(dof).map(std::mem::take))
+            .collect();
+        let joint = robot.model.dof_name(dof);
+        Some((joint.to_owned(), drive::fit(joint, &own)?))
+    };
+    Ok(robot.published().filter_map(of_joint).collect())
+}
+
+/// The offsets of the F/T sensors in a log, at its end.
+fn set_offsets(setup: &mut Setup, log: &LogOutcome) {
+    for offset in &log.offsets {
+        let sensor = setup.robot.sensor(&offset.sensor);
+        if let Some(place) = sensor.and_then(|sensor| setup.state.offsets.get_mut(sensor)) {
+            let [fx, fy, fz, tx, ty, tz] = offset.end;
+            *place = Wrench::from_parts([fx, fy, fz], [tx, ty, tz]);
+        }
+    }
+}
+
+/// For summary.json.
+pub(super) fn in_json(found: &[Found]) -> Json {
+    let one = |result: &Result<Drive, Unfit>| match result {
+        Err(unfit) => json!({ "reason": unfit.to_string() }),
+        Ok(drive) => {
+            let [constant, coulomb, viscous, load, rotor, offset] = drive.parameters;
+            json!({
+                "signal": drive.signal, "constant": constant, "coulomb_nm": coulomb,
+                "viscous": viscous, "load": load, "rotor_inertia_kgm2": rotor,
+                "offset_nm": offset, "std": drive.deviations(), "noise_nm": drive.noise,
+            })
+        }
+    };
+    let all = found
+        .iter()
+        .map(|(joint, result)| (joint.clone(), one(result)));
+    Json::Object(all.collect())
+}
+
+/// The drives that were identified, in a line; `None` if there is none.
+pub(super) fn line(found: &[Found]) -> Option<String> {
+    let joints = found.iter().filter(|(_, drive)| drive.is_ok());
+    let joints: Vec<&str> = joints.map(|(joint, _)| joint.as_str()).collect();
+    (!joints.is_empty()).then(|| {
+        format!("second opinions from the drives of {}", joints.join(", "))
+    })
+}
+
+/// What is odd about the drives, one sentence each.
+pub(super) fn warnings(found: &[Found]) -> Vec<String> {
+    let odd = |(joint, result): &Found| match result {
+        Err(unfit) => Some(format!(
+            "the drive of {joint} gives no second opinion: {unfit}"
+        )),
+        Ok(drive) => {
+            let (constant, deviation) = (drive.parameters[0], drive.deviations()[0]);
+            let is_off = (constant - 1.0).abs() > SAME_UNIT + 3.0 * deviation;
+            (drive.signal == Signal::Torque && is_off).then(|| {
+                format!(
+                    "the torque of {joint} is {constant:.3} +- {deviation:.3} times what its drive \
+                     reports: it reports in another unit, on the motor's side of the gear, or with \
+                     the other sign"
+                )
+            })
+        }
+    };
+    found.iter().filter_map(odd).collect()
+}

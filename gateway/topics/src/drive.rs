@@ -1,0 +1,175 @@
+//! A second opinion on joint torques: what the drives report, beside what is estimated from the
+//! force/torque sensors.
+
+use crate::code::coded;
+use crate::{Code, Header, MAX_JOINTS, NO_CAUSE, Name, Reason};
+use iceoryx2_bb_derive_macros::ZeroCopySend;
+use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+use zerocopy::FromBytes;
+
+/// Whether the drive and the force/torque sensors agree about a torque.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend)]
+pub enum Agreement {
+    /// They cannot be compared: [`DriveTorque::reason`].
+    #[default]
+    Unknown = 0,
+    /// Their difference is within both deviations.
+    Agrees = 1,
+    /// It is not.
+    Disagrees = 2,
+}
+
+coded!(Agreement {
+    Unknown = "unknown",
+    Agrees = "agrees",
+    Disagrees = "disagrees",
+});
+
+/// What may be the cause of a disagreement.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
+pub enum Candidate {
+    /// A contact on the named link, which no F/T sensor sees or which is taken to be elsewhere.
+    Contact = 0,
+    /// The named F/T sensor: turned, damaged, or with another gain.
+    Sensor = 1,
+    /// The drive of the named joint: it reports in other units, or its friction has changed.
+    Drive = 2,
+}
+
+coded!(Candidate {
+    Contact = "contact",
+    Sensor = "sensor",
+    Drive = "drive",
+});
+
+/// A candidate by name.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend, FromBytes)]
+pub struct NamedCandidate {
+    /// The link, the channel of the F/T sensor, or the joint.
+    pub name: Name,
+    /// What it is.
+    pub kind: Code<Candidate>,
+    /// The disagreeing joint that it is a candidate for: an index into `TorqueEstimate::joints`. If
+    /// several joints of a sub-tree disagree, their candidates are those that explain all of them,
+    /// and this is the first of them.
+    pub joint: u32,
+}
+
+/// The torque of one joint by its drive.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
+pub struct DriveTorque {
+    /// What the drive reports, less friction and rotor: the torque \[Nm\] (force \[N\] for a
+    /// prismatic joint) by the parent link on the child link. NaN if it reports nothing.
+    pub torque: f64,
+    /// Its standard deviation, NaN if there is no torque.
+    pub standard_deviation: f64,
+    /// The difference between this torque and the one of the F/T sensors, as a multiple of the
+    /// deviation of both together; smoothed. NaN if they cannot be compared.
+    pub deviate: f64,
+    /// What the drive reports by what it should, by least squares over the last seconds: near one
+    /// if they agree; NaN if that is not determined.
+    pub ratio: f64,
+    /// Whether they agree.
+    pub agreement: Code<Agreement>,
+    /// Why they cannot be compared: that of the estimated torque, or of the drive's report.
+    pub reason: Code<Reason>,
+    /// The channel that causes `reason`, or [`NO_CAUSE`].
+    pub cause: u32,
+    /// The joint: an index into `TorqueEstimate::joints`.
+    pub joint: u32,
+}
+
+/// The torques of the drives of one instant, whose constants and friction are known: the payload of
+/// `<robot>/estimate/drive`. It exists if `parameters.toml` has drives. No torque of
+/// `<robot>/estimate/torque` depends on it.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
+#[type_name("proprio/DriveEstimate/1")]
+pub struct DriveEstimate {
+    /// `acquired` is that of the estimate with which they are compared.
+    pub header: Header,
+    /// Number of valid entries in `drives`.
+    pub count: u32,
+    /// Number of valid entries in `candidates`.
+    pub candidate_count: u32,
+    /// The joints whose drives are known, ascending.
+    pub drives: [DriveTorque; MAX_JOINTS],
+    /// What may have caused the disagreements.
+    pub candidates: [NamedCandidate; Self::CANDIDATES],
+}
+
+impl DriveTorque {
+    /// Nothing compared yet.
+    pub const ABSENT: Self = Self {
+        torque: f64::NAN,
+        standard_deviation: f64::NAN,
+        deviate: f64::NAN,
+        ratio: f64::NAN,
+        agreement: Agreement::Unknown.in_memory(),
+        reason: Reason::NeverSeen.in_memory(),
+        cause: NO_CAUSE,
+        joint: 0,
+    };
+}
+
+impl NamedCandidate {
+    /// An unused entry.
+    pub const NONE: Self = Self {
+        name: Name::EMPTY,
+        kind: Candidate::Contact.in_memory(),
+        joint: 0,
+    };
+}
+
+impl DriveEstimate {
+    /// Maximum number of candidates of all disagreements together; those beyond it are left out.
+    pub const CANDIDATES: usize = 24;
+
+    /// Nothing compared yet.
+    #[must_use]
+    pub fn new() -> Self {
+        Self {
+            header: Header::default(),
+            count: 0,
+            candidate_count: 0,
+            drives: [DriveTorque::ABSENT; MAX_JOINTS],
+            candidates: [NamedCandidate::NONE; Self::CANDIDATES],
+        }
+    }
+
+    /// The valid joints.
+    #[must_use]
+    pub fn drives(&self) -> &[DriveTorque] {
+        self.drives
+            .get(..self.count as usize)
+            .unwrap_or(&self.drives)
+    }
+
+    /// The drive of a joint, by its index in `TorqueEstimate::joints`.
+    #[must_use]
+    pub fn of_joint(&self, joint: u32) -> Option<&DriveTorque> {
+        self.drives().iter().find(|own| own.joint == joint)
+    }
+
+    /// The valid candidates.
+    #[must_use]
+    pub fn candidates(&self) -> &[NamedCandidate] {
+        self.candidates
+            .get(..self.candidate_count as usize)
+            .unwrap_or(&self.candidates)
+    }
+}
+
+impl Default for DriveEstimate {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+const _: () = assert!(size_of::<DriveTorque>() == 48 && size_of::<NamedCandidate>() == 72);
+const _: () =
+    assert!(size_of::<DriveEstimate>() == 64 + 48 * MAX_JOINTS + 72 * DriveEstimate::CANDIDATES);
