@@ -345,14 +345,22 @@ impl Simulation {
             .collect();
         let mut trajectory = Trajectory::new(&ranges, settings.seed, settings.still);
         for fault in &settings.faults {
-            if let Fault::Still { joint } = fault {
+            if let Fault::Still { joint, at } = fault {
                 let number = joint_names.iter().position(|name| name == joint);
                 let number = number.ok_or_else(|| {
                     robot.mismatch(format!(
                         "fault {fault}: the URDF has no moving joint {joint:?}"
                     ))
                 })?;
-                trajectory.rest(number);
+                if let (Some(Some(limits)), Some(at)) = (ranges.get(number), at)
+                    && !(limits.lower..=limits.upper).contains(at)
+                {
+                    let (lower, upper) = (limits.lower, limits.upper);
+                    return Err(robot.mismatch(format!(
+                        "fault {fault}: the limits in the URDF are {lower} and {upper}"
+                    )));
+                }
+                trajectory.rest(number, *at);
             }
         }
         let standing =
