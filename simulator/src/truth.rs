@@ -952,6 +952,27 @@ mod tests {
     }
 
     #[test]
+    fn a_joint_stands_where_it_is_told_within_its_limits() {
+        let standing = |fault: &str| {
+            let faults = vec![fault.parse().unwrap()];
+            let simulation = Simulation::new(
+                &robot(),
+                &Settings {
+                    faults,
+                    ..Settings::default()
+                },
+            );
+            simulation.map(|simulation| {
+                let elbow = simulation.joint("l_elbow").unwrap();
+                simulation.motion(elbow, 7.0).unwrap().position
+            })
+        };
+        assert_eq!(standing("still:l_elbow=0.8").unwrap(), 0.8);
+        let message = standing("still:l_elbow=9").unwrap_err().to_string();
+        assert!(message.contains("the limits in the URDF are"), "{message}");
+    }
+
+    #[test]
     fn a_link_that_the_urdf_lacks_is_named() {
         let mut robot = robot();
         robot.config.contact[1].link = "left_hand".into();

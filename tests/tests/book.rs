@@ -672,7 +672,7 @@ impl Place {
                 .next()
                 .and_then(|n| n.parse().ok())
                 .expect("a number");
-            let robot = "proprio simulate --robot config/six_axis_arm --still 600 --no-push";
+            let robot = "proprio simulate --robot config/six_axis_arm --still 3600 --no-push";
             self.daemon(&format!("{robot}{at}"));
             let mut last = None;
             // At first the gateway waits for the new robot.
