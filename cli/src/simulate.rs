@@ -37,7 +37,8 @@ pub(crate) struct Args {
     /// A fault: "lost:0.01", "silent:BOARD@3..4", "saturate:BOARD@5..5.5", "spike:BOARD@6",
     /// "freeze:BOARD@5..6", "late:BOARD=0.02@2..8" (readings of 0.02 s before),
     /// "late_half:BOARD@2..8", "push:LINK=20@8..9", "push:LINK=20:X,Y,Z:DX,DY,DZ@8..9" (where [m]
-    /// and along what, in the link's frame), "still:JOINT"; may be repeated
+    /// and along what, in the link's frame), "still:JOINT", "still:JOINT=0.8" (where it stands);
+    /// may be repeated
     #[arg(long, value_name = "FAULT")]
     fault: Vec<String>,
     /// The file for the truth, written at the end: a table of joint torques, wrenches and motion

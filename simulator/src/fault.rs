@@ -13,6 +13,7 @@
 //! | `push:l_forearm=20@8..9` | an undeclared force of 20 N pushes this link of the URDF |
 //! | `push:l_forearm=20:0.03,-0.07,0:-1,0,0@8..9` | the same, at this point and in this direction |
 //! | `still:l_elbow` | this joint of the URDF does not move |
+//! | `still:l_elbow=0.8` | it does not move, and stands at 0.8 rad (or m) |
 //!
 //! A late half follows just after the next reading's first half; `late_half:BOARD@6` delays one
 //! reading. A push acts at the origin of the link's frame along its x axis, or at the point \[m\]
@@ -104,6 +105,8 @@ pub enum Fault {
     Still {
         /// The joint of the URDF.
         joint: String,
+        /// Where it stands \[rad or m\]; default: in the middle of its range.
+        at: Option<f64>,
     },
 }
 
@@ -330,8 +333,20 @@ impl FromStr for Fault {
                     )),
                 }
             }
-            "still" if named && when.is_none() => Ok(Self::Still { joint: device }),
-            "still" => Err(form("still:JOINT", "\"still:l_elbow\"")),
+            "still" => {
+                let (joint, at) = match what.split_once('=') {
+                    Some((joint, at)) => (joint, at.trim().parse().ok().map(Some)),
+                    None => (what, Some(None)),
+                };
+                let at = at.filter(|at: &Option<f64>| at.is_none_or(f64::is_finite));
+                match at {
+                    Some(at) if !joint.is_empty() && when.is_none() => Ok(Self::Still {
+                        joint: joint.to_owned(),
+                        at,
+                    }),
+                    _ => Err(form("still:JOINT[=RAD]", "\"still:l_elbow=0.8\"")),
+                }
+            }
             "late_half" => match (span, moment) {
                 (Some(window), _) => Ok(Self::LateHalf {
                     device,
@@ -415,7 +430,10 @@ impl fmt::Display for Fault {
                 age,
                 window,
             } => write!(f, "late:{device}={age}@{window}"),
-            Self::Still { joint } => write!(f, "still:{joint}"),
+            Self::Still { joint, at } => {
+                write!(f, "still:{joint}")?;
+                at.map_or(Ok(()), |at| write!(f, "={at}"))
+            }
             Self::LateHalf {
                 device,
                 window,
@@ -460,6 +478,7 @@ mod tests {
             "spike:l_arm_ft_sensor@6",
             "late:l_arm_ft_sensor=0.02@2..8",
             "still:l_elbow",
+            "still:l_elbow=-0.8",
             "late_half:l_arm_ft_sensor@2..8",
             "late_half:l_arm_ft_sensor@2.5",
             "push:l_forearm=20@8..9",
@@ -497,6 +516,9 @@ mod tests {
             ("late:ft=-1@2..8", "late:BOARD=SECONDS@FROM..UNTIL"),
             ("late:ft=0.1", "late:BOARD=SECONDS@FROM..UNTIL"),
             ("still:", "still:JOINT"),
+            ("still:=1", "still:JOINT"),
+            ("still:l_elbow=", "still:JOINT"),
+            ("still:l_elbow=inf", "still:JOINT"),
             ("still:l_elbow@3..", "still:JOINT"),
             ("late_half:ft", "late_half:BOARD@FROM..UNTIL or"),
             (

@@ -92,9 +92,10 @@ impl Trajectory {
         }
     }
 
-    /// Lets joint `joint` rest for good.
-    pub fn rest(&mut self, joint: usize) {
+    /// Lets joint `joint` rest for good, at this position \[rad or m\] or where it rests anyway.
+    pub fn rest(&mut self, joint: usize, at: Option<f64>) {
         if let Some(motion) = self.joints.get_mut(joint) {
+            motion.rest = at.unwrap_or(motion.rest);
             motion
                 .sines
                 .iter_mut()

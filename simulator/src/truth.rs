@@ -345,14 +345,22 @@ impl Simulation {
             .collect();
         let mut trajectory = Trajectory::new(&ranges, settings.seed, settings.still);
         for fault in &settings.faults {
-            if let Fault::Still { joint } = fault {
+            if let Fault::Still { joint, at } = fault {
                 let number = joint_names.iter().position(|name| name == joint);
                 let number = number.ok_or_else(|| {
                     robot.mismatch(format!(
                         "fault {fault}: the URDF has no moving joint {joint:?}"
                     ))
                 })?;
-                trajectory.rest(number);
+                if let (Some(Some(limits)), Some(at)) = (ranges.get(number), at)
+                    && !(limits.lower..=limits.upper).contains(at)
+                {
+                    let (lower, upper) = (limits.lower, limits.upper);
+                    return Err(robot.mismatch(format!(
+                        "fault {fault}: the limits in the URDF are {lower} and {upper}"
+                    )));
+                }
+                trajectory.rest(number, *at);
             }
         }
         let standing =
@@ -941,6 +949,27 @@ mod tests {
             simulation.motion(elbow + 1, 7.0),
             simulation.motion(elbow + 1, 0.0)
         );
+    }
+
+    #[test]
+    fn a_joint_stands_where_it_is_told_within_its_limits() {
+        let standing = |fault: &str| {
+            let faults = vec![fault.parse().unwrap()];
+            let simulation = Simulation::new(
+                &robot(),
+                &Settings {
+                    faults,
+                    ..Settings::default()
+                },
+            );
+            simulation.map(|simulation| {
+                let elbow = simulation.joint("l_elbow").unwrap();
+                simulation.motion(elbow, 7.0).unwrap().position
+            })
+        };
+        assert_eq!(standing("still:l_elbow=0.8").unwrap(), 0.8);
+        let message = standing("still:l_elbow=9").unwrap_err().to_string();
+        assert!(message.contains("the limits in the URDF are"), "{message}");
     }
 
     #[test]

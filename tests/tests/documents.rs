@@ -1,6 +1,6 @@
 //! The book, README.md and the other documents: their links lead somewhere, no page is long, every
 //! page is in the book's list, configuration blocks are legal, and a test knows each block of code.
-//! (Commands are parsed by a test of `proprio-cli`, programs are compiled by those of the readers.)
+//! (Commands are run by `book.rs`, programs are compiled by the tests of the readers.)
 
 use proprio_estimator::config::Config;
 use proprio_gateway::plan::Plan;
@@ -165,7 +165,7 @@ fn every_page_is_in_the_list_once() {
 
 /// The languages of blocks, and where the test of it looks; none: everywhere.
 const LANGUAGES: [(&str, Option<&str>); 8] = [
-    ("sh", None),   // cli/src/help.rs
+    ("sh", None),   // book.rs
     ("toml", None), // below, and gateway/tests/pages.rs
     ("text", None),
     ("json", Some("reference/editors.md")), // below
