@@ -51,8 +51,8 @@ pub(crate) struct Record {
     /// End after so many seconds; default: at Ctrl-C
     #[arg(long, value_name = "N")]
     seconds: Option<f64>,
-    /// Write all columns of a table, such as gauges and temperatures, not only those that the
-    /// estimator reads
+    /// Write all columns of a table, such as gauges, temperatures and what drives report, not only
+    /// those of motion and load
     #[arg(long)]
     all: bool,
     /// Record the raw frames of this bus, too: can0 or virtual:NAME. Can be given several times

@@ -191,7 +191,15 @@ fn found(arm: &Arm, parameters: &Parameters, summary: &Json) {
                 "{told}"
             );
         }
-        assert!((own.parameters[0] / expected[0] - 1.0).abs() < 0.1);
+        let relative = |i: usize| own.parameters[i] / expected[i] - 1.0;
+        println!(
+            "{}: constant {:+.3}, Coulomb {:+.3}, viscous {:+.3}",
+            own.joint,
+            relative(0),
+            relative(1),
+            relative(2)
+        );
+        assert!(relative(0).abs() < 0.1);
         let ripple = truth.ripple / f64::sqrt(2.0);
         assert!(
             (0.7..1.5).contains(&(own.noise / ripple)),

@@ -82,9 +82,8 @@ pub(super) fn in_json(found: &[Found]) -> Json {
 pub(super) fn line(found: &[Found]) -> Option<String> {
     let joints = found.iter().filter(|(_, drive)| drive.is_ok());
     let joints: Vec<&str> = joints.map(|(joint, _)| joint.as_str()).collect();
-    (!joints.is_empty()).then(|| {
-        format!("second opinions from the drives of {}", joints.join(", "))
-    })
+    (!joints.is_empty())
+        .then(|| format!("second opinions from the drives of {}", joints.join(", ")))
 }
 
 /// What is odd about the drives, one sentence each.
