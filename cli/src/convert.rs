@@ -35,8 +35,8 @@ pub(crate) struct Decode {
     /// The table to write; - for standard output
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Also write columns that the estimator does not read: currents, temperatures, gauges,
-    /// orientation, motor states
+    /// Write all columns, also those beside motion and load: torques and currents of drives,
+    /// temperatures, gauges, orientation, motor states
     #[arg(long)]
     all: bool,
     /// Print a summary of the conversion as JSON

@@ -337,13 +337,10 @@ fn fitted(joint: &str, signal: Signal, logs: &[Vec<Row>], has_load: bool) -> Res
     let mean = |of: fn(&Equation) -> f64| rows().map(of).sum::<f64>() / rows().count() as f64;
     let (torque, error) = (mean(|row| row.x[0] * row.x[0]), mean(|row| row.torque));
     let drive = physical(joint, signal, &theta, &covariance, (variance * few).sqrt());
-    let mut drive = match drive {
-        Some(drive) => drive,
-        None => {
-            return Err(Unfit::Uncertain {
-                relative: f64::INFINITY,
-            });
-        }
+    let Some(mut drive) = drive else {
+        return Err(Unfit::Uncertain {
+            relative: f64::INFINITY,
+        });
     };
     drive.inherited = [(error / torque).sqrt(), error.sqrt()];
     let relative = drive.deviations()[0] / drive.parameters[0].abs();

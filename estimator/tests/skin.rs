@@ -462,7 +462,7 @@ fn a_table_gives_the_live_estimates() {
     assert_eq!((report.log.bad_rows, report.unused_channels.len()), (0, 0));
     let mut own = offline::Table::new(Vec::new(), &setup).unwrap();
     for estimate in &live {
-        own.write(estimate, true).unwrap();
+        own.write(estimate, None, true).unwrap();
     }
     let own = own.into_inner();
     assert!(own.len() > 10_000 && own == out, "the tables differ");

@@ -16,17 +16,14 @@ impl Pipeline {
         let Some(buffer) = self.buffers.get_mut(channel) else {
             return self.push_skin(channel, t, reading, quality);
         };
-        if let (Reading::Joint(j), Some(ChannelRole::Joint(dof))) = (
-            reading,
-            self.setup.robot.channels.get(channel).map(|c| c.role),
-        ) {
-            if let Some(drives) = &mut self.drives {
-                drives.push(dof, t, [j.torque, j.current], quality);
-            }
+        let role = self.setup.robot.channels.get(channel).map(|c| c.role);
+        if let (Reading::Joint(j), Some(ChannelRole::Joint(dof))) = (reading, role)
+            && let Some(drives) = &mut self.drives
+        {
+            drives.push(dof, t, [j.torque, j.current], quality);
         }
         // Estimates that do not wait go by the order of arrival: no sample is late.
         let waits = self.setup.timing == Timing::Aligned;
-        let role = self.setup.robot.channels.get(channel).map(|c| c.role);
         let newest = buffer.newest().unwrap_or(Nanos::MIN);
         let all_finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
         let finite_or_absent = |values: &[f64]| values.iter().all(|v| !v.is_infinite());
