@@ -83,8 +83,8 @@ pub fn torques() -> Definition {
 /// The torques of drives, and whether they agree.
 #[must_use]
 pub fn drives() -> Definition {
-    let text = "# What the joints' drives report, less friction and rotor [Nm, N], beside the torques\n\
-                # from the force/torque sensors.\n\
+    let text = "# What the joints' drives report, less friction and rotor [Nm, N], beside the\n\
+                # torques from the force/torque sensors.\n\
                 # CLOCK_MONOTONIC [ns]\n\
                 int64 acquired\n\
                 string[] joint\n\
@@ -95,9 +95,12 @@ pub fn drives() -> Definition {
                 string[] agreement\n\
                 # The smoothed difference, in deviations of both together.\n\
                 float64[] deviate\n\
-                # What may have caused disagreements: contact, sensor or drive, and its name.\n\
+                # If it disagrees: the first joint of its sub-tree that does.\n\
+                string[] group\n\
+                # What may have caused the disagreements of a group: contact, sensor or drive.\n\
                 string[] candidate\n\
-                string[] candidate_name\n";
+                string[] candidate_name\n\
+                string[] candidate_group\n";
     Definition::new("proprio_msgs/msg/Drives", text)
 }
 

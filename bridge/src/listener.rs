@@ -472,8 +472,13 @@ impl Listener {
             let description = *self.gateway.newest();
             self.name_channels(&description);
         }
-        if self.estimates.is_none() {
-            self.estimates = Estimates::of(&self.domain, &self.robot);
+        match &mut self.estimates {
+            None => self.estimates = Estimates::of(&self.domain, &self.robot),
+            // Of an estimator that has learnt of drives since.
+            Some(Estimates { drives, .. }) if drives.is_none() => {
+                *drives = Reader::open(&self.domain, &self.robot).ok();
+            }
+            Some(_) => {}
         }
         if self.declarations.is_none() {
             self.declarations = Reader::open(&self.domain, &self.robot).ok();

@@ -483,12 +483,16 @@ impl<S: Sink> Messages<S> {
             }
             message.count(drives.len());
             drives.iter().for_each(|own| message.f64s(&[own.deviate]));
+            message.count(drives.len());
+            (drives.iter()).for_each(|own| message.text(name(names, Role::Joint, own.group)));
             message.count(candidates.len());
             for own in candidates {
                 message.text(own.kind.get().map_or("?", Candidate::word));
             }
             message.count(candidates.len());
             (candidates.iter()).for_each(|own| message.text(own.name.as_str()));
+            message.count(candidates.len());
+            (candidates.iter()).for_each(|own| message.text(name(names, Role::Joint, own.joint)));
             message
         })
     }

@@ -586,7 +586,7 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
 const CHECKED: u64 = 256 << 20;
 
 /// Whether a log can be read twice; a pipe cannot.
-fn is_file(log: &Path) -> bool {
+pub(crate) fn is_file(log: &Path) -> bool {
     log != Path::new("-") && std::fs::metadata(log).is_ok_and(|data| data.is_file())
 }
 

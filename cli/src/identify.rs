@@ -136,7 +136,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             );
         },
     );
-    bar.finish_and_clear();
+    if result.is_err() {
+        bar.finish_and_clear();
+    }
     let outcome = result?;
 
     let advice = Advice::of(&outcome);
@@ -148,7 +150,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             &setup.robot,
             concat!("proprio ", env!("CARGO_PKG_VERSION")),
         )?;
-        found = drives::identify(&setup, &parameters, &outcome, &files, &args.config)?;
+        show("drives", 1.0);
+        found = drives::identify(&setup, &parameters, &outcome, &files, &args.config)
+            .unwrap_or_else(|error| {
+                tracing::warn!("the drives give no second opinion: {error:#}");
+                Vec::new()
+            });
         let drives = found.iter().filter_map(|(_, drive)| drive.as_ref().ok());
         parameters.set_drives(&drives.cloned().collect::<Vec<_>>())?;
         let file = out.join("parameters.toml");
@@ -160,6 +167,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             .with_context(|| config.model.display().to_string())?;
         write(out, "identified.urdf", &urdf)?;
     }
+    bar.finish_and_clear();
     json["drives"] = drives::in_json(&found);
     let mut text = serde_json::to_string_pretty(&json)?;
     text.push('\n');

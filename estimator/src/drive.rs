@@ -2,8 +2,8 @@
 //! and how they are found from the torque of the force/torque (F/T) sensors.
 //!
 //! # The model
-//! A drive reports `s`, a torque \[Nm; N\] or a current \[A\]. With the torque `tau` of the joint, on
-//! the link's side of the gear, and `sgn(dq) = tanh(dq / v0)`,
+//! A drive reports `s`, a torque \[Nm; N\] or a current \[A\]. With the torque `tau` of the joint,
+//! on the link's side of the gear, and `sgn(dq) = tanh(dq / v0)`,
 //!
 //! ```text
 //! K s = tau + (c + l |tau|) sgn(dq) + d dq + J ddq + b
@@ -19,15 +19,16 @@
 //! | `b` | offset of the report | Nm |
 //!
 //! (N, N/A, N s/m and kg for a prismatic joint.) Load-dependent friction is that of a gear whose
-//! teeth press on each other (Gautier, Janot, "Global identification of drive gains parameters of
-//! robots using a known payload", 2014; Hamon et al., "Dynamic identification of robots with a dry
-//! friction model depending on load and velocity", 2010).
+//! teeth press on each other (Gautier, Briot, "Global identification of joint drive gains and
+//! dynamic parameters of robots", 2014; Hamon, Gautier, Garrec, "Dynamic identification of robots
+//! with a dry friction model depending on load and velocity", 2010).
 //!
 //! # The fit
-//! [`fit`] finds `s` as a linear function of `tau`, `sgn(dq)`, `dq`, `|tau| sgn(dq)`, `ddq` and one,
-//! because the errors of `s` (friction that the model lacks) are much larger than those of `tau`.
-//! - Below `v0` the friction may have any value between `-c` and `c`: such rows count less by that
-//!   variance.
+//! [`fit`] finds `s` as a linear function of `tau`, `sgn(dq)`, `dq`, `|tau| sgn(dq)`, `ddq` and
+//! one, because the errors of `s` (friction that the model lacks) are much larger than those of
+//! `tau`.
+//! - Below `v0` the friction may have any value between `-c` and `c`, with a variance of `c^2 / 3`:
+//!   such rows count less.
 //! - Seconds in which something else acts (a push that no sensor sees) count less: their residuals
 //!   have a Student distribution with [`NU`] degrees of freedom.
 //! - Residuals are correlated within a second, not between seconds: the covariance is that of the
@@ -35,7 +36,7 @@
 //! - The error of `tau` itself is that of the robot's parameters, and does not average out. The
 //!   drive inherits it ([`Drive::inherited`]): it is part of the deviation of the drive's torque,
 //!   and not of the difference between both.
-//! - What a log does not show (friction of a joint that stood still) keeps its prior, [`prior`].
+//! - What a log does not show (friction of a joint that stood still) keeps a wide prior.
 
 use crate::config::Timing;
 use crate::offline::{self, OfflineError};
@@ -117,21 +118,19 @@ pub struct Row {
 pub enum Unfit {
     /// Too little of the log can be used.
     #[error(
-        "only {seconds} s have a valid torque and a report of the drive; {LEAST_SECONDS} are needed"
+        "only {seconds} s, with stamps, have a valid torque and a report of the drive; \
+         {LEAST_SECONDS} are needed"
     )]
     TooShort {
         /// How many seconds can be used.
         seconds: usize,
     },
-    /// The report does not follow the torque.
+    /// The report does not follow the torque: its constant may be zero.
     #[error(
-        "what it reports does not follow the torque: its constant is known to {:.0} % only. Move \
-         the joint so that its torque changes more", 100.0 * .relative
+        "what it reports does not follow the torque, which gives no constant to {SIGNIFICANT} \
+         deviations; move the joint so that its torque changes more"
     )]
-    Uncertain {
-        /// Relative deviation of the constant.
-        relative: f64,
-    },
+    Unrelated,
 }
 
 impl Drive {
@@ -154,10 +153,11 @@ impl Drive {
             -acceleration,
             -1.0,
         ) / rest;
-        // At rest, friction holds whatever is less than it.
-        let stiction = (coulomb + load * torque.abs()).powi(2) * (1.0 - sign * sign);
+        // At rest, it is anything between plus and minus friction.
+        let friction = (coulomb + load * torque.abs()).powi(2) + self.covariance[(1, 1)];
+        let beside = self.noise.powi(2) + friction / 3.0 * (1.0 - sign * sign);
         let variance =
-            by_parameters.dot(&(self.covariance * by_parameters)) + self.noise.powi(2) + stiction;
+            by_parameters.dot(&(self.covariance * by_parameters)) + beside / rest.powi(2);
         let [relative, offset] = self.inherited;
         (
             torque,
@@ -189,27 +189,28 @@ impl Signal {
 }
 
 /// Finds the drive of a joint from logs, each with its rows in order. It is that of the reported
-/// torque, if there is one, else that of the current; `None` if the drive reports neither.
+/// torque, if that follows the joint's, else that of the current; `None` if the drive reports
+/// neither.
 ///
 /// # Errors
-/// [`Unfit`].
+/// [`Unfit`], of the first that it reports.
 pub fn fit(joint: &str, logs: &[Vec<Row>]) -> Option<Result<Drive, Unfit>> {
-    let has = |signal: Signal| {
+    let is_reported = |signal: &Signal| {
         let mut rows = logs.iter().flatten();
         rows.any(|row| signal.of(row.report).is_finite())
     };
-    let signal = [Signal::Torque, Signal::Current]
-        .into_iter()
-        .find(|signal| has(*signal))?;
-    let with_load = fitted(joint, signal, logs, true);
-    Some(with_load.and_then(|drive| {
-        let load = drive.parameters[3];
-        let is_asked = load > SIGNIFICANT * drive.deviations()[3] && load < 1.0;
-        match is_asked {
-            true => Ok(drive),
-            false => fitted(joint, signal, logs, false),
-        }
-    }))
+    let signals = [Signal::Torque, Signal::Current].into_iter();
+    let found = signals.filter(is_reported).map(|signal| {
+        let fitted = |has_load| Fit::new(signal, logs, has_load).and_then(|fit| fit.drive(joint));
+        fitted(true)
+            .ok()
+            .filter(|drive| {
+                let load = drive.parameters[3];
+                load > SIGNIFICANT * drive.deviations()[3] && load < 1.0
+            })
+            .map_or_else(|| fitted(false), Ok)
+    });
+    found.reduce(|first, second| first.or_else(|error| second.map_err(|_| error)))
 }
 
 /// What joints and drives do in a log, by degree of freedom, as the estimator with this `setup`
@@ -225,6 +226,10 @@ pub fn rows(setup: &Setup, log: impl Read) -> Result<Vec<Vec<Row>>, OfflineError
     // A log has the samples that a running estimator would have to wait for.
     setup.timing = Timing::Aligned;
     offline::follow(setup, log, |pipeline, is_stamped| {
+        // Friction needs velocities, and seconds.
+        if !is_stamped {
+            return Ok(ControlFlow::Break(()));
+        }
         for (dof, row) in pipeline.drive_rows() {
             if let Some(own) = rows.get_mut(dof)
                 && own.last().is_none_or(|last| row.t >= last.t + ROW_PERIOD)
@@ -232,11 +237,7 @@ pub fn rows(setup: &Setup, log: impl Read) -> Result<Vec<Vec<Row>>, OfflineError
                 own.push(row);
             }
         }
-        // Friction needs velocities, and seconds.
-        Ok(match is_stamped {
-            true => ControlFlow::Continue(()),
-            false => ControlFlow::Break(()),
-        })
+        Ok(ControlFlow::Continue(()))
     })?;
     Ok(rows)
 }
@@ -251,108 +252,187 @@ struct Second {
 struct Equation {
     x: Vector6<f64>,
     s: f64,
-    /// Variance of `tau`, and of the sign of the velocity.
+    /// Variance of `tau`.
     torque: f64,
-    sign: f64,
+    /// How far the direction of friction is open: one at rest.
+    rest: f64,
 }
 
-fn fitted(joint: &str, signal: Signal, logs: &[Vec<Row>], has_load: bool) -> Result<Drive, Unfit> {
-    let mut seconds = seconds(signal, logs, has_load);
-    if seconds.len() < LEAST_SECONDS {
-        return Err(Unfit::TooShort {
-            seconds: seconds.len(),
-        });
-    }
-    let unknowns = if has_load { 6.0 } else { 5.0 };
-    let count = seconds.len() as f64;
-    let (prior, report) = prior(&seconds);
-    let (mut theta, mut variance) = (Vector6::zeros(), f64::NAN);
-    let mut inverse = Matrix6::zeros();
-    // The variance of a row's residual.
-    let of_row = |theta: &Vector6<f64>, row: &Equation, variance: f64| {
-        let tau = row.x[0].abs();
-        variance + (theta[1] + theta[3] * tau).powi(2) * row.sign
-    };
-    for round in 0..ROUNDS {
-        let weigh = |row: &Equation, of_second: f64| match round {
-            0 => 1.0,
-            _ => of_second / of_row(&theta, row, variance),
-        };
-        // Before the first fit, residuals are taken to be as large as the report.
-        let (mut information, mut right) = (prior, Vector6::zeros());
-        if round == 0 {
-            information *= report.powi(2);
-        }
-        for second in &seconds {
-            for row in &second.equations {
-                let weight = weigh(row, second.weight);
-                information += weight * row.x * row.x.transpose();
-                right += weight * row.s * row.x;
-            }
-        }
-        let Some(inverted) = information.try_inverse() else {
-            return Err(Unfit::Uncertain {
-                relative: f64::INFINITY,
+/// A fit of `s = x . theta`.
+struct Fit {
+    signal: Signal,
+    has_load: bool,
+    seconds: Vec<Second>,
+    /// RMS of `s`.
+    report: f64,
+    theta: Vector6<f64>,
+    /// Variance of a residual in motion.
+    variance: f64,
+}
+
+impl Fit {
+    fn new(signal: Signal, logs: &[Vec<Row>], has_load: bool) -> Result<Self, Unfit> {
+        let seconds = seconds(signal, logs, has_load);
+        if seconds.len() < LEAST_SECONDS {
+            return Err(Unfit::TooShort {
+                seconds: seconds.len(),
             });
+        }
+        let mut fit = Self {
+            signal,
+            has_load,
+            report: f64::NAN,
+            seconds,
+            theta: Vector6::zeros(),
+            variance: f64::NAN,
         };
-        (theta, inverse) = (inverted * right, inverted);
-        let residual = |row: &Equation| row.s - row.x.dot(&theta);
-        // Rows count by how little friction at rest can have to do with them.
-        let before = if round == 0 { report.powi(2) } else { variance };
-        let (mut sum, mut weights) = (0.0, f64::MIN_POSITIVE);
-        for second in &seconds {
-            for row in &second.equations {
-                let weight = second.weight * before / of_row(&theta, row, before);
-                sum += weight * residual(row).powi(2);
-                weights += weight;
-            }
-        }
-        variance = (sum / weights).max(LEAST_NOISE.powi(2) * report.powi(2));
-        for second in &mut seconds {
-            let rows = second.equations.iter();
-            let deviates =
-                rows.map(|row| (row.s - row.x.dot(&theta)).powi(2) / of_row(&theta, row, variance));
-            let mean = deviates.sum::<f64>() / second.equations.len() as f64;
-            second.weight = (NU + 1.0) / (NU + mean);
-        }
+        fit.report = fit.rms(|row| row.s).max(f64::MIN_POSITIVE);
+        // Before the first fit, residuals are taken to be as large as the report.
+        fit.variance = fit.report.powi(2);
+        Ok(fit)
     }
-    let mut scatter = Matrix6::zeros();
-    for second in &seconds {
-        let rows = second.equations.iter();
-        let gradient: Vector6<f64> = rows
-            .map(|row| {
-                let weight = second.weight / of_row(&theta, row, variance);
-                weight * (row.s - row.x.dot(&theta)) * row.x
+
+    fn rows(&self) -> impl Iterator<Item = (f64, &Equation)> {
+        let seconds = self.seconds.iter();
+        seconds.flat_map(|Second { equations, weight }| {
+            equations.iter().map(move |row| (*weight, row))
+        })
+    }
+
+    fn rms(&self, of: fn(&Equation) -> f64) -> f64 {
+        let squares: f64 = self.rows().map(|(_, row)| of(row).powi(2)).sum();
+        (squares / self.rows().count().max(1) as f64).sqrt()
+    }
+
+    fn residual(&self, row: &Equation) -> f64 {
+        row.s - row.x.dot(&self.theta)
+    }
+
+    /// The variance of a row's residual: at rest, friction has any value between its limits.
+    fn variance_of(&self, row: &Equation) -> f64 {
+        let friction = self.theta[1] + self.theta[3] * row.x[0].abs();
+        self.variance + friction.powi(2) / 3.0 * row.rest
+    }
+
+    /// Information matrix of the weighted rows and the prior, and the right-hand side.
+    fn equations(&self) -> (Matrix6<f64>, Vector6<f64>) {
+        let (mut information, mut right) = (self.prior(), Vector6::zeros());
+        for (of_second, row) in self.rows() {
+            let weight = of_second / self.variance_of(row);
+            information += weight * row.x * row.x.transpose();
+            right += weight * row.s * row.x;
+        }
+        (information, right)
+    }
+
+    /// Precision of the prior about zero. Friction may be as large as the whole report, at 1 rad/s
+    /// (1 m/s), and for a rotor at 1 rad/s^2; load-dependent friction as large as the torque. It
+    /// gives what the log does not show a finite deviation, and weighs nothing beside a second of
+    /// what it does show. The constant and the offset have ten times the deviation that their
+    /// columns alone could explain.
+    fn prior(&self) -> Matrix6<f64> {
+        let report = self.report;
+        let by_torque = report / self.rms(|row| row.x[0]).max(1e-9);
+        let most = [
+            10.0 * by_torque,
+            report,
+            report,
+            by_torque,
+            report,
+            10.0 * report,
+        ];
+        Matrix6::from_diagonal(&Vector6::from(most).map(|most| most.powi(-2)))
+    }
+
+    /// One round: `theta`, then the variance, then what each second counts.
+    fn improve(&mut self) -> Option<()> {
+        let (information, right) = self.equations();
+        self.theta = information.cholesky()?.solve(&right);
+        // Squared, so that rows at rest, which show friction and no noise, drop out.
+        let of_motion = |row: &Equation| (self.variance / self.variance_of(row)).powi(2);
+        let (sum, weights) = self
+            .rows()
+            .fold((0.0, 0.0), |(sum, weights), (weight, row)| {
+                let weight = weight * of_motion(row);
+                (sum + weight * self.residual(row).powi(2), weights + weight)
+            });
+        let least = (LEAST_NOISE * self.report).powi(2);
+        self.variance = (sum / weights).max(least);
+        let weights = self.seconds.iter().map(|second| {
+            let deviates = second.equations.iter();
+            let deviates = deviates.map(|row| self.residual(row).powi(2) / self.variance_of(row));
+            let mean = deviates.sum::<f64>() / second.equations.len() as f64;
+            (NU + 1.0) / (NU + mean)
+        });
+        let weights: Vec<f64> = weights.collect();
+        for (second, weight) in self.seconds.iter_mut().zip(weights) {
+            second.weight = weight;
+        }
+        Some(())
+    }
+
+    /// The covariance of `theta`.
+    fn covariance(&self) -> Option<Matrix6<f64>> {
+        let (information, _) = self.equations();
+        let inverse = information.try_inverse()?;
+        let scatter: Matrix6<f64> = (self.seconds.iter())
+            .map(|second| {
+                let rows = second.equations.iter();
+                let gradient: Vector6<f64> = rows
+                    .map(|row| self.residual(row) * second.weight / self.variance_of(row) * row.x)
+                    .sum();
+                gradient * gradient.transpose()
             })
             .sum();
-        scatter += gradient * gradient.transpose();
+        let mut covariance = inverse * (self.few() * scatter + self.prior()) * inverse;
+        if !self.has_load {
+            covariance.row_mut(3).fill(0.0);
+            covariance.column_mut(3).fill(0.0);
+        }
+        Some(covariance)
     }
-    let few = count / (count - unknowns);
-    let mut covariance = inverse * (scatter * few + prior) * inverse;
-    if !has_load {
-        covariance.row_mut(3).fill(0.0);
-        covariance.column_mut(3).fill(0.0);
+
+    /// By how much squared residuals are larger than they look, for so many unknowns.
+    fn few(&self) -> f64 {
+        let count = self.seconds.len() as f64;
+        count / (count - if self.has_load { 6.0 } else { 5.0 })
     }
-    let rows = || seconds.iter().flat_map(|second| &second.equations);
-    let mean = |of: fn(&Equation) -> f64| rows().map(of).sum::<f64>() / rows().count() as f64;
-    let (torque, error) = (mean(|row| row.x[0] * row.x[0]), mean(|row| row.torque));
-    let drive = physical(joint, signal, &theta, &covariance, (variance * few).sqrt());
-    let Some(mut drive) = drive else {
-        return Err(Unfit::Uncertain {
-            relative: f64::INFINITY,
-        });
-    };
-    drive.inherited = [(error / torque).sqrt(), error.sqrt()];
-    let relative = drive.deviations()[0] / drive.parameters[0].abs();
-    match SIGNIFICANT * relative <= 1.0 {
-        true => Ok(drive),
-        false => Err(Unfit::Uncertain { relative }),
+
+    fn drive(mut self, joint: &str) -> Result<Drive, Unfit> {
+        (0..ROUNDS)
+            .try_for_each(|_| self.improve())
+            .ok_or(Unfit::Unrelated)?;
+        let covariance = self.covariance().ok_or(Unfit::Unrelated)?;
+        // From `s = theta . x` to `K s = ...`.
+        let constant = 1.0 / self.theta[0];
+        let mut parameters = [constant; 6];
+        let mut by_theta = Matrix6::zeros();
+        by_theta[(0, 0)] = -constant * constant;
+        for (i, place) in parameters.iter_mut().enumerate().skip(1) {
+            *place = self.theta[i] * constant;
+            by_theta[(i, 0)] = -*place * constant;
+            by_theta[(i, i)] = constant;
+        }
+        let error = self.rows().map(|(_, row)| row.torque).sum::<f64>();
+        let error = (error / self.rows().count() as f64).sqrt();
+        let drive = Drive {
+            joint: joint.to_owned(),
+            signal: self.signal,
+            parameters,
+            covariance: by_theta * covariance * by_theta.transpose(),
+            inherited: [error / self.rms(|row| row.x[0]), error],
+            noise: (self.variance * self.few()).sqrt() * constant.abs(),
+        };
+        match constant.abs() > SIGNIFICANT * drive.deviations()[0] {
+            true => Ok(drive),
+            false => Err(Unfit::Unrelated),
+        }
     }
 }
 
 /// The usable rows, by second.
 fn seconds(signal: Signal, logs: &[Vec<Row>], has_load: bool) -> Vec<Second> {
-    let mut seconds = Vec::new();
+    let mut seconds: Vec<Second> = Vec::new();
     for log in logs {
         let mut last = None;
         for row in log {
@@ -361,89 +441,24 @@ fn seconds(signal: Signal, logs: &[Vec<Row>], has_load: bool) -> Vec<Second> {
             if numbers.iter().any(|number| !number.is_finite()) {
                 continue;
             }
-            let second = row.t.0.div_euclid(Nanos::from_millis(1000).0);
-            if last != Some(second) {
-                last = Some(second);
+            let number = row.t.0.div_euclid(Nanos::from_millis(1000).0);
+            if last.replace(number) != Some(number) {
                 seconds.push(Second {
                     equations: Vec::new(),
                     weight: 1.0,
                 });
             }
             let sign = (row.velocity / COULOMB_SPEED).tanh();
-            let load = if has_load {
-                row.torque.abs() * sign
-            } else {
-                0.0
-            };
+            let load = f64::from(u8::from(has_load)) * row.torque.abs() * sign;
             if let Some(second) = seconds.last_mut() {
                 second.equations.push(Equation {
                     x: Vector6::new(row.torque, sign, row.velocity, load, row.acceleration, 1.0),
                     s,
                     torque: row.deviation.powi(2),
-                    sign: 1.0 - sign * sign,
+                    rest: 1.0 - sign * sign,
                 });
             }
         }
     }
     seconds
-}
-
-/// Precision of the prior about zero, and the RMS of the report. Friction may be as large as the
-/// whole report, at 1 rad/s (1 m/s), and for a rotor at 1 rad/s^2; load-dependent friction as large
-/// as the torque. It gives what the log does not show a finite deviation, and weighs nothing beside
-/// a second of what it does show. The constant and the offset have ten times the deviation that
-/// their columns alone could explain.
-fn prior(seconds: &[Second]) -> (Matrix6<f64>, f64) {
-    let rows = || seconds.iter().flat_map(|second| &second.equations);
-    let rms = |of: fn(&Equation) -> f64| {
-        let squares = rows().map(|row| of(row).powi(2)).sum::<f64>();
-        (squares / rows().count().max(1) as f64).sqrt()
-    };
-    let report = rms(|row| row.s).max(f64::MIN_POSITIVE);
-    let by_torque = report / rms(|row| row.x[0]).max(1e-9);
-    let most = Vector6::new(
-        10.0 * by_torque,
-        report,
-        report,
-        by_torque,
-        report,
-        10.0 * report,
-    );
-    (
-        Matrix6::from_diagonal(&most.map(|most| most.powi(-2))),
-        report,
-    )
-}
-
-/// The drive with `s = theta . x`, whose residuals have the standard deviation `noise` in units of
-/// the report.
-fn physical(
-    joint: &str,
-    signal: Signal,
-    theta: &Vector6<f64>,
-    covariance: &Matrix6<f64>,
-    noise: f64,
-) -> Option<Drive> {
-    let constant = 1.0 / theta[0];
-    if !constant.is_finite() {
-        return None;
-    }
-    let mut parameters = [0.0; 6];
-    let mut by_theta = Matrix6::zeros();
-    for (i, place) in parameters.iter_mut().enumerate() {
-        let own = if i == 0 { 1.0 } else { theta[i] };
-        *place = own * constant;
-        by_theta[(i, 0)] = -own * constant * constant;
-        if i > 0 {
-            by_theta[(i, i)] = constant;
-        }
-    }
-    Some(Drive {
-        joint: joint.to_owned(),
-        signal,
-        parameters,
-        covariance: by_theta * covariance * by_theta.transpose(),
-        inherited: [0.0; 2],
-        noise: noise * constant.abs(),
-    })
 }

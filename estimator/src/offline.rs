@@ -16,10 +16,10 @@
 //! | `reason/<joint>` | why it is not valid: a word, and the channel at fault after a colon |
 //! | `residual/<link>/fx fy fz tx ty tz` | \[N, Nm\], the residual of a sub-tree; see below |
 //! | `residual/<link>/significance` | its normal deviate; empty where it cannot be tested |
+//! | `residual/<link>/reason` | its cause: the contact detected there, or `unexplained` |
 //! | `drive/<joint>` | the torque by the drive ([`crate::drive`]), if its drive is known |
 //! | `drive_std/<joint>` | its standard deviation |
 //! | `agreement/<joint>` | whether it `agrees` or `disagrees`; empty if they cannot be compared |
-//! | `residual/<link>/reason` | its cause: the contact detected there, or `unexplained` |
 //!
 //! Cells of a withheld torque or wrench are empty; of a torque that is `uncertain` alone, the
 //! standard deviation is told.

@@ -4,8 +4,9 @@
 use crate::truth::JointTruth;
 use proprio_dynamics::model::Model;
 
-/// Speed over which the sign of friction is smoothed [rad/s or m/s].
-const STRIBECK: f64 = 0.02;
+/// Speed over which the sign of friction is smoothed [rad/s or m/s]: another one than that of the
+/// estimator's model, as a real gear has.
+const SMOOTHING: f64 = 0.01;
 
 /// A joint without limits in the URDF has these: effort [Nm or N], velocity [rad/s or m/s].
 const LIMITS: (f64, f64) = (20.0, 2.0);
@@ -48,7 +49,7 @@ impl DriveTruth {
     /// The torque that a drive reports [Nm or N]: that of the motor, on the joint's side.
     #[must_use]
     pub fn torque(&self, joint: &JointTruth) -> f64 {
-        let sign = (joint.velocity / STRIBECK).tanh();
+        let sign = (joint.velocity / SMOOTHING).tanh();
         joint.torque
             + (self.coulomb + self.load * joint.torque.abs()) * sign
             + self.viscous * joint.velocity

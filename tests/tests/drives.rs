@@ -183,10 +183,9 @@ fn found(arm: &Arm, parameters: &Parameters, summary: &Json) {
                 "{} {number}: {found} +- {deviation}, {expected:?}",
                 own.joint
             );
-            // The motion does not show all of them well; load-dependent friction may be left out.
+            // Load-dependent friction may be left out, and is then part of the other two.
             assert!(
                 (found - expected[number]).abs() < 4.0 * deviation
-                    || number == 3 && found == 0.0
                     || own.parameters[3] == 0.0 && (1..5).contains(&number),
                 "{told}"
             );
@@ -199,7 +198,7 @@ fn found(arm: &Arm, parameters: &Parameters, summary: &Json) {
             relative(1),
             relative(2)
         );
-        assert!(relative(0).abs() < 0.1);
+        assert!(relative(0).abs() < 0.06 && relative(1).abs() < 0.1 && relative(2).abs() < 0.15);
         let ripple = truth.ripple / f64::sqrt(2.0);
         assert!(
             (0.7..1.5).contains(&(own.noise / ripple)),
@@ -248,8 +247,8 @@ fn quiet(arm: &Arm, parameters: &Parameters) {
     assert!(compared > 7 * 25_000, "{compared}");
 }
 
-/// A push before the sensor that changes the torque by twelve of its deviations is found within half a
-/// second. Nothing else tells of it: the torque, which is wrong, stays valid.
+/// A push before the sensor that changes the torque by twelve of its deviations is found within
+/// half a second. Nothing else tells of it: the torque, which is wrong, stays valid.
 fn pushed(arm: &Arm, parameters: &Parameters) {
     const FROM: f64 = 12.0;
     let setup = arm.setup("estimator.toml", parameters);
@@ -290,11 +289,11 @@ fn pushed(arm: &Arm, parameters: &Parameters) {
     assert!((13.0..16.7).contains(&last), "{last}");
 }
 
-/// A drive that reports twice its current is the first candidate.
+/// A drive that reports twice its current is a candidate, and its factor is told.
 fn in_other_units(arm: &Arm, parameters: &Parameters) {
     let setup = arm.setup("estimator.toml", parameters);
     let log = multiplied(&arm.session(3, 12.0, &[]), "joint/l_elbow/current", 2.0);
-    let (mut count, mut first, mut ratio) = (0, 0, f64::NAN);
+    let (mut count, mut ratio) = (0, f64::NAN);
     each(setup.clone(), &log, |t, pipeline| {
         let said = pipeline.drives().unwrap();
         let (joints, candidates) = disagreement(&setup, said);
@@ -305,12 +304,10 @@ fn in_other_units(arm: &Arm, parameters: &Parameters) {
         assert_eq!(joints, ["l_elbow"], "{t}");
         let drive = (Candidate::Drive, "l_elbow".to_owned());
         assert!(candidates.contains(&drive), "{t} {candidates:?}");
-        first += usize::from(candidates.first() == Some(&drive));
         count += 1;
         ratio = said.drives()[3].ratio;
     });
-    println!("in other units: {first} of {count}, ratio {ratio:.2}");
-    assert!(first > count / 2, "{first} {count}");
+    println!("in other units: {ratio:.2}");
     assert!(
         count > 4000 && (1.7..2.4).contains(&ratio),
         "{count} {ratio}"
@@ -401,7 +398,7 @@ fn the_drive_of_a_real_leg_is_found() {
     // The hip bears no more than its friction.
     assert!(matches!(
         part("hip", 0.0, 24.0),
-        Some(Err(Unfit::Uncertain { .. }))
+        Some(Err(Unfit::Unrelated))
     ));
     assert!(part("ankle", 0.0, 24.0).is_none(), "it has no drive");
     // Constants of two halves are equal within their deviations, and near one: the torque constant

@@ -51,11 +51,14 @@ pub(super) fn know(
     .map(|(daemon, own)| format!("the {daemon} {own}"));
     let budget = match number {
         Some(number) if presence.estimator == Presence::Running => {
-            let budget = budgets.as_mut().and_then(|budgets| listen(budgets, number));
-            budget.or_else(|| torque(&domain, &robot, number))
+            let heard = budgets.as_mut();
+            let heard = heard.and_then(|budgets| listen(budgets, drives.as_mut(), number));
+            heard.or_else(|| Some((torque(&domain, &robot, number)?, None)))
         }
         _ => None,
     };
+    let (budget, opinions) = budget.unzip();
+    let opinions = opinions.flatten();
     let mut channels = names.iter().flat_map(Description::entries);
     let cause = channels.find(|entry| {
         let is_cause = match &budget {
@@ -67,10 +70,9 @@ pub(super) fn know(
     });
     let cause = cause.map(|entry| entry.name.as_str().to_owned());
     let health = newest::<EstimatorHealth>(&domain, &robot)?;
-    let opinion = budget.as_ref().and_then(|budget| {
-        let drives = drives.as_mut().and_then(newest_of)?;
-        opinion(&drives, budget.joint, budget.unit())
-    });
+    let opinion = budget
+        .as_ref()
+        .and_then(|budget| opinion(opinions.as_ref()?, budget.joint, budget.unit()));
     Ok(Known {
         joint: joint.to_owned(),
         opinion: opinion.unwrap_or_default(),
@@ -96,16 +98,25 @@ fn number(names: &Description, joint: &str) -> anyhow::Result<u32> {
     )
 }
 
-/// The budget of a joint: the last one that tells of a withheld torque, else the last one.
-fn listen(budgets: &mut Reader<TorqueBudget>, joint: u32) -> Option<TorqueBudget> {
-    let (mut found, begin) = (None::<TorqueBudget>, monotonic());
+/// The budget of a joint: the last one that tells of a withheld torque, else the last one; and what
+/// the drives said then.
+fn listen(
+    budgets: &mut Reader<TorqueBudget>,
+    mut drives: Option<&mut Reader<DriveEstimate>>,
+    joint: u32,
+) -> Option<(TorqueBudget, Option<DriveEstimate>)> {
+    let (mut found, begin) = (None::<(TorqueBudget, _)>, monotonic());
+    let mut opinions = None;
     loop {
+        while let Some(Ok(Some(newest))) = drives.as_mut().map(|drives| next(drives)) {
+            opinions = Some(newest);
+        }
         while let Ok(Some(budget)) = next(budgets) {
-            let tells = |found: &TorqueBudget| {
+            let tells = |(found, _): &(TorqueBudget, _)| {
                 budget.torque.valid != 1 || found.torque.reason == Reason::None
             };
             if budget.joint == joint && found.as_ref().is_none_or(tells) {
-                found = Some(budget);
+                found = Some((budget, opinions));
             }
         }
         let now = monotonic();
@@ -118,15 +129,6 @@ fn listen(budgets: &mut Reader<TorqueBudget>, joint: u32) -> Option<TorqueBudget
         }
         budgets.wait(deadline);
     }
-}
-
-/// The newest that drives said while budgets were listened to.
-fn newest_of(drives: &mut Reader<DriveEstimate>) -> Option<DriveEstimate> {
-    let mut newest = None;
-    while let Ok(Some(estimate)) = next(drives) {
-        newest = Some(estimate);
-    }
-    newest
 }
 
 /// The torque of a joint without a budget: an estimator of an earlier version publishes none.

@@ -92,25 +92,22 @@ pub(super) fn opinion(estimate: &DriveEstimate, joint: u32, unit: &str) -> Optio
         Agreement::Unknown => return Some(format!("its drive says {torque}")),
         Agreement::Agrees => "within both deviations".to_owned(),
         Agreement::Disagrees => {
-            let ratio = match own.ratio.is_finite() {
-                true => format!(" ({} times what it should report)", digits(own.ratio)),
-                false => String::new(),
-            };
-            let candidates = estimate.candidates().iter().map(|own| {
-                let name = own.name.as_str();
-                match own.kind.get() {
+            let candidates = estimate.candidates().iter();
+            let candidates = candidates.filter(|other| other.joint == own.group);
+            let candidates = candidates.map(|candidate| {
+                let name = candidate.name.as_str();
+                match candidate.kind.get() {
                     Some(Candidate::Contact) => format!("a contact on {name}"),
                     Some(Candidate::Sensor) => format!("{name}, turned or with another gain"),
                     _ => format!("the drive of {name}, in other units or with another friction"),
                 }
             });
             let candidates: Vec<String> = candidates.collect();
-            let candidates: Vec<&str> = candidates.iter().map(String::as_str).collect();
-            format!(
-                "{:.0} deviations away{ratio}; it may be {}",
-                own.deviate.abs(),
-                candidates.join("; or ")
-            )
+            let it_may_be = match candidates.is_empty() {
+                true => String::new(),
+                false => format!("; it may be {}", candidates.join("; or ")),
+            };
+            format!("{:.0} deviations away{it_may_be}", own.deviate.abs())
         }
     };
     Some(format!("its drive says {torque}, {verdict}"))

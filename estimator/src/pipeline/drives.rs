@@ -9,7 +9,7 @@ use proprio_dynamics::Dependence;
 use proprio_identification::Robot;
 use proprio_identification::robot::ChannelRole;
 use proprio_topics::{
-    Agreement, Candidate, Code, DriveEstimate, DriveTorque, JointTorque, NO_CAUSE, Name,
+    Agreement, Candidate, Code, DriveEstimate, DriveTorque, JointTorque, NO_CAUSE, NO_GROUP, Name,
     NamedCandidate, Nanos, Quality, Reason,
 };
 
@@ -17,19 +17,16 @@ use proprio_topics::{
 /// monitor expects to hear of it, and longer than the jitter of a drive's report.
 const SMOOTHING: f64 = 0.1;
 
-/// How many deviations the smoothed difference may have. A normal variable with one independent
-/// value in each time constant exceeds it once in an hour: `erfc(z / sqrt 2) = 0.1 s / 3600 s`.
+/// How many deviations the smoothed difference of a joint may have. A normal variable with one
+/// independent value in each time constant exceeds it once in an hour: `erfc(z / sqrt 2) = 0.1 s /
+/// 3600 s`.
 const DISAGREEMENT: f64 = 4.2;
 
 /// A disagreement ends at half of it.
 const AGREEMENT: f64 = 0.5 * DISAGREEMENT;
 
-/// Time constant of the ratio of the two torques \[s\]: that of a motion.
+/// Time constant of a drive's ratio \[s\]: that of a motion.
 const RATIO: f64 = 2.0;
-
-/// A drive in other units explains a disagreement if this share of its mean square is in
-/// proportion to the report: then what is left is within half of the difference.
-const PROPORTIONAL: f64 = 0.75;
 
 /// How many reports of a drive are kept: as many as come while an estimate waits.
 const KEPT: usize = 256;
@@ -49,6 +46,16 @@ struct Watched {
     comparison: Comparison,
 }
 
+impl Watched {
+    /// Whether a report has what is needed.
+    fn wants(&self, report: [f64; 2]) -> bool {
+        match &self.drive {
+            Some(drive) => drive.signal.of(report).is_finite(),
+            None => report.iter().any(|value| value.is_finite()),
+        }
+    }
+}
+
 /// The difference between both torques so far.
 #[derive(Clone, Copy, Default)]
 struct Comparison {
@@ -57,9 +64,9 @@ struct Comparison {
     /// The smoothed difference, in deviations.
     deviate: f64,
     disagrees: bool,
-    /// Smoothed squares and product of the motor's torque `m = K s` and the difference `d`: `m^2`,
-    /// `m d`, `d^2`.
-    moments: [f64; 3],
+    /// Smoothed products of the motor's torque `m = K s` and the difference `d` since they disagree:
+    /// `m^2`, `m d`.
+    moments: [f64; 2],
 }
 
 impl Comparison {
@@ -70,27 +77,34 @@ impl Comparison {
         // After a gap, what was before does not count.
         let since = if since > RATIO { f64::INFINITY } else { since };
         let part = |constant: f64| 1.0 - (-since / constant).exp();
-        if since.is_infinite() {
+        if since.is_finite() {
+            self.deviate += part(SMOOTHING) * (difference / deviation - self.deviate);
+        } else {
+            // One instant is no disagreement yet.
             *self = Self::default();
-        }
-        self.deviate += part(SMOOTHING) * (difference / deviation - self.deviate);
-        let now = [motor * motor, motor * difference, difference * difference];
-        for (moment, now) in self.moments.iter_mut().zip(now) {
-            *moment += part(RATIO) * (now - *moment);
         }
         let most = if self.disagrees {
             AGREEMENT
         } else {
             DISAGREEMENT
         };
-        self.disagrees = self.deviate.abs() > most;
+        let before = std::mem::replace(&mut self.disagrees, self.deviate.abs() > most);
+        // Of this disagreement alone: its beginning is a step in both.
+        let part = if before { part(RATIO) } else { 1.0 };
+        let now = [motor * motor, motor * difference];
+        for (moment, now) in self.moments.iter_mut().zip(now) {
+            *moment += part * (now - *moment);
+        }
         self.last = Some(t);
     }
 
-    /// What the drive reports by what it should: with `r` times the report `s`, `d = (r - 1) K s`.
+    /// What the drive reports by what it should, by least squares, if only that is wrong: with `r`
+    /// times the report `s`, the difference is `(1 - 1/r) K s`. NaN if they agree.
     fn ratio(&self) -> f64 {
-        let [square, product, _] = self.moments;
-        1.0 / (1.0 - product / square)
+        match self.disagrees {
+            true => 1.0 / (1.0 - self.moments[1] / self.moments[0]),
+            false => f64::NAN,
+        }
     }
 
     fn agreement(&self) -> Code<Agreement> {
@@ -98,12 +112,6 @@ impl Comparison {
             true => Agreement::Disagrees.in_memory(),
             false => Agreement::Agrees.in_memory(),
         }
-    }
-
-    /// Whether the difference is in proportion to the report.
-    fn is_proportional(&self) -> bool {
-        let [square, product, differences] = self.moments;
-        product * product > PROPORTIONAL * square * differences
     }
 }
 
@@ -132,7 +140,7 @@ impl Drives {
     /// Takes the report of a joint's drive; a value that it does not report is NaN.
     pub(super) fn push(&mut self, dof: usize, t: Nanos, report: [f64; 2], quality: Quality) {
         if let Some(Some(own)) = self.watched.get_mut(dof)
-            && report.iter().any(|value| value.is_finite())
+            && own.wants(report)
             && own.reports.newest().is_none_or(|newest| t > newest)
         {
             own.reports.push(t, report, quality);
@@ -158,7 +166,7 @@ impl Drives {
                 joint: u32::try_from(joint).unwrap_or(u32::MAX),
                 ..DriveTorque::ABSENT
             };
-            let (reason, cause) = match at.report(own) {
+            let (reason, cause) = match at.report(own, dof) {
                 Ok(report) => {
                     let [velocity, acceleration] = at.motion(dof);
                     let signal = drive.signal.of(report);
@@ -177,7 +185,8 @@ impl Drives {
                                 difference,
                                 deviation,
                             );
-                            (place.deviate, place.ratio) = (comparison.deviate, comparison.ratio());
+                            place.deviate = comparison.deviate;
+                            place.ratio = comparison.ratio();
                             place.agreement = comparison.agreement();
                             any_disagrees |= comparison.disagrees;
                             (Reason::None, NO_CAUSE)
@@ -197,76 +206,71 @@ impl Drives {
     }
 
     /// Names what may have caused the disagreements: for the joints of each sub-tree together, what
-    /// the torques of all of them rest on. A joint that agrees clears nothing: a force may pass
-    /// through its axis.
+    /// the torques of all of them rest on, then their drives. A joint that agrees clears nothing: a
+    /// force may pass through its axis.
     fn name_candidates(&mut self, at: &Instant<'_>, dependences: &[Dependence]) {
-        let (robot, structure) = (at.robot, &at.robot.structure);
-        let out = &mut self.estimate;
-        let drives = out.drives.get(..out.count as usize).unwrap_or_default();
-        let subtree = |own: &DriveTorque| {
-            let dof = robot.published().nth(own.joint as usize)?;
-            Some((dof, structure.subtree_of(structure.link_of(dof)?)?))
-        };
+        let (model, structure) = (&at.robot.model, &at.robot.structure);
+        let DriveEstimate {
+            count,
+            candidate_count,
+            drives,
+            candidates,
+            ..
+        } = &mut self.estimate;
         let mut add = |kind: Candidate, name: &str, joint: u32| {
-            if let Some(place) = out.candidates.get_mut(out.candidate_count as usize) {
-                let name = Name::new(name).unwrap_or(Name::EMPTY);
+            if let Some(place) = candidates.get_mut(*candidate_count as usize) {
                 *place = NamedCandidate {
-                    name,
+                    name: Name::new(name).unwrap_or(Name::EMPTY),
                     kind: kind.in_memory(),
                     joint,
                 };
-                out.candidate_count += 1;
+                *candidate_count += 1;
             }
         };
-        for number in 0..structure.subtrees().len() {
-            let disagreeing = || {
-                let own = drives
-                    .iter()
-                    .filter(|own| own.agreement == Agreement::Disagrees);
-                own.filter_map(subtree)
-                    .filter_map(move |(dof, own)| (own == number).then_some(dof))
-            };
-            let Some(first) = disagreeing().next() else {
+        let dof_of = |own: &DriveTorque| at.robot.published().nth(own.joint as usize);
+        let subtree_of = |dof: usize| structure.subtree_of(structure.link_of(dof)?);
+        let drives = drives.get_mut(..*count as usize).unwrap_or_default();
+        for first in 0..drives.len() {
+            let (_, rest) = drives.split_at_mut(first);
+            let Some(leader) = rest.first().filter(|own| is_ungrouped(own)).copied() else {
                 continue;
             };
-            let joint = robot.published().position(|dof| dof == first);
-            let joint = joint.and_then(|joint| u32::try_from(joint).ok());
-            let joint = joint.unwrap_or(u32::MAX);
-            let dependence = |dof: usize| dependences.get(dof);
-            let all = |is: &dyn Fn(&Dependence) -> bool| {
-                disagreeing().all(|dof| dependence(dof).is_some_and(is))
+            let Some(leading) = dof_of(&leader) else {
+                continue;
             };
-            let watched = |dof: usize| self.watched.get(dof)?.as_ref();
-            let is_drive =
-                |dof: usize| watched(dof).is_some_and(|own| own.comparison.is_proportional());
-            // In other units, each of them; else one drive that differs may be at fault.
-            let by_drive = disagreeing().all(is_drive);
-            let mut name_drives = || {
-                let names = disagreeing().map(|dof| robot.model.dof_name(dof));
-                names.for_each(|name| add(Candidate::Drive, name, joint));
-            };
-            if by_drive {
-                name_drives();
-            }
-            for link in structure.links_of(number) {
-                let rests = |own: &Dependence| own.links.contains(link);
-                if all(&rests) {
-                    add(Candidate::Contact, robot.model.link_name(link), joint);
+            let mut common = dependences.get(leading).cloned().unwrap_or_default();
+            for own in rest.iter_mut().filter(|own| is_ungrouped(own)) {
+                let Some(dof) = dof_of(own) else { continue };
+                if subtree_of(dof) != subtree_of(leading) {
+                    continue;
+                }
+                own.group = leader.joint;
+                if let Some(own) = dependences.get(dof) {
+                    common.links = common.links.intersection(&own.links);
+                    common.sensors = common.sensors.intersection(&own.sensors);
                 }
             }
-            for channel in &robot.channels {
+            for link in common.links.iter() {
+                add(Candidate::Contact, model.link_name(link), leader.joint);
+            }
+            for channel in &at.robot.channels {
                 if let ChannelRole::Sensor(sensor) = channel.role
-                    && all(&|own: &Dependence| own.sensors.contains(sensor))
+                    && common.sensors.contains(sensor)
                 {
-                    add(Candidate::Sensor, &channel.name, joint);
+                    add(Candidate::Sensor, &channel.name, leader.joint);
                 }
             }
-            if !by_drive && disagreeing().count() == 1 {
-                let name = robot.model.dof_name(first);
-                add(Candidate::Drive, name, joint);
+            let drives = rest.iter().filter(|own| own.group == leader.joint);
+            for dof in drives.filter_map(dof_of) {
+                add(Candidate::Drive, model.dof_name(dof), leader.joint);
             }
         }
     }
+}
+
+/// Whether this is a disagreement without candidates yet.
+fn is_ungrouped(own: &DriveTorque) -> bool {
+    own.agreement == Agreement::Disagrees && own.group == NO_GROUP
 }
 
 /// An estimate, and what it was made from.
@@ -280,6 +284,8 @@ struct Instant<'a> {
     /// Per degree of freedom.
     velocity: &'a [f64],
     acceleration: &'a [f64],
+    /// Per channel, why its value is not valid.
+    faults: &'a [Reason],
 }
 
 impl<'a> Instant<'a> {
@@ -293,7 +299,12 @@ impl<'a> Instant<'a> {
             .map(|values| values.get(dof).copied().unwrap_or(f64::NAN))
     }
 
-    fn report(&self, own: &Watched) -> Result<[f64; 2], Reason> {
+    /// What the drive of a joint reports; or why that, or the joint's motion, is not known.
+    fn report(&self, own: &Watched, dof: usize) -> Result<[f64; 2], Reason> {
+        let fault = self.faults.get(self.channel(dof) as usize);
+        if let Some(fault) = fault.filter(|fault| **fault != Reason::None) {
+            return Err(*fault);
+        }
         match own.reports.at(self.t, self.until) {
             None => Err(Reason::NeverSeen),
             Some(held) if held.age > self.robot.max_silence => Err(Reason::Stale),
@@ -332,7 +343,7 @@ impl Pipeline {
             let [velocity, acceleration] = at.motion(dof);
             let row = Row {
                 t: at.t,
-                report: at.report(watched).ok()?,
+                report: at.report(watched, dof).ok()?,
                 torque: torque.torque,
                 deviation: torque.standard_deviation,
                 velocity,
@@ -351,6 +362,7 @@ impl Pipeline {
             torques: self.estimate.torques.joints(),
             velocity: &self.velocity,
             acceleration: &self.acceleration,
+            faults: &self.faults,
         }
     }
 

@@ -52,9 +52,8 @@ pub struct NamedCandidate {
     pub name: Name,
     /// What it is.
     pub kind: Code<Candidate>,
-    /// The disagreeing joint that it is a candidate for: an index into `TorqueEstimate::joints`. If
-    /// several joints of a sub-tree disagree, their candidates are those that explain all of them,
-    /// and this is the first of them.
+    /// What it is a candidate for: the disagreements with this [`DriveTorque::group`]. It explains
+    /// all of them.
     pub joint: u32,
 }
 
@@ -63,15 +62,16 @@ pub struct NamedCandidate {
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes)]
 pub struct DriveTorque {
     /// What the drive reports, less friction and rotor: the torque \[Nm\] (force \[N\] for a
-    /// prismatic joint) by the parent link on the child link. NaN if it reports nothing.
+    /// prismatic joint) by the parent link on the child link. NaN if it reports nothing, or the
+    /// joint's motion is not known.
     pub torque: f64,
     /// Its standard deviation, NaN if there is no torque.
     pub standard_deviation: f64,
     /// The difference between this torque and the one of the F/T sensors, as a multiple of the
     /// deviation of both together; smoothed. NaN if they cannot be compared.
     pub deviate: f64,
-    /// What the drive reports by what it should, by least squares over the last seconds: near one
-    /// if they agree; NaN if that is not determined.
+    /// If it disagrees: what the drive reports by what it should, if only its unit is wrong; by
+    /// least squares over the last seconds. Else NaN.
     pub ratio: f64,
     /// Whether they agree.
     pub agreement: Code<Agreement>,
@@ -81,7 +81,15 @@ pub struct DriveTorque {
     pub cause: u32,
     /// The joint: an index into `TorqueEstimate::joints`.
     pub joint: u32,
+    /// If it disagrees: the first joint of its sub-tree that does. The candidates with this joint
+    /// are those of all disagreements there. Else [`NO_GROUP`].
+    pub group: u32,
+    /// Unused, zero.
+    pub reserved: u32,
 }
+
+/// [`DriveTorque::group`] of a joint that does not disagree.
+pub const NO_GROUP: u32 = u32::MAX;
 
 /// The torques of the drives of one instant, whose constants and friction are known: the payload of
 /// `<robot>/estimate/drive`. It exists if `parameters.toml` has drives. No torque of
@@ -113,6 +121,8 @@ impl DriveTorque {
         reason: Reason::NeverSeen.in_memory(),
         cause: NO_CAUSE,
         joint: 0,
+        group: NO_GROUP,
+        reserved: 0,
     };
 }
 
@@ -170,6 +180,6 @@ impl Default for DriveEstimate {
     }
 }
 
-const _: () = assert!(size_of::<DriveTorque>() == 48 && size_of::<NamedCandidate>() == 72);
+const _: () = assert!(size_of::<DriveTorque>() == 56 && size_of::<NamedCandidate>() == 72);
 const _: () =
-    assert!(size_of::<DriveEstimate>() == 64 + 48 * MAX_JOINTS + 72 * DriveEstimate::CANDIDATES);
+    assert!(size_of::<DriveEstimate>() == 64 + 56 * MAX_JOINTS + 72 * DriveEstimate::CANDIDATES);

@@ -58,7 +58,7 @@ pub use code::{Code, Coded};
 pub use description::{
     Description, Entry, Name, Publisher, ROBOT_NAME, Role, TRIGGER, is_robot_name,
 };
-pub use drive::{Agreement, Candidate, DriveEstimate, DriveTorque, NamedCandidate};
+pub use drive::{Agreement, Candidate, DriveEstimate, DriveTorque, NO_GROUP, NamedCandidate};
 pub use estimate::{
     ContactDeclaration, ContactEstimate, ContactState, ContactWrench, JointTorque, NO_CAUSE,
     NO_CONTACT, Reason, Residual, TorqueEstimate,
