@@ -165,10 +165,13 @@ impl Machine {
         fs::write(program, format!("#!/bin/sh\n{line}\n")).expect("a program");
         fs::set_permissions(program, fs::Permissions::from_mode(0o755)).expect("a program");
         let unit = format!("/usr/share/doc/proprio/examples/{LOOP}");
-        fs::copy(unit, Path::new("/etc/systemd/system").join(LOOP)).expect("the example");
-        sh(&format!(
-            "systemctl daemon-reload; systemctl restart {LOOP}"
-        ));
+        let own = Path::new("/etc/systemd/system").join(LOOP);
+        // systemd takes seconds to read all units again.
+        if !own.exists() {
+            fs::copy(unit, own).expect("the example");
+            sh("systemctl daemon-reload");
+        }
+        sh(&format!("systemctl restart {LOOP}"));
     }
 
     /// Waits for a valid torque acquired from now on.

@@ -181,14 +181,17 @@ impl Bases {
                 if k > 0 {
                     let a = vector::<S>(&self.a[k - 1], i);
                     let b = vector::<S>(&self.b[k - 1], i);
-                    let own = std::array::from_fn(|m| {
+                    // Not with `array::from_fn`: its closures are not compiled for these registers.
+                    let mut own = [zero; 3];
+                    for m in 0..3 {
                         let known = simd.mul_f64s(simd.sub_f64s(at, a), last[m]);
                         let inner = match m {
                             0 => zero,
                             _ => simd.mul_f64s(simd.splat_f64s(m as f64), last[m - 1]),
                         };
-                        simd.sub_f64s(simd.add_f64s(known, inner), simd.mul_f64s(b, before[m]))
-                    });
+                        let grown = simd.add_f64s(known, inner);
+                        own[m] = simd.sub_f64s(grown, simd.mul_f64s(b, before[m]));
+                    }
                     (before, last) = (last, own);
                 }
                 let per_norm = vector::<S>(&self.per_norm[k], i);
