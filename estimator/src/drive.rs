@@ -38,14 +38,9 @@
 //!   and not of the difference between both.
 //! - What a log does not show (friction of a joint that stood still) keeps a wide prior.
 
-use crate::config::Timing;
-use crate::offline::{self, OfflineError};
-use crate::setup::Setup;
 use nalgebra::{Matrix6, Vector6};
 use proprio_identification::COULOMB_SPEED;
 use proprio_topics::Nanos;
-use std::io::Read;
-use std::ops::ControlFlow;
 
 /// Degrees of freedom of the distribution of a second's residuals: between 3 and 5 is usual in
 /// robust regression (Lange, Little, Taylor 1989).
@@ -63,9 +58,6 @@ const SIGNIFICANT: f64 = 3.0;
 
 /// The least noise, by the RMS of the report: that of numbers with 16 bits.
 const LEAST_NOISE: f64 = 1e-5;
-
-/// The least time between two rows: friction and load change no faster than a joint moves.
-const ROW_PERIOD: Nanos = Nanos::from_millis(10);
 
 /// What a drive reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
@@ -211,35 +203,6 @@ pub fn fit(joint: &str, logs: &[Vec<Row>]) -> Option<Result<Drive, Unfit>> {
             .map_or_else(|| fitted(false), Ok)
     });
     found.reduce(|first, second| first.or_else(|error| second.map_err(|_| error)))
-}
-
-/// What joints and drives do in a log, by degree of freedom, as the estimator with this `setup`
-/// sees it; at most one row in [`ROW_PERIOD`].
-///
-/// # Errors
-/// As for [`offline::follow`].
-pub fn rows(setup: &Setup, log: impl Read) -> Result<Vec<Vec<Row>>, OfflineError> {
-    let mut rows: Vec<Vec<Row>> = vec![Vec::new(); setup.robot.model.dof_count()];
-    let mut setup = setup.clone();
-    setup.drives.clear();
-    setup.learns_drives = true;
-    // A log has the samples that a running estimator would have to wait for.
-    setup.timing = Timing::Aligned;
-    offline::follow(setup, log, |pipeline, is_stamped| {
-        // Friction needs velocities, and seconds.
-        if !is_stamped {
-            return Ok(ControlFlow::Break(()));
-        }
-        for (dof, row) in pipeline.drive_rows() {
-            if let Some(own) = rows.get_mut(dof)
-                && own.last().is_none_or(|last| row.t >= last.t + ROW_PERIOD)
-            {
-                own.push(row);
-            }
-        }
-        Ok(ControlFlow::Continue(()))
-    })?;
-    Ok(rows)
 }
 
 /// A second of a log: its rows as equations `s = x . theta`.
@@ -461,4 +424,163 @@ fn seconds(signal: Signal, logs: &[Vec<Row>], has_load: bool) -> Vec<Second> {
         }
     }
     seconds
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// A drive with this model, and no uncertainty.
+    fn exact(parameters: [f64; 6]) -> Drive {
+        Drive {
+            joint: "elbow".into(),
+            signal: Signal::Current,
+            parameters,
+            covariance: Matrix6::zeros(),
+            inherited: [0.0; 2],
+            noise: 0.0,
+        }
+    }
+
+    /// What a drive reports by the equation of the module's page.
+    fn report([k, c, d, l, j, b]: [f64; 6], tau: f64, dq: f64, ddq: f64) -> f64 {
+        let sign = (dq / COULOMB_SPEED).tanh();
+        (tau + (c + l * tau.abs()) * sign + d * dq + j * ddq + b) / k
+    }
+
+    /// Rows at 50 Hz of a joint that swings with a varying load, and rests for a fifth of the time.
+    /// The drive reports `reports(row number, report of the model)`.
+    fn rows(
+        parameters: [f64; 6],
+        seconds: f64,
+        reports: impl Fn(f64, f64) -> [f64; 2],
+    ) -> Vec<Row> {
+        let row = |number: u32| {
+            let t = 0.02 * f64::from(number);
+            let moves = if t % 5.0 < 4.0 { 1.0 } else { 0.0 };
+            let (velocity, acceleration) = (
+                moves * (1.3 * t).sin() * (1.0 + 0.5 * (0.37 * t).cos()),
+                moves * 1.5 * (1.7 * t).cos(),
+            );
+            let torque = 4.0 * (0.61 * t).sin() + 2.0 * (2.3 * t).cos();
+            Row {
+                t: Nanos::from_seconds(t),
+                report: reports(t, report(parameters, torque, velocity, acceleration)),
+                torque,
+                deviation: 0.01,
+                velocity,
+                acceleration,
+            }
+        };
+        (0..(50.0 * seconds) as u32).map(row).collect()
+    }
+
+    const MODEL: [f64; 6] = [2.5, 0.8, 0.3, 0.06, 0.05, -0.2];
+
+    proptest! {
+        /// From the torque to the report and back.
+        #[test]
+        fn the_torque_of_a_report_is_the_one_that_it_was_made_from(
+            k in prop_oneof![0.1..20.0_f64, -20.0..-0.1_f64], c in 0.0..3.0_f64,
+            d in 0.0..2.0_f64, l in 0.0..0.5_f64, j in 0.0..1.0_f64, b in -2.0..2.0_f64,
+            tau in -50.0..50.0_f64, dq in -2.0..2.0_f64, ddq in -9.0..9.0_f64,
+        ) {
+            let parameters = [k, c, d, l, j, b];
+            let s = report(parameters, tau, dq, ddq);
+            let (torque, _) = exact(parameters).torque(s, dq, ddq);
+            prop_assert!((torque - tau).abs() < 1e-9 * (1.0 + tau.abs()), "{torque} {tau}");
+        }
+    }
+
+    #[test]
+    fn a_report_without_noise_gives_the_model() {
+        let found = fit("elbow", &[rows(MODEL, 40.0, |_, s| [f64::NAN, s])]);
+        let found = found.unwrap().unwrap();
+        assert_eq!(found.signal, Signal::Current);
+        for (found, expected) in found.parameters.into_iter().zip(MODEL) {
+            assert!((found - expected).abs() < 2e-3, "{found} {expected}");
+        }
+        assert!(found.noise < 1e-3, "{}", found.noise);
+    }
+
+    /// Noise and ripple are within their deviations, and a second in which something else acts does
+    /// not matter.
+    #[test]
+    fn the_stated_deviations_cover_the_errors() {
+        let disturbed = |t: f64, s: f64| {
+            let ripple = 0.05 * (97.0 * t).sin() + 0.03 * (311.0 * t + 1.0).sin();
+            let push = if (20.0..22.0).contains(&t) { 3.0 } else { 0.0 };
+            [f64::NAN, s + ripple + push]
+        };
+        let found = fit("elbow", &[rows(MODEL, 60.0, disturbed)]);
+        let found = found.unwrap().unwrap();
+        for ((own, deviation), expected) in (found.parameters.into_iter())
+            .zip(found.deviations())
+            .zip(MODEL)
+        {
+            assert!(
+                (own - expected).abs() < 4.0 * deviation,
+                "{own} {deviation} {expected}"
+            );
+            assert!(deviation < 0.1, "{deviation}");
+        }
+        let noise = 2.5 * f64::hypot(0.05, 0.03) / f64::sqrt(2.0);
+        assert!(
+            (0.7..1.6).contains(&(found.noise / noise)),
+            "{} {noise}",
+            found.noise
+        );
+    }
+
+    #[test]
+    fn without_a_load_in_the_data_there_is_none_in_the_model() {
+        let [k, c, d, _, j, b] = MODEL;
+        let noisy = |t: f64, s: f64| [s + 0.05 * (97.0 * t).sin(), f64::NAN];
+        let found = fit("elbow", &[rows([k, c, d, 0.0, j, b], 40.0, noisy)]);
+        let found = found.unwrap().unwrap();
+        assert_eq!((found.signal, found.parameters[3]), (Signal::Torque, 0.0));
+        assert_eq!(found.deviations()[3], 0.0);
+    }
+
+    /// A torque that is none is not the end: the current may do.
+    #[test]
+    fn the_report_that_follows_the_torque_is_used() {
+        let both = fit("elbow", &[rows(MODEL, 40.0, |_, s| [0.0, s])]);
+        assert_eq!(both.unwrap().unwrap().signal, Signal::Current);
+        let constant = fit("elbow", &[rows(MODEL, 40.0, |_, _| [1.5, f64::NAN])]);
+        assert_eq!(constant, Some(Err(Unfit::Unrelated)));
+        let short = fit("elbow", &[rows(MODEL, 8.0, |_, s| [s, f64::NAN])]);
+        assert_eq!(short, Some(Err(Unfit::TooShort { seconds: 8 })));
+        let none = fit("elbow", &[rows(MODEL, 40.0, |_, _| [f64::NAN; 2])]);
+        assert_eq!(none, None);
+    }
+
+    /// A joint that never moved keeps a friction that may be as large as the report.
+    #[test]
+    fn what_a_log_does_not_show_stays_uncertain() {
+        let mut still = rows(MODEL, 40.0, |_, s| [s, f64::NAN]);
+        for row in &mut still {
+            (row.velocity, row.acceleration) = (0.0, 0.0);
+            row.report = [report(MODEL, row.torque, 0.0, 0.0), f64::NAN];
+        }
+        let found = fit("elbow", &[still]).unwrap().unwrap();
+        let (_, [moving, _]) = found.torque(1.0, 1.0, 0.0);
+        let (_, [resting, _]) = found.torque(1.0, 0.0, 0.0);
+        assert!(moving > 1.0 && resting > 0.5, "{moving} {resting}");
+    }
+
+    /// At rest, anything between plus and minus friction is possible.
+    #[test]
+    fn friction_at_rest_is_part_of_the_deviation() {
+        let (_, [resting, inherited]) = exact(MODEL).torque(0.0, 0.0, 0.0);
+        let torque: f64 = 0.2;
+        let expected = (0.8 + 0.06 * torque).powi(2) / 3.0;
+        assert!(
+            (resting - expected).abs() < 1e-12 && inherited == 0.0,
+            "{resting} {expected}"
+        );
+        let (_, [moving, _]) = exact(MODEL).torque(0.0, 1.0, 0.0);
+        assert!(moving < 1e-12, "{moving}");
+    }
 }

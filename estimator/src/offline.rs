@@ -19,7 +19,7 @@
 //! | `residual/<link>/reason` | its cause: the contact detected there, or `unexplained` |
 //! | `drive/<joint>` | the torque by the drive ([`crate::drive`]), if its drive is known |
 //! | `drive_std/<joint>` | its standard deviation |
-//! | `agreement/<joint>` | whether it `agrees` or `disagrees`; empty if they cannot be compared |
+//! | `disagrees/<joint>` | 1 if the two disagree, 0 if not; empty if they cannot be compared |
 //!
 //! Cells of a withheld torque or wrench are empty; of a torque that is `uncertain` alone, the
 //! standard deviation is told.
@@ -30,6 +30,8 @@
 //! deviate with the same probability, if no unknown wrench acts.
 
 use crate::assessment::Assessor;
+use crate::config::Timing;
+use crate::drive;
 use crate::pipeline::{Estimate, Pipeline};
 use crate::reading::{MissingChannels, Target, check_columns, check_skins, targets};
 use crate::setup::Setup;
@@ -235,6 +237,38 @@ pub fn follow(
     Ok((report, pipeline))
 }
 
+/// What joints and drives do in a log, by degree of freedom, as the estimator with this `setup`
+/// sees it; at most one row in 10 ms, because friction and load change no faster than a joint
+/// moves.
+///
+/// # Errors
+/// As for [`follow`].
+pub fn drive_rows(setup: &Setup, log: impl Read) -> Result<Vec<Vec<drive::Row>>, OfflineError> {
+    let mut rows: Vec<Vec<drive::Row>> = vec![Vec::new(); setup.robot.model.dof_count()];
+    let mut setup = setup.clone();
+    setup.drives.clear();
+    setup.learns_drives = true;
+    // A log has the samples that a running estimator would have to wait for.
+    setup.timing = Timing::Aligned;
+    follow(setup, log, |pipeline, is_stamped| {
+        // Friction needs velocities, and seconds.
+        if !is_stamped {
+            return Ok(ControlFlow::Break(()));
+        }
+        for (dof, row) in pipeline.drive_rows() {
+            if let Some(own) = rows.get_mut(dof)
+                && own
+                    .last()
+                    .is_none_or(|last| row.t >= last.t + Nanos::from_millis(10))
+            {
+                own.push(row);
+            }
+        }
+        Ok(ControlFlow::Continue(()))
+    })?;
+    Ok(rows)
+}
+
 /// Writes estimates row by row.
 pub struct Table<W> {
     out: W,
@@ -284,7 +318,7 @@ impl<W: Write> Table<W> {
         let drives: Vec<&str> = (setup.robot.joint_names())
             .filter(|joint| setup.drives.iter().any(|drive| drive.joint == *joint))
             .collect();
-        for part in ["drive", "drive_std", "agreement"] {
+        for part in ["drive", "drive_std", "disagrees"] {
             drives.iter().for_each(|joint| add(part, joint, ""));
         }
         header.push(b'\n');
@@ -394,10 +428,10 @@ impl<W: Write> Table<W> {
         drives().for_each(|own| number(&mut self.text, own.torque));
         drives().for_each(|own| number(&mut self.text, own.standard_deviation));
         for own in drives() {
-            self.text.push(b',');
-            let agreement = own.agreement.get().filter(|own| *own != Agreement::Unknown);
-            let word = agreement.map_or("", Agreement::word);
-            self.text.extend_from_slice(word.as_bytes());
+            match own.agreement.get().unwrap_or_default() {
+                Agreement::Unknown => self.text.push(b','),
+                agreement => flag(&mut self.text, u32::from(agreement == Agreement::Disagrees)),
+            }
         }
         self.text.push(b'\n');
         self.rows += 1;

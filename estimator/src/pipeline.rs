@@ -84,13 +84,14 @@ pub use identification::Job;
 
 use crate::config::Timing;
 use crate::differentiate::{Grid, Window};
+use crate::drive::Row;
 use crate::history::{ChannelValue, History};
 use crate::propagation::Propagation;
 use crate::setup::Setup;
 use buffers::{ChannelBuffer, OrReason, Sanity, stale, temperature_at};
 use channels::{imu_at, joint_at, wrench_at};
 use contacts::Contacts;
-use drives::Drives;
+use drives::{Drives, Instant};
 use estimate::root_of_squares;
 use identification::OnlineIdentification;
 use motion::{ENCODER_OFFSET_STD, MotionErrors};
@@ -103,7 +104,7 @@ use proprio_dynamics::{
 use proprio_identification::online::state::StateError;
 use proprio_identification::online::{Online, OnlineError};
 use proprio_identification::robot::{BaseMotion, ChannelRole};
-use proprio_topics::{InertiaEstimate, Nanos, Quality, Reason, TorqueBudget};
+use proprio_topics::{DriveEstimate, InertiaEstimate, Nanos, Quality, Reason, TorqueBudget};
 use residuals::ResidualMonitor;
 use std::collections::VecDeque;
 use steps::StepCover;
@@ -395,7 +396,10 @@ impl Pipeline {
         self.released = t;
         self.identify(t);
         self.compute_estimate(t);
-        self.compare_drives();
+        if let Some(mut drives) = self.drives.take() {
+            drives.compare(&self.instant(), &self.dependences.torques);
+            self.drives = Some(drives);
+        }
         Some(&self.estimate)
     }
 
@@ -403,6 +407,35 @@ impl Pipeline {
     #[must_use]
     pub fn last_estimate(&self) -> &Estimate {
         &self.estimate
+    }
+
+    /// The torques of the drives at the last estimate, and whether they agree with it; none if no
+    /// drive is known.
+    #[must_use]
+    pub fn drives(&self) -> Option<&DriveEstimate> {
+        let drives = self.drives.as_ref()?;
+        (!self.setup.drives.is_empty()).then_some(drives.estimate())
+    }
+
+    /// What joints and drives do at the last estimate, per degree of freedom whose torque is valid
+    /// and whose drive reports something: what a drive is identified from. Of all joints, with
+    /// [`Setup::learns_drives`].
+    pub fn drive_rows(&self) -> impl Iterator<Item = (usize, Row)> {
+        let drives = self.drives.iter();
+        drives.flat_map(|drives| drives.rows(self.instant()))
+    }
+
+    /// The last estimate, as drives are compared with it.
+    fn instant(&self) -> Instant<'_> {
+        Instant {
+            t: self.estimate.t,
+            until: self.until(self.estimate.t),
+            robot: &self.setup.robot,
+            torques: self.estimate.torques.joints(),
+            velocity: &self.velocity,
+            acceleration: &self.acceleration,
+            faults: &self.faults,
+        }
     }
 
     /// Feeds identification, and puts a new solution in use when it is due.

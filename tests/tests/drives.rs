@@ -4,7 +4,7 @@
 
 use proprio_estimator::config::Config;
 use proprio_estimator::drive::{self, Drive, Signal, Unfit};
-use proprio_estimator::offline::follow;
+use proprio_estimator::offline::{drive_rows, follow};
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
@@ -388,7 +388,7 @@ fn the_drive_of_a_real_leg_is_found() {
     let setup = Setup::new(&config).unwrap();
     let log: PathBuf = folder.join("squats.csv");
     let log = fs::read(log).unwrap();
-    let rows = drive::rows(&setup, &log[..]).unwrap();
+    let rows = drive_rows(&setup, &log[..]).unwrap();
     let part = |joint: &str, from: f64, to: f64| {
         let rows = &rows[setup.robot.model.dof(joint).unwrap()];
         let own = rows.iter().copied();

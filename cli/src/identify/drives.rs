@@ -7,6 +7,7 @@ use crate::samples;
 use anyhow::Context;
 use proprio_dynamics::spatial::Wrench;
 use proprio_estimator::drive::{self, Drive, Row, Signal, Unfit};
+use proprio_estimator::offline::drive_rows;
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::setup::Setup;
 use proprio_identification::{LogOutcome, Outcome, Role};
@@ -38,7 +39,7 @@ pub(super) fn identify(
             let mut setup = setup.clone();
             set_offsets(&mut setup, log);
             let table = open(file, config, &setup)?;
-            let rows = drive::rows(&setup, table);
+            let rows = drive_rows(&setup, table);
             logs.push(rows.with_context(|| file.display().to_string())?);
         }
     }

@@ -1,7 +1,6 @@
 //! Compares the estimated torques with those that the joints' drives report ([`crate::drive`]). No
 //! estimate depends on it.
 
-use super::Pipeline;
 use crate::drive::{Drive, Row};
 use crate::history::History;
 use crate::setup::Setup;
@@ -64,8 +63,8 @@ struct Comparison {
     /// The smoothed difference, in deviations.
     deviate: f64,
     disagrees: bool,
-    /// Smoothed products of the motor's torque `m = K s` and the difference `d` since they disagree:
-    /// `m^2`, `m d`.
+    /// Smoothed products `m^2` and `m d` of the motor's torque `m = K s` and the difference `d`, of
+    /// this disagreement.
     moments: [f64; 2],
 }
 
@@ -147,8 +146,32 @@ impl Drives {
         }
     }
 
+    /// The drives' torques at the last estimate, and whether they agree with it.
+    pub(super) fn estimate(&self) -> &DriveEstimate {
+        &self.estimate
+    }
+
+    /// What joints and drives do, per degree of freedom whose torque is valid and whose drive
+    /// reports something.
+    pub(super) fn rows(&self, at: Instant<'_>) -> impl Iterator<Item = (usize, Row)> {
+        let joints = at.joints().filter(|(_, torque)| torque.valid == 1);
+        joints.filter_map(move |(dof, torque)| {
+            let watched = self.watched.get(dof)?.as_ref()?;
+            let [velocity, acceleration] = at.motion(dof);
+            let row = Row {
+                t: at.t,
+                report: at.report(watched, dof).ok()?,
+                torque: torque.torque,
+                deviation: torque.standard_deviation,
+                velocity,
+                acceleration,
+            };
+            Some((dof, row))
+        })
+    }
+
     /// Compares the torques of an estimate with what the drives report.
-    fn compare(&mut self, at: &Instant<'_>, dependences: &[Dependence]) {
+    pub(super) fn compare(&mut self, at: &Instant<'_>, dependences: &[Dependence]) {
         let out = &mut self.estimate;
         (out.count, out.candidate_count) = (0, 0);
         out.header.acquired = at.t;
@@ -275,17 +298,17 @@ fn is_ungrouped(own: &DriveTorque) -> bool {
 
 /// An estimate, and what it was made from.
 #[derive(Clone, Copy)]
-struct Instant<'a> {
-    t: Nanos,
+pub(super) struct Instant<'a> {
+    pub(super) t: Nanos,
     /// Reports up to this stamp count.
-    until: Nanos,
-    robot: &'a Robot,
-    torques: &'a [JointTorque],
+    pub(super) until: Nanos,
+    pub(super) robot: &'a Robot,
+    pub(super) torques: &'a [JointTorque],
     /// Per degree of freedom.
-    velocity: &'a [f64],
-    acceleration: &'a [f64],
+    pub(super) velocity: &'a [f64],
+    pub(super) acceleration: &'a [f64],
     /// Per channel, why its value is not valid.
-    faults: &'a [Reason],
+    pub(super) faults: &'a [Reason],
 }
 
 impl<'a> Instant<'a> {
@@ -323,54 +346,52 @@ impl<'a> Instant<'a> {
     }
 }
 
-impl Pipeline {
-    /// The torques of the drives at the last estimate, and whether they agree with it; none if no
-    /// drive is known.
-    #[must_use]
-    pub fn drives(&self) -> Option<&DriveEstimate> {
-        let drives = self.drives.as_ref()?;
-        (!self.setup.drives.is_empty()).then_some(&drives.estimate)
-    }
+#[cfg(test)]
+mod tests {
+    use super::*;
 
-    /// What joints and drives do at the last estimate, per degree of freedom whose torque is valid
-    /// and whose drive reports something: what a drive is identified from. Of all joints, with
-    /// [`Setup::learns_drives`].
-    pub fn drive_rows(&self) -> impl Iterator<Item = (usize, Row)> {
-        let at = self.instant();
-        let joints = at.joints().filter(|(_, torque)| torque.valid == 1);
-        joints.filter_map(move |(dof, torque)| {
-            let watched = self.drives.as_ref()?.watched.get(dof)?.as_ref()?;
-            let [velocity, acceleration] = at.motion(dof);
-            let row = Row {
-                t: at.t,
-                report: at.report(watched, dof).ok()?,
-                torque: torque.torque,
-                deviation: torque.standard_deviation,
-                velocity,
-                acceleration,
-            };
-            Some((dof, row))
-        })
-    }
-
-    /// The last estimate, as drives are compared with it.
-    fn instant(&self) -> Instant<'_> {
-        Instant {
-            t: self.estimate.t,
-            until: self.until(self.estimate.t),
-            robot: &self.setup.robot,
-            torques: self.estimate.torques.joints(),
-            velocity: &self.velocity,
-            acceleration: &self.acceleration,
-            faults: &self.faults,
+    /// The comparison at 1 kHz, with a difference for each millisecond.
+    fn compared(difference: impl Fn(i32) -> f64, milliseconds: i32) -> (Comparison, Option<i32>) {
+        let (mut comparison, mut first) = (Comparison::default(), None);
+        for ms in 0..milliseconds {
+            let t = Nanos::from_millis(i64::from(ms));
+            comparison.update(t, 8.0, difference(ms), 1.0);
+            if comparison.disagrees {
+                first.get_or_insert(ms);
+            }
         }
+        (comparison, first)
     }
 
-    /// Compares the torques of the estimate at hand with those of the drives.
-    pub(super) fn compare_drives(&mut self) {
-        if let Some(mut drives) = self.drives.take() {
-            drives.compare(&self.instant(), &self.dependences.torques);
-            self.drives = Some(drives);
-        }
+    #[test]
+    fn ten_deviations_are_found_in_a_twentieth_of_a_second() {
+        let (_, first) = compared(|ms| if ms < 500 { 0.0 } else { 10.0 }, 1000);
+        // 10 (1 - exp(-t / 0.1)) = 4.2
+        assert_eq!(first, Some(554));
+        // Four never are; and a single one is not a disagreement, whatever it is.
+        assert_eq!(compared(|_| 4.0, 5000).1, None);
+        assert_eq!(
+            compared(|ms| if ms == 500 { 100.0 } else { 0.0 }, 1000).1,
+            None
+        );
+    }
+
+    #[test]
+    fn a_disagreement_ends_and_a_gap_ends_it() {
+        let (mut comparison, _) = compared(|ms| if ms < 500 { 10.0 } else { 0.0 }, 600);
+        assert!(comparison.disagrees, "2.1 deviations are not reached yet");
+        comparison.update(Nanos::from_millis(800), 8.0, 0.0, 1.0);
+        assert!(!comparison.disagrees);
+        let (mut comparison, _) = compared(|_| 10.0, 500);
+        comparison.update(Nanos::from_millis(3000), 8.0, 10.0, 1.0);
+        assert!(!comparison.disagrees && comparison.deviate == 0.0);
+    }
+
+    /// Twice the report of a motor of 4 Nm is 8 Nm, and the difference 4 Nm.
+    #[test]
+    fn the_ratio_is_that_of_the_report() {
+        let (comparison, _) = compared(|_| 4.3, 5000);
+        assert!((comparison.ratio() - 8.0 / (8.0 - 4.3)).abs() < 1e-9);
+        assert!(compared(|_| 1.0, 500).0.ratio().is_nan());
     }
 }

@@ -127,9 +127,14 @@ pub const FAMILIES: &[Family] = &[
         ..joint("moteus", "moteus", "period_ms = 5")
     },
     joint("odrive", "odrive", "period_ms = 5"),
+    // Ranges of torque that carry the arm: at its end, a reading is saturated.
     Family {
         half_step: 2e-4,
-        ..joint("cubemars", "cubemars", "model = \"AK80-9\"\nperiod_ms = 5")
+        ..joint(
+            "cubemars",
+            "cubemars",
+            "model = \"AK80-9\"\neffort_max = 500.0\nperiod_ms = 5",
+        )
     },
     Family {
         half_step: 9e-4,
@@ -141,14 +146,18 @@ pub const FAMILIES: &[Family] = &[
     },
     Family {
         half_step: 2e-4,
-        ..joint("damiao", "damiao", "model = \"DM4310\"\nperiod_ms = 5")
+        ..joint(
+            "damiao",
+            "damiao",
+            "model = \"DM4310\"\ntorque_max = 500.0\nperiod_ms = 5",
+        )
     },
     Family {
         half_step: 2e-4,
         ..joint(
             "damiao asked",
             "damiao",
-            "model = \"DM4310\"\nrequest_period_ms = 5",
+            "model = \"DM4310\"\ntorque_max = 500.0\nrequest_period_ms = 5",
         )
     },
     joint("myactuator", "myactuator", "request_period_ms = 5"),
@@ -159,14 +168,18 @@ pub const FAMILIES: &[Family] = &[
     ),
     Family {
         half_step: 2e-4,
-        ..joint("robstride", "robstride", "model = \"RS03\"\nperiod_ms = 5")
+        ..joint(
+            "robstride",
+            "robstride",
+            "model = \"RS03\"\ntorque_max = 500.0\nperiod_ms = 5",
+        )
     },
     Family {
         half_step: 2e-4,
         ..joint(
             "robstride mit",
             "robstride",
-            "model = \"RS03\"\nprotocol = \"mit\"\nperiod_ms = 5",
+            "model = \"RS03\"\nprotocol = \"mit\"\ntorque_max = 500.0\nperiod_ms = 5",
         )
     },
     Family {
