@@ -30,7 +30,7 @@
 //! - Below `v0` the friction may have any value between `-c` and `c`, with a variance of `c^2 / 3`:
 //!   such rows count less.
 //! - Seconds in which something else acts (a push that no sensor sees) count less: their residuals
-//!   have a Student distribution with [`NU`] degrees of freedom.
+//!   have a Student distribution with four degrees of freedom.
 //! - Residuals are correlated within a second, not between seconds: the covariance is that of the
 //!   sums over seconds (the "sandwich" of cluster-robust statistics).
 //! - The error of `tau` itself is that of the robot's parameters, and does not average out. The
