@@ -21,6 +21,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use logs::{names, open, read};
 use proprio_dynamics::model::Model;
 use proprio_estimator::export;
+use proprio_identification::robot::IdentificationInput;
 use proprio_identification::{Options, Outcome, Progress, Role, Severity, Verdict, identify};
 use std::fs;
 use std::io::IsTerminal;
@@ -150,12 +151,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             &setup.robot,
             concat!("proprio ", env!("CARGO_PKG_VERSION")),
         )?;
-        show("drives", 1.0);
-        found = drives::identify(&setup, &parameters, &outcome, &files, &args.config)
-            .unwrap_or_else(|error| {
-                tracing::warn!("the drives give no second opinion: {error:#}");
-                Vec::new()
-            });
+        // What was identified from torques is no opinion of its own on them.
+        let is_second = !options.inputs.contains(&IdentificationInput::Torque)
+            && !setup.robot.structure.sensors().is_empty();
+        if is_second {
+            show("drives", 1.0);
+            found = drives::identify(&setup, &parameters, &outcome, &files, &args.config)
+                .unwrap_or_else(|error| {
+                    tracing::warn!("the drives give no second opinion: {error:#}");
+                    Vec::new()
+                });
+        }
         let drives = found.iter().filter_map(|(_, drive)| drive.as_ref().ok());
         parameters.set_drives(&drives.cloned().collect::<Vec<_>>())?;
         let file = out.join("parameters.toml");
