@@ -228,6 +228,8 @@ struct Fit {
     seconds: Vec<Second>,
     /// RMS of `s`.
     report: f64,
+    /// See [`Fit::wide`].
+    prior: Matrix6<f64>,
     theta: Vector6<f64>,
     /// Variance of a residual in motion.
     variance: f64,
@@ -245,11 +247,13 @@ impl Fit {
             signal,
             has_load,
             report: f64::NAN,
+            prior: Matrix6::zeros(),
             seconds,
             theta: Vector6::zeros(),
             variance: f64::NAN,
         };
         fit.report = fit.rms(|row| row.s).max(f64::MIN_POSITIVE);
+        fit.prior = fit.wide();
         // Before the first fit, residuals are taken to be as large as the report.
         fit.variance = fit.report.powi(2);
         Ok(fit)
@@ -279,7 +283,7 @@ impl Fit {
 
     /// Information matrix of the weighted rows and the prior, and the right-hand side.
     fn equations(&self) -> (Matrix6<f64>, Vector6<f64>) {
-        let (mut information, mut right) = (self.prior(), Vector6::zeros());
+        let (mut information, mut right) = (self.prior, Vector6::zeros());
         for (of_second, row) in self.rows() {
             let weight = of_second / self.variance_of(row);
             information += weight * row.x * row.x.transpose();
@@ -293,7 +297,7 @@ impl Fit {
     /// gives what the log does not show a finite deviation, and weighs nothing beside a second of
     /// what it does show. The constant and the offset have ten times the deviation that their
     /// columns alone could explain.
-    fn prior(&self) -> Matrix6<f64> {
+    fn wide(&self) -> Matrix6<f64> {
         let report = self.report;
         let by_torque = report / self.rms(|row| row.x[0]).max(1e-9);
         let most = [
@@ -347,7 +351,7 @@ impl Fit {
                 gradient * gradient.transpose()
             })
             .sum();
-        let mut covariance = inverse * (self.few() * scatter + self.prior()) * inverse;
+        let mut covariance = inverse * (self.few() * scatter + self.prior) * inverse;
         if !self.has_load {
             covariance.row_mut(3).fill(0.0);
             covariance.column_mut(3).fill(0.0);
@@ -450,7 +454,7 @@ mod tests {
     }
 
     /// Rows at 50 Hz of a joint that swings with a varying load, and rests for a fifth of the time.
-    /// The drive reports `reports(row number, report of the model)`.
+    /// The drive reports `reports(t, report of the model)`.
     fn rows(
         parameters: [f64; 6],
         seconds: f64,

@@ -38,6 +38,8 @@ pub(super) struct Drives {
 }
 
 struct Watched {
+    /// The number of the joint's channel; beyond all others if it is locked.
+    channel: usize,
     /// Torque and current.
     reports: History<2, KEPT>,
     /// None while it is to be identified.
@@ -46,6 +48,11 @@ struct Watched {
 }
 
 impl Watched {
+    /// The joint's channel, as the cause of a reason.
+    fn number(&self) -> u32 {
+        u32::try_from(self.channel).unwrap_or(NO_CAUSE)
+    }
+
     /// Whether a report has what is needed.
     fn wants(&self, report: [f64; 2]) -> bool {
         match &self.drive {
@@ -122,9 +129,12 @@ impl Drives {
         }
         let robot = &setup.robot;
         let watched = (0..robot.model.dof_count()).map(|dof| {
+            let mut channels = robot.channels.iter();
+            let channel = channels.position(|own| own.role == ChannelRole::Joint(dof));
             let joint = robot.model.dof_name(dof);
             let drive = setup.drives.iter().find(|drive| drive.joint == joint);
             (drive.is_some() || setup.learns_drives).then(|| Watched {
+                channel: channel.unwrap_or(usize::MAX),
                 reports: History::default(),
                 drive: drive.cloned(),
                 comparison: Comparison::default(),
@@ -160,7 +170,7 @@ impl Drives {
             let [velocity, acceleration] = at.motion(dof);
             let row = Row {
                 t: at.t,
-                report: at.report(watched, dof).ok()?,
+                report: at.report(watched).ok()?,
                 torque: torque.torque,
                 deviation: torque.standard_deviation,
                 velocity,
@@ -189,7 +199,7 @@ impl Drives {
                 joint: u32::try_from(joint).unwrap_or(u32::MAX),
                 ..DriveTorque::ABSENT
             };
-            let (reason, cause) = match at.report(own, dof) {
+            let (reason, cause) = match at.report(own) {
                 Ok(report) => {
                     let [velocity, acceleration] = at.motion(dof);
                     let signal = drive.signal.of(report);
@@ -214,11 +224,11 @@ impl Drives {
                             any_disagrees |= comparison.disagrees;
                             (Reason::None, NO_CAUSE)
                         }
-                        1 => (Reason::NotFinite, at.channel(dof)),
+                        1 => (Reason::NotFinite, own.number()),
                         _ => (torque.reason.get().unwrap_or_default(), torque.cause),
                     }
                 }
-                Err(reason) => (reason, at.channel(dof)),
+                Err(reason) => (reason, own.number()),
             };
             place.reason = reason.in_memory();
             place.cause = cause;
@@ -323,8 +333,8 @@ impl<'a> Instant<'a> {
     }
 
     /// What the drive of a joint reports; or why that, or the joint's motion, is not known.
-    fn report(&self, own: &Watched, dof: usize) -> Result<[f64; 2], Reason> {
-        let fault = self.faults.get(self.channel(dof) as usize);
+    fn report(&self, own: &Watched) -> Result<[f64; 2], Reason> {
+        let fault = self.faults.get(own.channel);
         if let Some(fault) = fault.filter(|fault| **fault != Reason::None) {
             return Err(*fault);
         }
@@ -334,15 +344,6 @@ impl<'a> Instant<'a> {
             Some(held) if held.quality.intersects(Quality::DRIVE_FAULT) => Err(Reason::DeviceFault),
             Some(held) => Ok(held.value),
         }
-    }
-
-    /// The channel of a joint.
-    fn channel(&self, dof: usize) -> u32 {
-        let mut channels = self.robot.channels.iter();
-        let number = channels.position(|own| own.role == ChannelRole::Joint(dof));
-        number
-            .and_then(|number| u32::try_from(number).ok())
-            .unwrap_or(NO_CAUSE)
     }
 }
 
