@@ -2,7 +2,7 @@
 //! they come from the URDF and the configuration, then from off-line or on-line identification.
 
 use crate::parameters::{Offset, Parameters, ParametersError};
-use crate::propagation::Covariance;
+use crate::uncertainty::propagation::Covariance;
 use nalgebra::DMatrix;
 use proprio_dynamics::Structure;
 use proprio_dynamics::calibration::{

@@ -28,7 +28,8 @@
 //! - Contacts: [`skin`] turns the values of taxels into touches, and where they are.
 //! - Parameters: [`inertial`] holds the parameters in use, [`parameters`] is the file
 //!   parameters.toml, [`export`] writes it from an identification result.
-//! - Uncertainty: [`propagation`] turns the covariance of the parameters into standard deviations.
+//! - Uncertainty: `uncertainty` turns all uncertain inputs into standard deviations,
+//!   [`propagation`] those of the parameters.
 //! - Drives: [`drive`] identifies what joints' drives report from the torques of the F/T sensors;
 //!   the pipeline compares both.
 //! - Programs: [`daemon`] and [`offline`] run the pipeline, [`check`] and `description` print what
@@ -57,10 +58,12 @@ pub mod offline;
 pub mod parameters;
 pub mod pipeline;
 mod plausible;
-pub mod propagation;
 pub mod reading;
 #[cfg(test)]
 #[path = "../../tests/schema.rs"]
 mod schema;
 pub mod setup;
 pub mod skin;
+mod uncertainty;
+
+pub use uncertainty::propagation;

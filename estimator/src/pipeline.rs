@@ -11,7 +11,7 @@
 //!    temperature and offset.
 //! 4. The contacts that are present are put where declarations or skins say (`contacts`,
 //!    [`crate::skin`]). Kinematics and solver give torques and contact wrenches; standard
-//!    deviations are propagated (`solution`, `motion`, [`crate::propagation`]).
+//!    deviations are propagated (`solution`, `uncertainty`).
 //! 5. The F/T residual of each sub-tree is tested (`residuals`). A possible contact that explains a
 //!    significant residual is taken as present. Without such a contact, the torques of the sub-tree
 //!    are not valid.
@@ -59,10 +59,10 @@
 //! of a new zero has an unknown offset until a solution has it; without identification for good.
 //!
 //! # Uncertainty
-//! Standard deviations contain F/T noise, the uncertainty of inertial parameters and F/T offsets
-//! ([`crate::propagation::Propagation`]), that of differentiated accelerations, encoder offsets and
-//! the base's proper acceleration (`motion`), and that of the places of declared and touched
-//! contacts ([`PlaceErrors`]). They do not contain the errors of velocities.
+//! Standard deviations contain F/T noise, the uncertainty of inertial parameters and F/T offsets,
+//! that of differentiated accelerations, encoder offsets and the base's proper acceleration, and
+//! that of the places of declared and touched contacts (`uncertainty`). They do not contain the
+//! errors of velocities.
 
 mod budget;
 mod buffers;
@@ -72,7 +72,6 @@ mod drives;
 mod estimate;
 mod identification;
 mod input;
-mod motion;
 mod prediction;
 mod residuals;
 mod solution;
@@ -83,28 +82,23 @@ pub use estimate::{Counts, Estimate};
 pub use identification::Job;
 
 use crate::config::Timing;
-use crate::differentiate::{Grid, Window};
+use crate::differentiate::Window;
 use crate::drive::Row;
-use crate::history::{ChannelValue, History};
-use crate::propagation::Propagation;
+use crate::history::History;
 use crate::setup::Setup;
-use buffers::{ChannelBuffer, OrReason, Sanity, stale, temperature_at};
-use channels::{imu_at, joint_at, wrench_at};
+use crate::uncertainty::Uncertainty;
+use buffers::{ChannelBuffer, Sanity};
+use channels::Inputs;
 use contacts::Contacts;
 use drives::{Drives, Instant};
-use estimate::root_of_squares;
 use identification::OnlineIdentification;
-use motion::{ENCODER_OFFSET_STD, MotionErrors};
-use prediction::{Extrapolated, Predictor};
-use proprio_dynamics::model::Model;
-use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
-use proprio_dynamics::{
-    ContactSet, Dependence, FrameMotion, Kinematics, Noise, PlaceErrors, SensorCut, Solver,
-};
+use prediction::Predictor;
+use proprio_dynamics::spatial::Wrench;
+use proprio_dynamics::{ContactSet, Dependence, FrameMotion, Kinematics, Noise, SensorCut, Solver};
 use proprio_identification::online::state::StateError;
 use proprio_identification::online::{Online, OnlineError};
-use proprio_identification::robot::{BaseMotion, ChannelRole};
-use proprio_topics::{DriveEstimate, InertiaEstimate, Nanos, Quality, Reason, TorqueBudget};
+use proprio_identification::robot::ChannelRole;
+use proprio_topics::{DriveEstimate, InertiaEstimate, Nanos, Reason, TorqueBudget};
 use residuals::ResidualMonitor;
 use std::collections::VecDeque;
 use steps::StepCover;
@@ -116,10 +110,8 @@ pub struct Pipeline {
     buffers: Vec<ChannelBuffer>,
     /// The same channels: whether their readings can be true.
     sanity: Vec<Sanity>,
-    /// The stamp-dependent part of differentiation, shared by channels with equal stamps.
-    grid: Box<Grid>,
-    /// Per channel, why its value at the present instant is not valid.
-    faults: Vec<Reason>,
+    /// What they say at the present instant.
+    inputs: Inputs,
     /// Why the motion of the base is not valid, if no channel measures it.
     base_fault: Reason,
     /// Which contacts are present, and where.
@@ -134,31 +126,16 @@ pub struct Pipeline {
     counts: Counts,
     kinematics: Kinematics,
     solver: Solver,
-    /// Standard deviations of the results from the covariance of parameters and offsets.
-    propagation: Propagation,
-    /// The same from errors of positions and accelerations.
-    motion: Box<MotionErrors>,
-    /// The same from errors of the contacts' places.
-    place_errors: PlaceErrors,
+    /// Standard deviations of the results.
+    uncertainty: Box<Uncertainty>,
     /// Tests the F/T residual of each sub-tree.
     residuals: ResidualMonitor,
     /// What else the residuals may be.
     steps: StepCover,
-    position: Vec<f64>,
-    /// Per degree of freedom, the least and the greatest position so far.
-    travel: Vec<[f64; 2]>,
-    velocity: Vec<f64>,
-    acceleration: Vec<f64>,
-    /// Per degree of freedom, the standard deviation of the encoder offset \[rad or m\].
-    encoder_offset_std: Vec<f64>,
-    /// Per F/T sensor, the corrected reading less the offset.
-    readings: Vec<Wrench>,
     /// See [`validity::ValidityCheck`].
     unwatched: Vec<(ContactSet, Reason, u32)>,
     /// Per F/T sensor, since when its zero is another one than that of the offset in use.
     new_zeros: Vec<Option<Nanos>>,
-    /// Per F/T sensor, whether its calibration needs a temperature that is missing or too old.
-    missing_temperature: Vec<bool>,
     /// The channels that each output depends on.
     dependences: Dependences,
     identification: Option<Box<OnlineIdentification>>,
@@ -217,18 +194,14 @@ impl Pipeline {
             setup.state.model.dof_count(),
             setup.robot.structure.contacts().len(),
         );
-        let motion = MotionErrors::new(
-            &setup.state.model,
-            &setup.robot.structure,
-            setup.robot.base_link,
-        );
         let mut estimate = Box::new(Estimate::absent(Nanos::ZERO));
         estimate.torques.count = u32::try_from(setup.robot.published().count()).unwrap_or(0);
         estimate.contacts.count = u32::try_from(setup.robot.contacts.len()).unwrap_or(0);
         estimate.contacts.residual_count =
             u32::try_from(setup.robot.subtree_names().count()).unwrap_or(0);
-        let mut propagation = Propagation::new(&setup.robot.structure, &setup.state.covariance)
-            .expect("the covariance is of the model");
+        let mut uncertainty =
+            Uncertainty::new(&setup.robot.structure, &setup.state, setup.robot.base_link)
+                .expect("the covariance is of the model, and the base its link");
         let (identification, refusal) = match setup
             .identifies
             .then(|| OnlineIdentification::new(&setup))
@@ -239,13 +212,12 @@ impl Pipeline {
         };
         let mut identification = identification;
         if let Some(identification) = &mut identification {
-            identification.install_initial_covariance(&mut propagation);
+            identification.install_initial_covariance(&mut uncertainty.parameters);
         }
         Self {
             buffers: buffers.collect(),
             sanity: sanity.collect(),
-            grid: Box::default(),
-            faults: vec![Reason::NeverSeen; setup.robot.channels.len()],
+            inputs: Inputs::new(&setup),
             base_fault: Reason::None,
             contacts: Contacts::new(&setup),
             waiting: VecDeque::with_capacity(Self::MAX_WAITING),
@@ -255,20 +227,11 @@ impl Pipeline {
             counts: Counts::default(),
             kinematics,
             solver: Solver::new(&setup.robot.structure),
-            propagation,
-            motion: Box::new(motion.expect("the base is a link of the model")),
-            place_errors: PlaceErrors::new(&setup.robot.structure),
+            uncertainty: Box::new(uncertainty),
             residuals: ResidualMonitor::new(&setup.robot.structure),
             steps: StepCover::new(&setup.robot.structure, dofs),
-            position: setup.robot.position_without_samples(),
-            travel: vec![[f64::INFINITY, f64::NEG_INFINITY]; dofs],
-            velocity: vec![0.0; dofs],
-            acceleration: vec![0.0; dofs],
-            encoder_offset_std: encoder_offset_std(&setup.state.model),
-            readings: vec![Wrench::zero(); setup.robot.structure.sensors().len()],
             unwatched: Vec::with_capacity(setup.robot.structure.subtrees().len()),
             new_zeros: vec![None; setup.robot.structure.sensors().len()],
-            missing_temperature: vec![false; setup.robot.structure.sensors().len()],
             dependences: Dependences {
                 active: None,
                 torques: vec![Dependence::default(); dofs],
@@ -307,7 +270,7 @@ impl Pipeline {
         let Some(identification) = &mut self.identification else {
             return Ok(());
         };
-        identification.resume(state, &mut self.setup, &mut self.propagation)
+        identification.resume(state, &mut self.setup, &mut self.uncertainty.parameters)
     }
 
     /// The next job of identification, if one is due: about once a second of stamps. Call it after
@@ -361,8 +324,9 @@ impl Pipeline {
     /// estimate: none was received, or the last one was more than a minute old.
     pub fn without_temperature(&self) -> impl Iterator<Item = &str> {
         let channels = self.setup.robot.channels.iter();
+        let missing = &self.inputs.missing_temperature;
         channels.filter_map(|channel| match channel.role {
-            ChannelRole::Sensor(number) if self.missing_temperature.get(number) == Some(&true) => {
+            ChannelRole::Sensor(number) if missing.get(number) == Some(&true) => {
                 Some(channel.name.as_str())
             }
             _ => None,
@@ -432,9 +396,8 @@ impl Pipeline {
             until: self.until(self.estimate.t),
             robot: &self.setup.robot,
             torques: self.estimate.torques.joints(),
-            velocity: &self.velocity,
-            acceleration: &self.acceleration,
-            faults: &self.faults,
+            state: self.inputs.joints(),
+            faults: &self.inputs.faults,
         }
     }
 
@@ -451,7 +414,8 @@ impl Pipeline {
                 identification.observe(instant, &self.setup, &self.buffers, &active, base);
             }
             let touched = self.residuals.touched(&self.setup.robot.structure);
-            if identification.apply(&mut self.setup, &mut self.propagation, &touched) {
+            let parameters = &mut self.uncertainty.parameters;
+            if identification.apply(&mut self.setup, parameters, &touched) {
                 self.residuals.restart_means();
                 for (sensor, since) in self.new_zeros.iter_mut().enumerate() {
                     since.take_if(|_| identification.knows_zero(sensor));
@@ -490,125 +454,6 @@ impl Pipeline {
             Timing::Immediate => Nanos::MAX,
         }
     }
-
-    /// Evaluates every channel at `t`. Returns the motion of the base link, and the IMU's motion
-    /// and pose if there is one.
-    fn evaluate_channels(
-        &mut self,
-        t: Nanos,
-        active: &ContactSet,
-    ) -> (FrameMotion, Option<(FrameMotion, Pose)>) {
-        let until = self.until(t);
-        let mut base = self.place_base(active);
-        let mut imu = None;
-        for ((buffer, channel), fault) in self
-            .buffers
-            .iter()
-            .zip(&self.setup.robot.channels)
-            .zip(&mut self.faults)
-        {
-            *fault = match (buffer, channel.role) {
-                (ChannelBuffer::Joint(history, window), ChannelRole::Joint(dof)) => {
-                    match history.at(t, until) {
-                        None => Reason::NeverSeen,
-                        Some(sample) => {
-                            let (state, [acceleration_std, position_std], reason) = joint_at(
-                                t,
-                                until,
-                                &sample,
-                                (window, &mut self.grid),
-                                self.setup.robot.max_silence,
-                            );
-                            let [noise] = window.noise(t);
-                            let offset_std =
-                                self.encoder_offset_std.get(dof).copied().unwrap_or(0.0);
-                            self.motion.set_joint(
-                                dof,
-                                acceleration_std,
-                                root_of_squares([offset_std, noise, position_std]),
-                            );
-                            let places = (
-                                self.position.get_mut(dof),
-                                self.velocity.get_mut(dof),
-                                self.acceleration.get_mut(dof),
-                            );
-                            if let (Some(q), Some(dq), Some(ddq)) = places {
-                                [*q, *dq, *ddq] = state;
-                            }
-                            if let Some([least, most]) = self.travel.get_mut(dof) {
-                                (*least, *most) = (least.min(state[0]), most.max(state[0]));
-                            }
-                            Reason::of_quality(sample.quality, Quality::UNTRUSTED_ENCODER)
-                                .or(reason)
-                        }
-                    }
-                }
-                (
-                    ChannelBuffer::Sensor(history, temperatures, predictor),
-                    ChannelRole::Sensor(number),
-                ) => match history.at(t, until) {
-                    None => Reason::NeverSeen,
-                    Some(sample) => {
-                        let celsius = temperature_at(temperatures, t, self.setup.max_wait);
-                        let state = &self.setup.state;
-                        let (predicted, starting) =
-                            predicted(t, &sample, predictor, &mut self.grid);
-                        let raw = predicted.unwrap_or(Extrapolated {
-                            value: sample.value,
-                            std: [0.0; 6],
-                        });
-                        if let (Some(reading), Some(missing), Some(corrected)) = (
-                            self.readings.get_mut(number),
-                            self.missing_temperature.get_mut(number),
-                            wrench_at(state, number, raw, celsius, &mut self.propagation),
-                        ) {
-                            (*reading, *missing) = corrected;
-                        }
-                        stale(&sample, self.setup.robot.max_silence)
-                            .or(Reason::of_quality(sample.quality, Quality::DEVICE_FAULT))
-                            .or(starting)
-                            .or(match self.new_zeros.get(number) {
-                                Some(Some(since)) if t > *since => Reason::Uncertain,
-                                _ => Reason::None,
-                            })
-                    }
-                },
-                (ChannelBuffer::Imu(history, window, predictor), ChannelRole::Base) => {
-                    match history.at(t, until) {
-                        None => Reason::NeverSeen,
-                        Some(sample) => {
-                            let (mut measured, deviation, reason) = imu_at(
-                                t,
-                                until,
-                                &sample,
-                                (window, &mut self.grid),
-                                self.setup.robot.max_silence,
-                            );
-                            let (predicted, starting) =
-                                predicted(t, &sample, predictor, &mut self.grid);
-                            let mut std = [0.0; 3];
-                            if let Some(predicted) = predicted {
-                                measured.proper_acceleration = Vec3::from(predicted.value);
-                                std = predicted.std;
-                            }
-                            self.motion.set_proper(&std);
-                            if let BaseMotion::Imu(pose) = &self.setup.robot.base {
-                                base = FrameMotion::of_link_from_imu(&measured, pose);
-                                imu = Some((measured, *pose));
-                            }
-                            self.motion.set_angular(&deviation);
-                            Reason::of_quality(sample.quality, Quality::DEVICE_FAULT)
-                                .or(reason)
-                                .or(starting)
-                        }
-                    }
-                }
-                // Not reached: buffers were made from the channels' roles.
-                _ => Reason::NeverSeen,
-            };
-        }
-        (base, imu)
-    }
 }
 
 /// Peak noise of an accelerometer \[m/s^2\]: three times the noise of a BNO055 at a bandwidth of
@@ -632,32 +477,4 @@ fn sensor_peaks(setup: &Setup, number: usize) -> [f64; 6] {
     let ([fx, fy, fz], [tx, ty, tz]) = (force, torque);
     // A uniformly distributed error of this peak has this standard deviation.
     [fx, fy, fz, tx, ty, tz].map(|std| std * f64::sqrt(3.0))
-}
-
-/// The values of a channel whose last sample is earlier than `t`, extrapolated to `t`, and their
-/// standard deviations. None if a sample was measured at `t` or later, or there is no predictor; or
-/// with [`Reason::Starting`], if too few good samples are at hand.
-fn predicted<const N: usize, const D: usize>(
-    t: Nanos,
-    sample: &ChannelValue<N>,
-    predictor: &Option<Predictor<D>>,
-    grid: &mut Grid,
-) -> (Option<Extrapolated<D>>, Reason) {
-    match predictor {
-        Some(predictor) if !(sample.exact || sample.interpolated) => {
-            let predicted = predictor.at(t, grid);
-            let reason = match predicted {
-                Some(_) => Reason::None,
-                None => Reason::Starting,
-            };
-            (predicted, reason)
-        }
-        _ => (None, Reason::None),
-    }
-}
-
-/// Per degree of freedom, the standard deviation of the encoder offset \[rad or m\].
-fn encoder_offset_std(model: &Model) -> Vec<f64> {
-    let of_dof = |dof| ENCODER_OFFSET_STD[usize::from(model.is_prismatic(dof))];
-    (0..model.dof_count()).map(of_dof).collect()
 }

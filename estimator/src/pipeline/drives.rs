@@ -4,7 +4,7 @@
 use crate::drive::{Drive, Row};
 use crate::history::History;
 use crate::setup::Setup;
-use proprio_dynamics::Dependence;
+use proprio_dynamics::{Dependence, JointState};
 use proprio_identification::Robot;
 use proprio_identification::robot::ChannelRole;
 use proprio_topics::{
@@ -314,9 +314,8 @@ pub(super) struct Instant<'a> {
     pub(super) until: Nanos,
     pub(super) robot: &'a Robot,
     pub(super) torques: &'a [JointTorque],
-    /// Per degree of freedom.
-    pub(super) velocity: &'a [f64],
-    pub(super) acceleration: &'a [f64],
+    /// Of all joints.
+    pub(super) state: JointState<'a>,
     /// Per channel, why its value is not valid.
     pub(super) faults: &'a [Reason],
 }
@@ -328,7 +327,7 @@ impl<'a> Instant<'a> {
     }
 
     fn motion(&self, dof: usize) -> [f64; 2] {
-        [self.velocity, self.acceleration]
+        [self.state.velocity, self.state.acceleration]
             .map(|values| values.get(dof).copied().unwrap_or(f64::NAN))
     }
 

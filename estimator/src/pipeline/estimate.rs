@@ -56,8 +56,3 @@ pub struct Counts {
     /// Dropped: a value is not finite.
     pub not_finite: u64,
 }
-
-/// The deviation of a sum of independent errors.
-pub(super) fn root_of_squares<const N: usize>(deviations: [f64; N]) -> f64 {
-    deviations.iter().map(|x| x * x).sum::<f64>().sqrt()
-}

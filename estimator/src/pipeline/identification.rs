@@ -15,10 +15,11 @@ use crate::pipeline::identification::centred::{Centred, DELAY, SignalStatistics}
 use proprio_topics::{InertiaEstimate, LinkInertia, Name, Nanos, Quality, Reason, SensorOffset};
 
 use super::buffers::{ChannelBuffer, OrReason, temperature_at};
+use crate::differentiate::Window;
 use crate::history::History;
 use crate::inertial::{PosteriorBlock, excess};
-use crate::propagation::{Covariance, Propagation};
 use crate::setup::Setup;
+use crate::uncertainty::propagation::{Covariance, Propagation};
 use proprio_dynamics::spatial::{RigidInertia, Vec3, Wrench};
 use proprio_dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics, SensorSet};
 use proprio_identification::online::state::{SensorFingerprint, StateError};
@@ -284,155 +285,20 @@ impl OnlineIdentification {
         active: &ContactSet,
         (base_link, mut base, mut base_fault): (usize, FrameMotion, Reason),
     ) {
-        let (from, to) = (t - DELAY, t + DELAY);
         let mut is_base_moved = false;
         self.moved = DofSet::default();
         self.current.copy_from(&self.held);
         for (buffer, channel) in buffers.iter().zip(&setup.robot.channels) {
             match (buffer, channel.role) {
                 (ChannelBuffer::Joint(history, window), ChannelRole::Joint(dof)) => {
-                    let places = (
-                        self.current.position.get_mut(dof),
-                        self.current.velocity.get_mut(dof),
-                        self.current.acceleration.get_mut(dof),
-                        self.joints.get_mut(dof),
-                    );
-                    let (Some(q), Some(dq), Some(ddq), Some(fault)) = places else {
-                        continue;
-                    };
-                    // Measured velocities and accelerations are used. Derivatives that are not
-                    // measured come from the highest one that is.
-                    let gathered = self.differentiator.gather(
-                        history,
-                        from,
-                        to,
-                        setup.robot.max_silence,
-                        Quality::UNTRUSTED_ENCODER | Quality::ZERO_CHANGED,
-                    );
-                    *fault = gathered.err().unwrap_or(Reason::None);
-                    let highest = (0..3)
-                        .rev()
-                        .find(|&order| self.differentiator.is_complete(order))
-                        .unwrap_or(0);
-                    let Some(statistics) = self.statistics.get_mut(dof) else {
-                        continue;
-                    };
-                    // For positions the noise during motion is known, too.
-                    let [sigma] = if highest == 0 {
-                        window.noise(to)
-                    } else {
-                        [f64::NAN]
-                    };
-                    let fit = self.differentiator.fit(highest, statistics, (sigma, 2));
-                    let measured = (highest > 0).then(|| history.at(t, to)).flatten();
-                    let mut measured_statistics = self.measured_statistics.iter_mut().skip(2 * dof);
-                    let mut exact = |order: usize| {
-                        let deviation = measured_statistics.next().map_or(0.0, |statistics| {
-                            self.differentiator.deviation(order, statistics)
-                        });
-                        let value =
-                            measured.and_then(|measured| measured.value.get(order).copied());
-                        (value.unwrap_or(f64::NAN), deviation)
-                    };
-                    let values = match highest {
-                        0 => fit,
-                        1 => [exact(0), fit[0], fit[1]],
-                        _ => [exact(0), exact(1), fit[0]],
-                    };
-                    let errors = self
-                        .current
-                        .errors
-                        .chunks_exact_mut(3)
-                        .nth(dof)
-                        .unwrap_or_default();
-                    for ((place, (value, error)), old) in
-                        [&mut *q, dq, ddq].into_iter().zip(values).zip(errors)
-                    {
-                        if has_moved((*place, *old), (value, error)) {
-                            self.moved.insert(dof);
-                        }
-                        (*place, *old) = (value, error);
-                    }
-                    if !(q.is_finite() && dq.is_finite() && ddq.is_finite()) {
-                        [*q, *dq, *ddq] = [0.0; 3];
-                        *fault = (*fault).or(Reason::NotFinite);
-                    }
+                    self.observe_joint(t, setup, dof, (history, window));
                 }
                 (ChannelBuffer::Sensor(history, temperatures, _), ChannelRole::Sensor(number)) => {
-                    let (Some(reading), Some(fault)) =
-                        (self.readings.get_mut(number), self.sensors.get_mut(number))
-                    else {
-                        continue;
-                    };
-                    let (mean, reason) =
-                        mean_reading(history, t, self.period, setup.robot.max_silence);
                     let (celsius, _) = temperature_at(temperatures, t, setup.max_wait);
-                    let calibration = setup.state.calibrations.get(number);
-                    *reading =
-                        calibration.map_or(mean, |calibration| calibration.apply(&mean, celsius));
-                    *fault = reason;
-                    // A mean of readings before and after is of neither zero.
-                    if let Some(zero) = self.new_zeros.get_mut(number)
-                        && let Some(from) = *zero
-                    {
-                        if t > from + self.period {
-                            *zero = None;
-                            self.online.forget_offset(number);
-                        } else if t + self.period >= from {
-                            *fault = (*fault).or(Reason::Uncertain);
-                        }
-                    }
+                    self.observe_sensor(t, setup, number, (history, celsius));
                 }
                 (ChannelBuffer::Imu(history, window, _), ChannelRole::Base) => {
-                    let gathered = self.differentiator.gather(
-                        history,
-                        from,
-                        to,
-                        setup.robot.max_silence,
-                        Quality::DEVICE_FAULT,
-                    );
-                    base_fault = gathered.err().unwrap_or(Reason::None);
-                    let measured = &mut self.current.imu;
-                    let first = self.statistics.len().saturating_sub(9);
-                    let sigma = window.noise(to);
-                    for (axis, sigma) in sigma.into_iter().enumerate() {
-                        // Separate statistics: angular acceleration may be absent at times.
-                        let mut none = [SignalStatistics::default(); 3];
-                        let own = self
-                            .statistics
-                            .get_mut(first + 3 * axis..first + 3 * axis + 3);
-                        let [of_rate, of_angular, of_linear]: &mut [SignalStatistics; 3] =
-                            own.and_then(|own| own.try_into().ok()).unwrap_or(&mut none);
-                        let gyro = self.differentiator.fit(3 + axis, of_rate, (sigma, 1));
-                        let alpha = if self.differentiator.is_complete(6 + axis) {
-                            self.differentiator.fit(6 + axis, of_angular, (f64::NAN, 0))[0]
-                        } else {
-                            gyro[1]
-                        };
-                        let acceleration =
-                            self.differentiator.fit(axis, of_linear, (f64::NAN, 0))[0];
-                        let errors = self.current.errors.iter_mut().rev().skip(3 * axis);
-                        for ((place, (value, error)), old) in [
-                            (&mut measured.proper_acceleration[axis], acceleration),
-                            (&mut measured.angular_velocity[axis], gyro[0]),
-                            (&mut measured.angular_acceleration[axis], alpha),
-                        ]
-                        .into_iter()
-                        .zip(errors)
-                        {
-                            is_base_moved |= has_moved((*place, *old), (value, error));
-                            (*place, *old) = (value, error);
-                        }
-                    }
-                    let numbers = [
-                        &measured.proper_acceleration,
-                        &measured.angular_velocity,
-                        &measured.angular_acceleration,
-                    ];
-                    if numbers.iter().any(|v| v.iter().any(|x| !x.is_finite())) {
-                        base_fault = base_fault.or(Reason::NotFinite);
-                        *measured = FrameMotion::standing(&Vec3::zeros());
-                    }
+                    (is_base_moved, base_fault) = self.observe_imu(t, setup, (history, window));
                 }
                 _ => {}
             }
@@ -476,6 +342,156 @@ impl OnlineIdentification {
             base_motion: base,
             sensors: &self.sensors,
         });
+    }
+
+    /// Evaluates a joint at `t`. Measured velocities and accelerations are used. Derivatives that
+    /// are not measured come from the highest one that is.
+    fn observe_joint(
+        &mut self,
+        t: Nanos,
+        setup: &Setup,
+        dof: usize,
+        (history, window): (&History<3>, &Window<1>),
+    ) {
+        let (from, to) = (t - DELAY, t + DELAY);
+        let (Some(q), Some(dq), Some(ddq), Some(fault), Some(statistics)) = (
+            self.current.position.get_mut(dof),
+            self.current.velocity.get_mut(dof),
+            self.current.acceleration.get_mut(dof),
+            self.joints.get_mut(dof),
+            self.statistics.get_mut(dof),
+        ) else {
+            return;
+        };
+        let bad = Quality::UNTRUSTED_ENCODER | Quality::ZERO_CHANGED;
+        let max_silence = setup.robot.max_silence;
+        let gathered = self
+            .differentiator
+            .gather(history, from, to, max_silence, bad);
+        *fault = gathered.err().unwrap_or(Reason::None);
+        let mut orders = (0..3).rev();
+        let highest = orders.find(|&order| self.differentiator.is_complete(order));
+        let highest = highest.unwrap_or(0);
+        // For positions the noise during motion is known, too.
+        let [sigma] = match highest {
+            0 => window.noise(to),
+            _ => [f64::NAN],
+        };
+        let fit = self.differentiator.fit(highest, statistics, (sigma, 2));
+        let measured = (highest > 0).then(|| history.at(t, to)).flatten();
+        let mut measured_statistics = self.measured_statistics.iter_mut().skip(2 * dof);
+        let mut exact = |order: usize| {
+            let deviation = measured_statistics.next().map_or(0.0, |statistics| {
+                self.differentiator.deviation(order, statistics)
+            });
+            let value = measured.and_then(|measured| measured.value.get(order).copied());
+            (value.unwrap_or(f64::NAN), deviation)
+        };
+        let values = match highest {
+            0 => fit,
+            1 => [exact(0), fit[0], fit[1]],
+            _ => [exact(0), exact(1), fit[0]],
+        };
+        let errors = self.current.errors.chunks_exact_mut(3).nth(dof);
+        let held = [&mut *q, dq, ddq]
+            .into_iter()
+            .zip(errors.unwrap_or_default());
+        for ((value, error), (held, held_error)) in values.into_iter().zip(held) {
+            if has_moved((*held, *held_error), (value, error)) {
+                self.moved.insert(dof);
+            }
+            (*held, *held_error) = (value, error);
+        }
+        if !(q.is_finite() && dq.is_finite() && ddq.is_finite()) {
+            [*q, *dq, *ddq] = [0.0; 3];
+            *fault = (*fault).or(Reason::NotFinite);
+        }
+    }
+
+    /// Averages the readings of an F/T sensor about `t`, whose board has this temperature
+    /// \[degrees Celsius\].
+    fn observe_sensor(
+        &mut self,
+        t: Nanos,
+        setup: &Setup,
+        number: usize,
+        (history, celsius): (&History<6>, f64),
+    ) {
+        let (Some(reading), Some(fault)) =
+            (self.readings.get_mut(number), self.sensors.get_mut(number))
+        else {
+            return;
+        };
+        let (mean, reason) = mean_reading(history, t, self.period, setup.robot.max_silence);
+        let calibration = setup.state.calibrations.get(number);
+        *reading = calibration.map_or(mean, |calibration| calibration.apply(&mean, celsius));
+        *fault = reason;
+        // A mean of readings before and after is of neither zero.
+        if let Some(zero) = self.new_zeros.get_mut(number)
+            && let Some(from) = *zero
+        {
+            if t > from + self.period {
+                *zero = None;
+                self.online.forget_offset(number);
+            } else if t + self.period >= from {
+                *fault = (*fault).or(Reason::Uncertain);
+            }
+        }
+    }
+
+    /// Evaluates the IMU at `t`. Returns whether the base moves, and why its motion is not valid.
+    fn observe_imu(
+        &mut self,
+        t: Nanos,
+        setup: &Setup,
+        (history, window): (&History<9>, &Window<3>),
+    ) -> (bool, Reason) {
+        let (from, to) = (t - DELAY, t + DELAY);
+        let max_silence = setup.robot.max_silence;
+        let gathered =
+            self.differentiator
+                .gather(history, from, to, max_silence, Quality::DEVICE_FAULT);
+        let mut fault = gathered.err().unwrap_or(Reason::None);
+        let mut has_base_moved = false;
+        let measured = &mut self.current.imu;
+        let first = self.statistics.len().saturating_sub(9);
+        for (axis, sigma) in window.noise(to).into_iter().enumerate() {
+            // Separate statistics: angular acceleration may be absent at times.
+            let mut none = [SignalStatistics::default(); 3];
+            let of_axis = first + 3 * axis..first + 3 * axis + 3;
+            let own = self.statistics.get_mut(of_axis);
+            let [of_rate, of_angular, of_linear]: &mut [SignalStatistics; 3] =
+                own.and_then(|own| own.try_into().ok()).unwrap_or(&mut none);
+            let gyro = self.differentiator.fit(3 + axis, of_rate, (sigma, 1));
+            let alpha = match self.differentiator.is_complete(6 + axis) {
+                true => self.differentiator.fit(6 + axis, of_angular, (f64::NAN, 0))[0],
+                false => gyro[1],
+            };
+            let acceleration = self.differentiator.fit(axis, of_linear, (f64::NAN, 0))[0];
+            let errors = self.current.errors.iter_mut().rev().skip(3 * axis);
+            let held = [
+                &mut measured.proper_acceleration[axis],
+                &mut measured.angular_velocity[axis],
+                &mut measured.angular_acceleration[axis],
+            ];
+            let values = [acceleration, gyro[0], alpha];
+            for ((value, error), (held, held_error)) in
+                values.into_iter().zip(held.into_iter().zip(errors))
+            {
+                has_base_moved |= has_moved((*held, *held_error), (value, error));
+                (*held, *held_error) = (value, error);
+            }
+        }
+        let numbers = [
+            &measured.proper_acceleration,
+            &measured.angular_velocity,
+            &measured.angular_acceleration,
+        ];
+        if numbers.iter().any(|v| v.iter().any(|x| !x.is_finite())) {
+            fault = fault.or(Reason::NotFinite);
+            *measured = FrameMotion::standing(&Vec3::zeros());
+        }
+        (has_base_moved, fault)
     }
 
     /// Puts a solution in use if its stamp has been reached; whether it did. The noise of the

@@ -1,11 +1,14 @@
 //! The pipeline's input: samples, of skins too, and declarations of contacts.
 
 use super::Pipeline;
-use super::buffers::ChannelBuffer;
+use super::buffers::{ChannelBuffer, Sanity};
+use super::prediction::Predictor;
 use crate::config::Timing;
+use crate::differentiate::Window;
+use crate::history::History;
 use crate::skin::Taken;
 use proprio_identification::robot::ChannelRole;
-use proprio_topics::{ContactState, Nanos, Quality, Reading, Reason};
+use proprio_topics::{self as topics, ContactState, Nanos, Quality, Reading, Reason};
 
 impl Pipeline {
     /// Takes a sample of channel number `channel`, acquired at `t`. A temperature of an F/T
@@ -25,89 +28,28 @@ impl Pipeline {
         // Estimates that do not wait go by the order of arrival: no sample is late.
         let waits = self.setup.timing == Timing::Aligned;
         let newest = buffer.newest().unwrap_or(Nanos::MIN);
-        let all_finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
-        let finite_or_absent = |values: &[f64]| values.iter().all(|v| !v.is_infinite());
-        let is_continued = !quality.intersects(Quality::ZERO_CHANGED);
-        let max_silence = self.setup.robot.max_silence;
-        let mut sanity = self.sanity.get_mut(channel);
-        let mut judged = |values: [f64; 6]| match &mut sanity {
-            Some(sanity) => sanity.look(t, &values, quality, max_silence),
-            None => quality,
+        let arrival = Arrival {
+            t,
+            quality,
+            newest,
+            released: waits.then_some(self.released),
+            max_silence: self.setup.robot.max_silence,
+            sanity: self.sanity.get_mut(channel),
         };
-        // Decide first whether the sample may be taken; then push it to window and history.
-        let (mut late, mut backward) = (false, false);
-        let mut admit = |is_valid: bool| {
-            late = waits && is_valid && t <= self.released;
-            backward = is_valid && !late && t <= newest;
-            is_valid && !late && !backward
-        };
-        let is_valid = match (buffer, reading) {
+        let fate = match (buffer, reading) {
+            // For example a row with a torque alone: nothing to differentiate.
+            (ChannelBuffer::Joint(..), Reading::Joint(j)) if j.position.is_nan() => return,
             (ChannelBuffer::Joint(history, window), Reading::Joint(j)) => {
-                let is_valid =
-                    j.position.is_finite() && finite_or_absent(&[j.velocity, j.acceleration]);
-                if j.position.is_nan() {
-                    // For example a row with a torque alone: nothing to differentiate.
-                    return;
-                }
-                if admit(is_valid) {
-                    const NONE: f64 = f64::NAN;
-                    let quality = judged([j.position, NONE, NONE, NONE, NONE, NONE]);
-                    if !is_continued || sanity.is_some_and(|sanity| sanity.has_stepped()) {
-                        window.interrupt();
-                    }
-                    // A position that is not to be trusted is kept, but not differentiated.
-                    match Reason::of_quality(quality, Quality::UNTRUSTED_ENCODER) {
-                        Reason::None => {
-                            let _ = window.push(t, [j.position]);
-                        }
-                        Reason::Implausible => {}
-                        _ => window.interrupt(),
-                    }
-                    history.push(t, [j.position, j.velocity, j.acceleration], quality);
-                }
-                is_valid
+                arrival.joint(history, window, j)
             }
-            (ChannelBuffer::Sensor(_, temperatures, _), Reading::Temperature(temperature)) => {
-                if !self.setup.depends_on_temperature(channel)
-                    || quality.intersects(Quality::DEVICE_FAULT)
-                {
-                    return;
-                }
-                let late = waits
-                    && t < self
-                        .released
-                        .saturating_sub(Nanos(self.setup.max_wait.0 / 2));
-                match temperature.celsius.is_finite() {
-                    false => self.counts.not_finite += 1,
-                    true if temperatures.newest().is_some_and(|newest| t <= newest) => {
-                        self.counts.backward += 1;
-                    }
-                    true => {
-                        temperatures.push(t, [temperature.celsius], quality);
-                        self.counts.taken += 1;
-                        // Taken, but too late for a released instant: a replay would use it there.
-                        self.counts.late += u64::from(late);
-                    }
-                }
-                return;
+            (ChannelBuffer::Sensor(..), Reading::Temperature(temperature)) => {
+                return self.push_temperature(channel, t, temperature.celsius, quality);
             }
             (ChannelBuffer::Sensor(history, _, predictor), Reading::Wrench(w)) => {
-                let ([fx, fy, fz], [tx, ty, tz]) = (w.force, w.torque);
-                let value = [fx, fy, fz, tx, ty, tz];
-                let is_valid = all_finite(&value);
-                if admit(is_valid) {
-                    let quality = judged(value);
-                    let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
-                    if let Some(predictor) = predictor
-                        && fault != Reason::Implausible
-                    {
-                        predictor.push(t, &value, fault == Reason::None, is_continued);
-                    }
-                    history.push(t, value, quality);
-                }
+                let fate = arrival.wrench(history, predictor, w);
                 // The first reading is of the zero that the configuration is of. A reading that is
                 // of no use tells of a new zero all the same.
-                if !is_continued
+                if quality.intersects(Quality::ZERO_CHANGED)
                     && newest > Nanos::MIN
                     && let Some(ChannelRole::Sensor(number)) = role
                     && let Some(since) = self.new_zeros.get_mut(number)
@@ -117,41 +59,18 @@ impl Pipeline {
                         identification.begin_zero(number, t);
                     }
                 }
-                is_valid
+                fate
             }
             (ChannelBuffer::Imu(history, window, predictor), Reading::Imu(i)) => {
-                let is_valid = all_finite(&i.proper_acceleration)
-                    && all_finite(&i.angular_velocity)
-                    && finite_or_absent(&i.angular_acceleration);
-                if admit(is_valid) {
-                    let ([ax, ay, az], [gx, gy, gz]) = (i.proper_acceleration, i.angular_velocity);
-                    let quality = judged([ax, ay, az, gx, gy, gz]);
-                    let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
-                    if let Some(predictor) = predictor
-                        && fault != Reason::Implausible
-                    {
-                        let is_good = fault == Reason::None;
-                        predictor.push(t, &i.proper_acceleration, is_good, is_continued);
-                    }
-                    match fault {
-                        Reason::None => {
-                            let _ = window.push(t, i.angular_velocity);
-                        }
-                        Reason::Implausible => {}
-                        _ => window.interrupt(),
-                    }
-                    let [bx, by, bz] = i.angular_acceleration;
-                    history.push(t, [ax, ay, az, gx, gy, gz, bx, by, bz], quality);
-                }
-                is_valid
+                arrival.imu(history, (window, predictor), i)
             }
             _ => return,
         };
-        self.counts.not_finite += u64::from(!is_valid);
-        self.counts.late += u64::from(late);
-        self.counts.backward += u64::from(backward);
-        if !is_valid || late || backward {
-            return;
+        match fate {
+            Fate::Taken => {}
+            Fate::NotFinite => return self.counts.not_finite += 1,
+            Fate::Late => return self.counts.late += 1,
+            Fate::Backward => return self.counts.backward += 1,
         }
         self.counts.taken += 1;
         // Taken, but too late for a released instant: a replay would use it there.
@@ -168,6 +87,29 @@ impl Pipeline {
                 self.counts.late += 1;
             }
         }
+    }
+
+    /// Takes the temperature of an F/T sensor's board, if the sensor's calibration depends on it.
+    fn push_temperature(&mut self, channel: usize, t: Nanos, celsius: f64, quality: Quality) {
+        if !self.setup.depends_on_temperature(channel) || quality.intersects(Quality::DEVICE_FAULT)
+        {
+            return;
+        }
+        let Some(ChannelBuffer::Sensor(_, temperatures, _)) = self.buffers.get_mut(channel) else {
+            return;
+        };
+        if !celsius.is_finite() {
+            return self.counts.not_finite += 1;
+        }
+        if temperatures.newest().is_some_and(|newest| t <= newest) {
+            return self.counts.backward += 1;
+        }
+        temperatures.push(t, [celsius], quality);
+        self.counts.taken += 1;
+        // Taken, but too late for a released instant: a replay would use it there.
+        let until = Nanos(self.setup.max_wait.0 / 2);
+        let is_late = t < self.released.saturating_sub(until);
+        self.counts.late += u64::from(self.setup.timing == Timing::Aligned && is_late);
     }
 
     /// Takes a reading of a skin, whose channels follow those of the robot.
@@ -223,4 +165,152 @@ impl Pipeline {
                 .newest(channel.checked_sub(self.buffers.len())?),
         }
     }
+}
+
+/// What becomes of a sample.
+enum Fate {
+    Taken,
+    NotFinite,
+    /// Its instant has been released.
+    Late,
+    /// It is not later than the last one of its channel.
+    Backward,
+}
+
+/// A sample that arrives at the buffer of its channel.
+struct Arrival<'a> {
+    t: Nanos,
+    /// As its device has it.
+    quality: Quality,
+    /// The newest stamp of its channel.
+    newest: Nanos,
+    /// The stamp of the last estimate, if samples can be late for one.
+    released: Option<Nanos>,
+    max_silence: Nanos,
+    sanity: Option<&'a mut Sanity>,
+}
+
+impl Arrival<'_> {
+    fn fate(&self, is_finite: bool) -> Fate {
+        if !is_finite {
+            Fate::NotFinite
+        } else if self.released.is_some_and(|released| self.t <= released) {
+            Fate::Late
+        } else if self.t <= self.newest {
+            Fate::Backward
+        } else {
+            Fate::Taken
+        }
+    }
+
+    /// Its quality, judged by the samples before it, too.
+    fn judged(&mut self, values: [f64; 6]) -> Quality {
+        match &mut self.sanity {
+            Some(sanity) => sanity.look(self.t, &values, self.quality, self.max_silence),
+            None => self.quality,
+        }
+    }
+
+    /// Whether it continues those before it.
+    fn is_continued(&self) -> bool {
+        !self.quality.intersects(Quality::ZERO_CHANGED)
+    }
+
+    fn joint(
+        mut self,
+        history: &mut History<3>,
+        window: &mut Window<1>,
+        j: &topics::JointState,
+    ) -> Fate {
+        let is_finite =
+            j.position.is_finite() && is_finite_or_absent(&[j.velocity, j.acceleration]);
+        let fate = self.fate(is_finite);
+        if matches!(fate, Fate::Taken) {
+            const NONE: f64 = f64::NAN;
+            let quality = self.judged([j.position, NONE, NONE, NONE, NONE, NONE]);
+            let has_stepped = self.sanity.as_ref().is_some_and(|own| own.has_stepped());
+            if !self.is_continued() || has_stepped {
+                window.interrupt();
+            }
+            // A position that is not to be trusted is kept, but not differentiated.
+            differentiate(
+                window,
+                self.t,
+                [j.position],
+                Reason::of_quality(quality, Quality::UNTRUSTED_ENCODER),
+            );
+            history.push(self.t, [j.position, j.velocity, j.acceleration], quality);
+        }
+        fate
+    }
+
+    fn wrench(
+        mut self,
+        history: &mut History<6>,
+        predictor: &mut Option<Predictor<6>>,
+        w: &topics::Wrench,
+    ) -> Fate {
+        let ([fx, fy, fz], [tx, ty, tz]) = (w.force, w.torque);
+        let value = [fx, fy, fz, tx, ty, tz];
+        let fate = self.fate(value.iter().all(|x| x.is_finite()));
+        if matches!(fate, Fate::Taken) {
+            let quality = self.judged(value);
+            let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
+            self.predict(predictor, &value, fault);
+            history.push(self.t, value, quality);
+        }
+        fate
+    }
+
+    fn imu(
+        mut self,
+        history: &mut History<9>,
+        (window, predictor): (&mut Window<3>, &mut Option<Predictor<3>>),
+        i: &topics::Imu,
+    ) -> Fate {
+        let ([ax, ay, az], [gx, gy, gz]) = (i.proper_acceleration, i.angular_velocity);
+        let measured = [ax, ay, az, gx, gy, gz];
+        let is_finite = measured.iter().all(|x| x.is_finite());
+        let fate = self.fate(is_finite && is_finite_or_absent(&i.angular_acceleration));
+        if matches!(fate, Fate::Taken) {
+            let quality = self.judged(measured);
+            let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
+            self.predict(predictor, &i.proper_acceleration, fault);
+            differentiate(window, self.t, i.angular_velocity, fault);
+            let [bx, by, bz] = i.angular_acceleration;
+            history.push(self.t, [ax, ay, az, gx, gy, gz, bx, by, bz], quality);
+        }
+        fate
+    }
+
+    /// Gives the sample to the predictor, unless its reading cannot be true.
+    fn predict<const D: usize>(
+        &self,
+        predictor: &mut Option<Predictor<D>>,
+        value: &[f64; D],
+        fault: Reason,
+    ) {
+        if let Some(predictor) = predictor
+            && fault != Reason::Implausible
+        {
+            predictor.push(self.t, value, fault == Reason::None, self.is_continued());
+        }
+    }
+}
+
+/// Gives a sample to the window that differentiates, if nothing is wrong with it. One that cannot
+/// be true is left out; another fault interrupts the window.
+fn differentiate<const D: usize>(window: &mut Window<D>, t: Nanos, value: [f64; D], fault: Reason) {
+    match fault {
+        Reason::None => {
+            let _ = window.push(t, value);
+        }
+        Reason::Implausible => {}
+        _ => window.interrupt(),
+    }
+}
+
+/// Whether none of these is infinite: what is not measured is not a number.
+fn is_finite_or_absent(values: &[f64]) -> bool {
+    values.iter().all(|x| !x.is_infinite())
 }

@@ -2,12 +2,15 @@
 //! with their validity.
 
 use super::Pipeline;
-use super::motion::OperatingPoint;
-use super::residuals::{self, SubtreeResidual};
-use crate::pipeline::estimate::root_of_squares;
-use crate::pipeline::validity::{ValidityCheck, first_fault};
-use proprio_dynamics::spatial::Pose;
-use proprio_dynamics::{Certainty, ContactSet, Dependence, DofSet, FrameMotion, JointState};
+use super::channels::At;
+use super::contacts::Place;
+use super::residuals::{self, ResidualMonitor, SubtreeResidual};
+use super::steps::StepCover;
+use super::validity::{Dependences, ValidityCheck, first_fault};
+use crate::setup::Setup;
+use crate::uncertainty::{Solution, Uncertainty};
+use proprio_dynamics::{Certainty, ContactSet, Dependence, DofSet, SensorSet, Solver};
+use proprio_identification::online::Doubt;
 use proprio_identification::robot::ChannelRole;
 use proprio_topics::{ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Nanos, Reason, Residual};
 
@@ -17,18 +20,21 @@ impl Pipeline {
     pub(super) fn compute_estimate(&mut self, t: Nanos) {
         let active = self.active_contacts(t);
         self.contacts.place(&mut self.setup.robot, t);
-        let (base, imu) = self.evaluate_channels(t, &active);
+        let base = self.place_base(&active);
+        let at = At {
+            t,
+            until: self.until(t),
+            setup: &self.setup,
+            new_zeros: &self.new_zeros,
+            uncertainty: &mut self.uncertainty,
+        };
+        self.inputs.evaluate(at, &self.buffers, base);
         // A contact detected at the last instant is most likely still there.
         let possible = self.residuals.possible().difference(&active);
-        let mut solved = self.solve(t, &base, imu.as_ref(), &active.union(&possible));
+        let mut solved = self.solve(t, &active.union(&possible));
         self.test_residuals(t, &active, solved);
         if solved && self.residuals.possible() != possible {
-            solved = self.solve(
-                t,
-                &base,
-                imu.as_ref(),
-                &active.union(&self.residuals.possible()),
-            );
+            solved = self.solve(t, &active.union(&self.residuals.possible()));
         }
         if solved {
             self.steps.update(
@@ -36,7 +42,7 @@ impl Pipeline {
                 &self.setup.robot.structure,
                 &self.kinematics,
                 &self.solver,
-                &self.readings,
+                &self.inputs.readings,
                 [
                     &active,
                     &self.residuals.possible(),
@@ -50,58 +56,33 @@ impl Pipeline {
 
     /// Solves with the contacts in `active` present, and computes all standard deviations. False if
     /// the solver failed.
-    fn solve(
-        &mut self,
-        t: Nanos,
-        base: &FrameMotion,
-        imu: Option<&(FrameMotion, Pose)>,
-        active: &ContactSet,
-    ) -> bool {
+    fn solve(&mut self, t: Nanos, active: &ContactSet) -> bool {
         let (model, structure) = (&self.setup.state.model, &self.setup.robot.structure);
-        let state = JointState {
-            position: &self.position,
-            velocity: &self.velocity,
-            acceleration: &self.acceleration,
+        let (inputs, kinematics, solver) = (&self.inputs, &mut self.kinematics, &mut self.solver);
+        self.dependences.update(structure, kinematics, active);
+        let solved = kinematics
+            .update(model, inputs.joints(), &inputs.base)
+            .and_then(|()| {
+                solver.solve(model, structure, kinematics, &inputs.readings, active, &[])
+            })
+            .and_then(|()| solver.update_deviations(structure));
+        let solution = Solution {
+            t,
+            model,
+            structure,
+            state: inputs.joints(),
+            base: &inputs.base,
+            imu: inputs.imu.as_ref(),
+            readings: &inputs.readings,
+            active,
+            kinematics,
+            solver,
         };
-        self.dependences.update(structure, &self.kinematics, active);
-        self.kinematics
-            .update(model, state, base)
-            .and_then(|()| {
-                self.solver.solve(
-                    model,
-                    structure,
-                    &self.kinematics,
-                    &self.readings,
-                    active,
-                    &[],
-                )
-            })
-            .and_then(|()| self.solver.update_deviations(structure))
-            .and_then(|()| {
-                self.propagation
-                    .update(structure, &self.solver, &self.kinematics, t)
-            })
-            .and_then(|()| {
-                self.motion.update(&OperatingPoint {
-                    t,
-                    model,
-                    structure,
-                    state,
-                    base,
-                    imu: imu.map(|(measured, pose)| (measured, pose)),
-                    readings: &self.readings,
-                    active,
-                    solver: &self.solver,
-                    base_link: self.kinematics.base(),
-                })
-            })
-            .and_then(|()| {
-                let places = self.contacts.places();
-                let std =
-                    |contact: usize| places.get(contact).map_or_else(Default::default, |p| p.std);
-                self.place_errors
-                    .update(structure, &self.solver, &self.kinematics, std)
-            })
+        let places = self.contacts.places();
+        let place_std =
+            |contact: usize| places.get(contact).map_or_else(Default::default, |p| p.std);
+        solved
+            .and_then(|()| self.uncertainty.update(&solution, place_std))
             .is_ok()
     }
 
@@ -115,8 +96,8 @@ impl Pipeline {
         // A touch that is lost does not matter here: the test shows whether it is still there.
         let validity = ValidityCheck {
             channels: &self.setup.robot.channels,
-            faults: &self.faults,
-            first_fault: first_fault(&self.faults),
+            faults: &self.inputs.faults,
+            first_fault: first_fault(&self.inputs.faults),
             base_fault: self.base_fault,
             lost: &[],
             detected: ContactSet::EMPTY,
@@ -132,7 +113,7 @@ impl Pipeline {
         }
         let solved = residuals::Solved {
             t,
-            structure: &self.setup.robot.structure,
+            structure,
             kinematics: &self.kinematics,
             solver: &self.solver,
             declared,
@@ -140,10 +121,8 @@ impl Pipeline {
         let covariance = |number: usize| {
             let dependence = self.dependences.subtrees.get(number)?;
             let (reason, _) = validity.reason_and_cause(dependence);
-            let parameters = self.propagation.imbalance_covariances().get(number)?;
-            let places = self.place_errors.imbalance_covariances().get(number)?;
-            (reason == Reason::None)
-                .then(|| parameters + places + self.motion.imbalance_covariance(number))
+            let covariance = self.uncertainty.imbalance(number)?;
+            (reason == Reason::None).then_some(covariance)
         };
         self.residuals.update(&solved, covariance);
     }
@@ -153,41 +132,47 @@ impl Pipeline {
         self.estimate.t = t;
         self.estimate.torques.header.acquired = t;
         self.estimate.contacts.header.acquired = t;
-        let detected = self.residuals.detected();
-        let validity = ValidityCheck {
-            channels: &self.setup.robot.channels,
-            faults: &self.faults,
-            first_fault: first_fault(&self.faults),
-            base_fault: self.base_fault,
-            lost: self.contacts.lost(),
-            detected,
-            unwatched: &self.unwatched,
+        let stuck = self.stuck_encoders();
+        let robot = &self.setup.robot;
+        let judge = Judge {
+            setup: &self.setup,
+            solver: &self.solver,
+            uncertainty: &self.uncertainty,
+            residuals: &self.residuals,
+            steps: &self.steps,
+            places: self.contacts.places(),
+            dependences: &self.dependences,
+            doubts: (self.identification.as_ref()).map(|own| &*own.online.solution().doubts),
+            validity: ValidityCheck {
+                channels: &robot.channels,
+                faults: &self.inputs.faults,
+                first_fault: first_fault(&self.inputs.faults),
+                base_fault: self.base_fault,
+                lost: self.contacts.lost(),
+                detected: self.residuals.detected(),
+                unwatched: &self.unwatched,
+            },
+            unconfirmed: self.residuals.unconfirmed(&robot.structure),
+            stuck,
+            is_solved,
         };
-        let results = self
-            .solver
-            .torque()
-            .iter()
-            .zip(self.solver.torque_deviation())
-            .zip(self.propagation.torque_std())
-            .zip(self.solver.torque_certainty())
-            .zip(self.motion.torque_std())
-            .zip(self.place_errors.torque_std())
-            .zip(self.steps.torque());
-        let structure = &self.setup.robot.structure;
-        let residual = |number: usize| self.residuals.subtrees().nth(number);
-        // What a wrong offset does to one sub-tree, it does to the other one at that sensor.
-        let unconfirmed = self.residuals.unconfirmed(structure);
-        let doubted = |link: usize| {
-            let number = structure.subtree_of(link)?;
-            let sensors = structure.subtrees().get(number)?.sensors;
-            match residual(number)? {
-                own if own.is_unexplained => Some(Reason::Unexplained),
-                _ if !sensors.intersection(&unconfirmed).is_empty() => Some(Reason::Contradicted),
-                _ => None,
-            }
-        };
-        // An encoder that stands before a residual may be stuck: then no contact explains it.
-        let channels = &self.setup.robot.channels;
+        let joints = self.estimate.torques.joints.iter_mut();
+        for (to, dof) in joints.zip(robot.published()) {
+            *to = judge.torque(dof);
+        }
+        let contacts = self.estimate.contacts.contacts.iter_mut();
+        for (to, contact) in contacts.zip(0..self.solver.contacts().len()) {
+            *to = judge.contact(contact, active);
+        }
+        let residuals = self.estimate.contacts.residuals.iter_mut();
+        for (to, residual) in residuals.zip(self.residuals.subtrees()) {
+            *to = residual.published();
+        }
+    }
+
+    /// The joints whose encoders may be stuck. One that stands before a residual may be: then no
+    /// contact explains it.
+    fn stuck_encoders(&mut self) -> DofSet {
         let before = |is_one: fn(&SubtreeResidual) -> bool| {
             let balances = self.residuals.subtrees().zip(&self.dependences.subtrees);
             let balances = balances.filter(|(residual, _)| is_one(residual));
@@ -196,7 +181,7 @@ impl Pipeline {
         let disturbed = before(SubtreeResidual::is_disturbed);
         let unexplained = before(|residual| residual.is_unexplained);
         let mut stuck = DofSet::EMPTY;
-        for (channel, sanity) in channels.iter().zip(&mut self.sanity) {
+        for (channel, sanity) in self.setup.robot.channels.iter().zip(&mut self.sanity) {
             if let ChannelRole::Joint(dof) = channel.role {
                 sanity.suspect(unexplained.contains(dof));
                 if sanity.may_be_stuck(disturbed.contains(dof)) {
@@ -204,157 +189,178 @@ impl Pipeline {
                 }
             }
         }
-        let stuck = |dependence: &Dependence| {
-            let dof = dependence.dofs.intersection(&stuck).iter().next()?;
-            let role = ChannelRole::Joint(dof);
-            channels.iter().position(|channel| channel.role == role)
+        stuck
+    }
+}
+
+/// Says of each result whether it is valid, and if not, why.
+struct Judge<'a> {
+    setup: &'a Setup,
+    solver: &'a Solver,
+    uncertainty: &'a Uncertainty,
+    residuals: &'a ResidualMonitor,
+    steps: &'a StepCover,
+    /// Of the contacts.
+    places: &'a [Place],
+    dependences: &'a Dependences,
+    /// What on-line identification has not refuted, by degree of freedom.
+    doubts: Option<&'a [Doubt]>,
+    validity: ValidityCheck<'a>,
+    /// The sensors of the sub-trees whose model has not been confirmed without a contact.
+    unconfirmed: SensorSet,
+    /// The joints whose encoders may be stuck.
+    stuck: DofSet,
+    is_solved: bool,
+}
+
+impl Judge<'_> {
+    /// Why the residual of a link's sub-tree speaks against what acts on the link.
+    fn doubt(&self, link: usize) -> Option<Reason> {
+        let structure = &self.setup.robot.structure;
+        let number = structure.subtree_of(link)?;
+        let sensors = structure.subtrees().get(number)?.sensors;
+        let residual = self.residuals.subtrees().nth(number)?;
+        if residual.is_unexplained {
+            return Some(Reason::Unexplained);
+        }
+        // What a wrong offset does to one sub-tree, it does to the other one at that sensor.
+        let is_unconfirmed = !sensors.intersection(&self.unconfirmed).is_empty();
+        is_unconfirmed.then_some(Reason::Contradicted)
+    }
+
+    fn doubts(&self, dof: usize) -> Option<&Doubt> {
+        self.doubts?.get(dof)
+    }
+
+    /// The number of the channel with this role, for who reads the estimate.
+    fn channel(&self, role: ChannelRole) -> u32 {
+        let mut channels = self.setup.robot.channels.iter();
+        let number = channels.position(|channel| channel.role == role);
+        number.map_or(NO_CAUSE, |number| u32::try_from(number).unwrap_or(NO_CAUSE))
+    }
+
+    /// Why the torque of a degree of freedom is not valid, and the channel that causes it. The
+    /// deviation does not matter.
+    fn torque_reason(&self, dof: usize) -> (Reason, u32) {
+        let none = Dependence::default();
+        let dependence = self.dependences.torques.get(dof).unwrap_or(&none);
+        let (reason, cause) = self.validity.reason_and_cause(dependence);
+        if reason != Reason::None {
+            return (reason, cause);
+        }
+        if self.solver.torque_certainty().get(dof) == Some(&Certainty::Assumed) {
+            return (Reason::Undetermined, cause);
+        }
+        if let Some(leading) = self.doubts(dof).and_then(|doubt| doubt.leading.as_ref()) {
+            let channel = leading.role().map_or(NO_CAUSE, |role| self.channel(role));
+            return (Reason::Contradicted, channel);
+        }
+        let mut moved = self.setup.robot.structure.moved_by(dof).iter();
+        if let Some(reason) = moved.find_map(|link| self.doubt(*link)) {
+            return (reason, cause);
+        }
+        match dependence.dofs.intersection(&self.stuck).iter().next() {
+            Some(stuck) => (Reason::Frozen, self.channel(ChannelRole::Joint(stuck))),
+            None => (Reason::None, cause),
+        }
+    }
+
+    fn torque(&self, dof: usize) -> JointTorque {
+        let least = self.doubts(dof).map_or(0.0, |doubt| doubt.deviation);
+        let step = self.steps.torque().get(dof).copied().unwrap_or(0.0);
+        let own = self.uncertainty.torque(self.solver, dof);
+        let deviation = own.max(least).max(step);
+        let bound = self.setup.max_deviation.get(dof);
+        let (mut reason, mut cause) = self.torque_reason(dof);
+        let is_uncertain = bound.is_some_and(|most| deviation > *most) || least.is_infinite();
+        if reason == Reason::None && is_uncertain {
+            reason = Reason::Uncertain;
+        }
+        let torque = self.solver.torque().get(dof).copied();
+        let torque = torque.filter(|x| self.is_solved && x.is_finite() && !own.is_nan());
+        if torque.is_none() {
+            (reason, cause) = (Reason::NotFinite, NO_CAUSE);
+        }
+        let is_valid = reason == Reason::None;
+        // What is published keeps the bound, however it came about.
+        debug_assert!(
+            !is_valid || bound.is_none_or(|most| deviation <= *most),
+            "joint {dof} is valid, with a deviation of {deviation} Nm"
+        );
+        // Of an uncertain torque the deviation is the reason.
+        let has_deviation = is_valid || reason == Reason::Uncertain;
+        JointTorque {
+            torque: torque.filter(|_| is_valid).unwrap_or(f64::NAN),
+            standard_deviation: if has_deviation { deviation } else { f64::NAN },
+            valid: u32::from(is_valid),
+            reason: reason.in_memory(),
+            cause,
+            reserved: 0,
+        }
+    }
+
+    /// `active` are the contacts that are known to be present.
+    fn contact(&self, contact: usize, active: &ContactSet) -> ContactWrench {
+        let (Some(result), Some(dependence), Some(at)) = (
+            self.solver.contacts().get(contact),
+            self.dependences.contacts.get(contact),
+            self.places.get(contact),
+        ) else {
+            return ContactWrench::ABSENT;
         };
-        let moved = |dof: usize| structure.moved_by(dof).iter().copied();
-        let identification = self.identification.as_ref();
-        let doubts = identification.map(|own| &own.online.solution().doubts);
-        let robot = &self.setup.robot;
-        let results = (results.zip(&self.dependences.torques).enumerate())
-            .filter(|(dof, _)| robot.is_published(*dof));
-        for (
-            place,
-            (dof, (((((((torque, noise), model), certainty), motion), located), step), dependence)),
-        ) in self.estimate.torques.joints.iter_mut().zip(results)
-        {
-            let (mut reason, mut cause) = validity.reason_and_cause(dependence);
-            let doubt = doubts.and_then(|doubts| doubts.get(dof));
-            let least = doubt.map_or(0.0, |doubt| doubt.deviation);
-            let own = root_of_squares([*noise, *model, *motion, *located]);
-            let deviation = own.max(least).max(*step);
-            if reason == Reason::None && *certainty == Certainty::Assumed {
-                reason = Reason::Undetermined;
-            }
-            if reason == Reason::None
-                && let Some(leading) = doubt.and_then(|doubt| doubt.leading)
-            {
-                let channel = robot
-                    .channels
-                    .iter()
-                    .position(|c| Some(c.role) == leading.role());
-                let number = channel.and_then(|channel| u32::try_from(channel).ok());
-                (reason, cause) = (Reason::Contradicted, number.unwrap_or(NO_CAUSE));
-            }
-            if reason == Reason::None {
-                reason = moved(dof).find_map(doubted).unwrap_or_default();
-            }
-            if reason == Reason::None
-                && let Some(channel) = stuck(dependence)
-            {
-                let number = u32::try_from(channel).unwrap_or(NO_CAUSE);
-                (reason, cause) = (Reason::Frozen, number);
-            }
-            if reason == Reason::None
-                && self
-                    .setup
-                    .max_deviation
-                    .get(dof)
-                    .is_some_and(|most| deviation > *most)
-            {
-                reason = Reason::Uncertain;
-            }
-            if reason == Reason::None && least.is_infinite() {
-                reason = Reason::Uncertain;
-            }
-            if !is_solved || !torque.is_finite() || own.is_nan() {
-                (reason, cause) = (Reason::NotFinite, NO_CAUSE);
-            }
-            let is_valid = reason == Reason::None;
-            *place = JointTorque {
-                torque: if is_valid { *torque } else { f64::NAN },
-                // Of an uncertain torque the deviation is the reason.
-                standard_deviation: if is_valid || reason == Reason::Uncertain {
-                    deviation
-                } else {
-                    f64::NAN
-                },
-                valid: u32::from(is_valid),
-                reason: reason.in_memory(),
-                cause,
-                reserved: 0,
-            };
-            // What is published keeps the bound, however it came about.
-            debug_assert!(
-                place.valid == 0
-                    || (self.setup.max_deviation.get(dof))
-                        .is_none_or(|most| place.standard_deviation <= *most),
-                "joint {dof} is valid, with a deviation of {} Nm",
-                place.standard_deviation
-            );
+        let (mut reason, mut cause) = self.validity.reason_and_cause(dependence);
+        let specs = self.setup.robot.structure.contacts();
+        if reason == Reason::None {
+            let link = specs.get(contact).map(|spec| spec.frame.link);
+            reason = link.and_then(|link| self.doubt(link)).unwrap_or_default();
         }
-        let places = self
-            .estimate
-            .contacts
-            .contacts
-            .iter_mut()
-            .zip(&self.dependences.contacts);
-        let results = self
-            .solver
-            .contacts()
-            .iter()
-            .zip(self.propagation.contact_std());
-        let results = results
-            .zip(self.motion.contact_std())
-            .zip(self.place_errors.contact_std())
-            .zip(self.contacts.places());
-        let contacts = places.zip(results);
-        for (number, ((place, dependence), ((((result, model), motion), located), at))) in
-            contacts.enumerate()
-        {
-            let (mut reason, mut cause) = validity.reason_and_cause(dependence);
-            let link = structure.contacts().get(number).map(|spec| spec.frame.link);
-            if reason == Reason::None {
-                reason = link.and_then(doubted).unwrap_or_default();
-            }
-            // One that may still be there is not reported.
-            let is_known = detected.contains(number) || active.contains(number);
-            match result.certainty {
-                _ if !is_known => (reason, cause) = (Reason::Absent, NO_CAUSE),
-                Certainty::Absent => (reason, cause) = (Reason::Absent, NO_CAUSE),
-                Certainty::Assumed if reason == Reason::None => reason = Reason::Undetermined,
-                _ => {}
-            }
-            let deviation: [f64; 6] = std::array::from_fn(|i| {
-                let motion = motion.get(i).copied().unwrap_or(0.0);
-                root_of_squares([result.deviation[i], model[i], motion, located[i]])
-                    .max(self.steps.contact(number, result.wrench.force_first()[i]))
-            });
-            let is_finite = result.wrench.is_finite() && deviation.iter().all(|x| x.is_finite());
-            if !is_solved || !is_finite {
-                (reason, cause) = (Reason::NotFinite, NO_CAUSE);
-            }
-            let is_valid = reason == Reason::None;
-            let unless_withheld = |values| if is_valid { values } else { [f64::NAN; 6] };
-            let [fx, fy, fz, tx, ty, tz] = unless_withheld(result.wrench.force_first());
-            *place = ContactWrench {
-                force: [fx, fy, fz],
-                torque: [tx, ty, tz],
-                standard_deviation: unless_withheld(deviation),
-                valid: u32::from(is_valid),
-                reason: reason.in_memory(),
-                cause,
-                detected: u32::from(detected.contains(number)),
-                position: at.position.into(),
-                located: u32::from(at.is_located),
-                reserved: 0,
-            };
+        let is_detected = self.validity.detected.contains(contact);
+        // One that may still be there is not reported.
+        let is_known = is_detected || active.contains(contact);
+        match result.certainty {
+            _ if !is_known => (reason, cause) = (Reason::Absent, NO_CAUSE),
+            Certainty::Absent => (reason, cause) = (Reason::Absent, NO_CAUSE),
+            Certainty::Assumed if reason == Reason::None => reason = Reason::Undetermined,
+            _ => {}
         }
-        let places = self.estimate.contacts.residuals.iter_mut();
-        for (place, residual) in places.zip(self.residuals.subtrees()) {
-            let [fx, fy, fz, tx, ty, tz] = residual.wrench.force_first();
-            *place = Residual {
-                force: [fx, fy, fz],
-                torque: [tx, ty, tz],
-                significance: residual.significance,
-                contact: residual
-                    .contact
-                    .and_then(|contact| u32::try_from(contact).ok())
-                    .unwrap_or(NO_CONTACT),
-                unexplained: u32::from(residual.is_unexplained),
-            };
+        let wrench = result.wrench.force_first();
+        let own = self.uncertainty.contact(self.solver, contact);
+        let deviation: [f64; 6] =
+            std::array::from_fn(|i| own[i].max(self.steps.contact(contact, wrench[i])));
+        let is_finite = result.wrench.is_finite() && deviation.iter().all(|x| x.is_finite());
+        if !self.is_solved || !is_finite {
+            (reason, cause) = (Reason::NotFinite, NO_CAUSE);
+        }
+        let is_valid = reason == Reason::None;
+        let unless_withheld = |values| if is_valid { values } else { [f64::NAN; 6] };
+        let [fx, fy, fz, tx, ty, tz] = unless_withheld(wrench);
+        ContactWrench {
+            force: [fx, fy, fz],
+            torque: [tx, ty, tz],
+            standard_deviation: unless_withheld(deviation),
+            valid: u32::from(is_valid),
+            reason: reason.in_memory(),
+            cause,
+            detected: u32::from(is_detected),
+            position: at.position.into(),
+            located: u32::from(at.is_located),
+            reserved: 0,
+        }
+    }
+}
+
+impl SubtreeResidual {
+    fn published(&self) -> Residual {
+        let [fx, fy, fz, tx, ty, tz] = self.wrench.force_first();
+        Residual {
+            force: [fx, fy, fz],
+            torque: [tx, ty, tz],
+            significance: self.significance,
+            contact: self
+                .contact
+                .and_then(|contact| u32::try_from(contact).ok())
+                .unwrap_or(NO_CONTACT),
+            unexplained: u32::from(self.is_unexplained),
         }
     }
 }

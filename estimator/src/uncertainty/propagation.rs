@@ -55,15 +55,15 @@ mod vectors;
 
 pub use covariance::Covariance;
 
-use crate::propagation::covariance::{Drift, triangle};
-use crate::propagation::vectors::{
+use self::covariance::{Block, Drift, triangle};
+use self::vectors::{
     Calibrated, ColumnBlock, Covariance6, LANES, Lanes, Member, Root, add_covariance,
     add_independent, add_link, add_offset, add_reading, dot, numbers, project, splat, times,
     vectors, vectors_mut,
 };
 use std::ops::Range;
 
-use nalgebra::Matrix6;
+use nalgebra::{DMatrix, Matrix6};
 use proprio_topics::Nanos;
 use pulp::{Arch, Simd, WithSimd};
 
@@ -335,67 +335,32 @@ impl WithSimd for Update<'_> {
 
 impl SubtreeRoot {
     fn new(structure: &Structure, number: usize, covariance: &Covariance) -> Self {
-        let subtree = &structure.subtrees()[number];
         let numbers: Vec<usize> = structure.links_of(number).collect();
-        let place_of = |link: usize| numbers.iter().position(|&other| other == link);
-        let ends: Vec<End> = subtree
-            .sensors
-            .iter()
-            .map(|sensor| {
-                let cut = &structure.sensors()[sensor];
-                let child = cut.joint() + 1;
-                let is_above = structure.subtree_of(child) == Some(number);
-                let link = match is_above {
-                    true => child,
-                    false => structure.parent_of(child),
-                };
-                End {
-                    sensor,
-                    link,
-                    place: place_of(link).unwrap_or(0),
-                    is_positive: is_above == (cut.sign() > 0.0),
-                }
-            })
+        let place_of = |link: usize| {
+            let place = numbers.iter().position(|&other| other == link);
+            place.unwrap_or(0)
+        };
+        let sensors = structure.subtrees()[number].sensors.iter();
+        let ends: Vec<End> = sensors
+            .map(|sensor| End::new(structure, number, sensor, place_of))
             .collect();
         let (mut column_blocks, mut independent, mut rows) = (Vec::new(), Vec::new(), 0);
         for block in &covariance.blocks {
-            // Where the columns of each link and sensor of this sub-tree are in the block's root.
-            let mut members = Vec::new();
-            for end in &ends {
-                if let Some(i) = block.sensors.iter().position(|&s| s == end.sensor) {
-                    let first = LINK_PARAMETERS * block.links.len() + 6 * i;
-                    let mut own = LINK_PARAMETERS * block.links.len() + 6 * block.sensors.len();
-                    for (sensor, kind) in &block.calibrations {
-                        if *sensor == end.sensor {
-                            members.push((Member::Calibration, end.link, own..own + kind.count()));
-                        }
-                        own += kind.count();
-                    }
-                    members.push((
-                        Member::Sensor(end.sensor, end.is_positive),
-                        end.link,
-                        first..first + 6,
-                    ));
-                }
-            }
-            for &link in numbers.iter().rev() {
-                if let Some(i) = block.links.iter().position(|&l| l == link) {
-                    members.push((
-                        Member::Link(link),
-                        link,
-                        LINK_PARAMETERS * i..LINK_PARAMETERS * (i + 1),
-                    ));
-                }
-            }
-            let wanted: Vec<usize> = members
-                .iter()
-                .flat_map(|(_, _, columns)| columns.clone())
-                .collect();
+            let members = members(block, &ends, &numbers);
+            let wanted = members.iter().flat_map(|own| own.columns.clone());
+            let wanted: Vec<usize> = wanted.collect();
             if wanted.is_empty() || block.root.nrows() == 0 {
                 continue;
             }
             let root = triangle(block.root.select_columns(&wanted));
-            if let [(Member::Link(number), link, _)] = members.as_slice() {
+            if let [
+                BlockMember {
+                    what: Member::Link(number),
+                    link,
+                    ..
+                },
+            ] = members.as_slice()
+            {
                 let at = |i, j| {
                     if i < root.nrows() && i <= j {
                         root[(i, j)]
@@ -404,76 +369,13 @@ impl SubtreeRoot {
                     }
                 };
                 let own = std::array::from_fn(|i| std::array::from_fn(|j| at(i, j)));
-                independent.push((*number, place_of(*link).unwrap_or(0), Box::new(own)));
+                independent.push((*number, place_of(*link), Box::new(own)));
                 continue;
             }
-            let mut first = 0;
-            let mut calibration: Vec<Vec<Lanes>> = Vec::new();
-            for (what, link, columns) in members {
-                let end = (first + columns.len()).min(root.nrows());
-                let count = end.div_ceil(LANES);
-                // A value too large for single precision becomes infinite, and so does the
-                // deviation.
-                #[allow(clippy::cast_possible_truncation, reason = "single precision suffices")]
-                let at = |row: usize, column: usize| {
-                    if row < end {
-                        root[(row, column)] as f32
-                    } else {
-                        0.0
-                    }
-                };
-                let lanes_of = |column: usize| {
-                    (0..count)
-                        .map(move |chunk| std::array::from_fn(|i| at(LANES * chunk + i, column)))
-                };
-                let lanes = first..first + columns.len();
-                first += columns.len();
-                if what == Member::Calibration {
-                    calibration = lanes.map(|column| lanes_of(column).collect()).collect();
-                    continue;
-                }
-                let lanes: Vec<Lanes> = lanes.flat_map(lanes_of).collect();
-                let own = std::mem::take(&mut calibration);
-                let kind = block
-                    .calibrations
-                    .iter()
-                    .find(|(sensor, _)| matches!(what, Member::Sensor(own, _) if own == *sensor));
-                column_blocks.push(ColumnBlock {
-                    what,
-                    place: place_of(link).unwrap_or(0),
-                    rows: rows..rows + count,
-                    calibration: kind.map(|(_, kind)| {
-                        Box::new(Calibrated {
-                            offset: lanes.clone(),
-                            unknowns: kind.unknowns().zip(own).collect(),
-                        })
-                    }),
-                    columns: lanes,
-                });
-            }
+            column_blocks.extend(blocks_of(block, members, &root, rows, place_of));
             rows += root.nrows().div_ceil(LANES);
         }
-        let mut links: Vec<Link> = numbers
-            .iter()
-            .enumerate()
-            .map(|(place, &link)| Link {
-                link,
-                parent: if place == 0 {
-                    0
-                } else {
-                    place_of(structure.parent_of(link)).unwrap_or(0)
-                },
-                rows: 0..0,
-            })
-            .collect();
-        for column_block in &column_blocks {
-            let link = &mut links[column_block.place];
-            link.rows = hull(&link.rows, &column_block.rows);
-        }
-        for place in (1..links.len()).rev() {
-            let (parent, below) = (links[place].parent, links[place].rows.clone());
-            links[parent].rows = hull(&links[parent].rows, &below);
-        }
+        let links = links(structure, &numbers, &column_blocks, place_of);
         let below = match independent.is_empty() && ends.is_empty() {
             true => Vec::new(),
             false => vec![Covariance6::default(); links.len()],
@@ -674,6 +576,165 @@ impl SubtreeRoot {
         }
         axes
     }
+}
+
+impl End {
+    fn new(
+        structure: &Structure,
+        subtree: usize,
+        sensor: usize,
+        place_of: impl Fn(usize) -> usize,
+    ) -> Self {
+        let cut = &structure.sensors()[sensor];
+        let child = cut.joint() + 1;
+        let is_above = structure.subtree_of(child) == Some(subtree);
+        let link = match is_above {
+            true => child,
+            false => structure.parent_of(child),
+        };
+        Self {
+            sensor,
+            link,
+            place: place_of(link),
+            is_positive: is_above == (cut.sign() > 0.0),
+        }
+    }
+}
+
+/// A link or sensor of a sub-tree, in a block of the covariance.
+struct BlockMember {
+    what: Member,
+    link: usize,
+    /// Its columns of the block's root.
+    columns: Range<usize>,
+}
+
+/// Those of a sub-tree in a block: sensors first, the columns of a calibration before its
+/// sensor's, then links from the tips on.
+fn members(block: &Block, ends: &[End], links: &[usize]) -> Vec<BlockMember> {
+    let mut members = Vec::new();
+    let offsets = LINK_PARAMETERS * block.links.len();
+    for end in ends {
+        let Some(i) = block.sensors.iter().position(|&s| s == end.sensor) else {
+            continue;
+        };
+        let link = end.link;
+        let mut first = offsets + 6 * block.sensors.len();
+        for (sensor, kind) in &block.calibrations {
+            if *sensor == end.sensor {
+                let columns = first..first + kind.count();
+                members.push(BlockMember {
+                    what: Member::Calibration,
+                    link,
+                    columns,
+                });
+            }
+            first += kind.count();
+        }
+        let first = offsets + 6 * i;
+        members.push(BlockMember {
+            what: Member::Sensor(end.sensor, end.is_positive),
+            link,
+            columns: first..first + 6,
+        });
+    }
+    for &link in links.iter().rev() {
+        if let Some(i) = block.links.iter().position(|&l| l == link) {
+            members.push(BlockMember {
+                what: Member::Link(link),
+                link,
+                columns: LINK_PARAMETERS * i..LINK_PARAMETERS * (i + 1),
+            });
+        }
+    }
+    members
+}
+
+/// The columns of a block's members, `root` in single precision, whose rows begin at `rows`.
+fn blocks_of(
+    block: &Block,
+    members: Vec<BlockMember>,
+    root: &DMatrix<f64>,
+    rows: usize,
+    place_of: impl Fn(usize) -> usize,
+) -> Vec<ColumnBlock> {
+    let (mut blocks, mut first) = (Vec::new(), 0);
+    let mut calibration: Vec<Vec<Lanes>> = Vec::new();
+    for BlockMember {
+        what,
+        link,
+        columns,
+    } in members
+    {
+        let end = (first + columns.len()).min(root.nrows());
+        let count = end.div_ceil(LANES);
+        // A value too large for single precision becomes infinite, and so does the deviation.
+        #[allow(clippy::cast_possible_truncation, reason = "single precision suffices")]
+        let at = |row: usize, column: usize| {
+            if row < end {
+                root[(row, column)] as f32
+            } else {
+                0.0
+            }
+        };
+        let lanes_of = |column: usize| {
+            (0..count).map(move |chunk| std::array::from_fn(|i| at(LANES * chunk + i, column)))
+        };
+        let lanes = first..first + columns.len();
+        first += columns.len();
+        if what == Member::Calibration {
+            calibration = lanes.map(|column| lanes_of(column).collect()).collect();
+            continue;
+        }
+        let lanes: Vec<Lanes> = lanes.flat_map(lanes_of).collect();
+        let own = std::mem::take(&mut calibration);
+        let mut kinds = block.calibrations.iter();
+        let kind =
+            kinds.find(|(sensor, _)| matches!(what, Member::Sensor(own, _) if own == *sensor));
+        blocks.push(ColumnBlock {
+            what,
+            place: place_of(link),
+            rows: rows..rows + count,
+            calibration: kind.map(|(_, kind)| {
+                Box::new(Calibrated {
+                    offset: lanes.clone(),
+                    unknowns: kind.unknowns().zip(own).collect(),
+                })
+            }),
+            columns: lanes,
+        });
+    }
+    blocks
+}
+
+/// The links of a sub-tree, and the rows in which their wrenches are not zero.
+fn links(
+    structure: &Structure,
+    numbers: &[usize],
+    column_blocks: &[ColumnBlock],
+    place_of: impl Fn(usize) -> usize,
+) -> Vec<Link> {
+    let mut links: Vec<Link> = numbers
+        .iter()
+        .enumerate()
+        .map(|(place, &link)| Link {
+            link,
+            parent: match place {
+                0 => 0,
+                _ => place_of(structure.parent_of(link)),
+            },
+            rows: 0..0,
+        })
+        .collect();
+    for column_block in column_blocks {
+        let link = &mut links[column_block.place];
+        link.rows = hull(&link.rows, &column_block.rows);
+    }
+    for place in (1..links.len()).rev() {
+        let (parent, below) = (links[place].parent, links[place].rows.clone());
+        links[parent].rows = hull(&links[parent].rows, &below);
+    }
+    links
 }
 
 /// The smallest range that contains both.

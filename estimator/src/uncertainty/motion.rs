@@ -19,9 +19,9 @@
 //! those of the stamps, so that a replay which begins elsewhere gives the same. Errors of
 //! velocities are smaller by an order of magnitude and are neglected.
 
+use super::{Solution, sum_of_squares};
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::model::Model;
-use proprio_dynamics::spatial::{Pose, Wrench};
 use proprio_dynamics::{
     ContactKind, ContactSet, ContactSpec, DynamicsError, FrameMotion, JointState, Kinematics,
     Solver, Structure,
@@ -34,7 +34,7 @@ const POSTURE_PERIOD: Nanos = Nanos::from_millis(100);
 
 /// Standard deviation of an encoder's offset: revolute joint \[rad\], a third of a degree;
 /// prismatic joint \[m\].
-pub(super) const ENCODER_OFFSET_STD: [f64; 2] = [0.005, 0.001];
+const ENCODER_OFFSET_STD: [f64; 2] = [0.005, 0.001];
 
 /// Standard deviation of the base's proper acceleration, each axis \[m/s^2\]: a hundredth of
 /// gravity, or a tilt of 0.6 degrees.
@@ -46,22 +46,6 @@ const STEP: f64 = 1e-4;
 /// A contact that moves less than this \[m\], or turns less \[rad\], within a tenth of a second
 /// does not change S more than the motion of the robot does in that time.
 const JUMP: [f64; 2] = [0.01, 0.1];
-
-/// The point of linearisation: the inputs and the result of one estimate.
-pub(super) struct OperatingPoint<'a> {
-    pub(super) t: Nanos,
-    pub(super) model: &'a Model,
-    pub(super) structure: &'a Structure,
-    pub(super) state: JointState<'a>,
-    /// Motion of the base link; if an IMU measures it, the IMU's motion and its pose in the link.
-    pub(super) base: &'a FrameMotion,
-    pub(super) imu: Option<(&'a FrameMotion, &'a Pose)>,
-    pub(super) readings: &'a [Wrench],
-    pub(super) active: &'a ContactSet,
-    /// The solution, and the link where the kinematics start.
-    pub(super) solver: &'a Solver,
-    pub(super) base_link: usize,
-}
 
 /// Adds the squares of each column's first numbers, times its sigma.
 struct AddSquares<'a> {
@@ -103,6 +87,8 @@ pub(super) struct MotionErrors {
     solver: Solver,
     /// Standard deviations of x; zero where it is exact.
     sigma: Vec<f64>,
+    /// Of the encoders' offsets, by degree of freedom.
+    encoder_offset: Vec<f64>,
     /// S, column by column: torques, then six numbers per contact, then the imbalance of each
     /// sub-tree.
     sensitivity: Vec<f64>,
@@ -138,6 +124,9 @@ impl MotionErrors {
             kinematics: Kinematics::new(model, base_link)?,
             solver: Solver::new(structure),
             sigma,
+            encoder_offset: (0..dofs)
+                .map(|dof| ENCODER_OFFSET_STD[usize::from(model.is_prismatic(dof))])
+                .collect(),
             sensitivity: vec![0.0; columns * rows],
             is_known: vec![false; columns],
             valid_for: None,
@@ -149,46 +138,43 @@ impl MotionErrors {
         })
     }
 
-    /// Sets the standard deviations of a joint's acceleration and position.
-    pub(super) fn set_joint(&mut self, dof: usize, acceleration: f64, position: f64) {
-        if let [of_accelerations, of_positions] = self.joint_sigmas()
-            && let (Some(a), Some(q)) = (of_accelerations.get_mut(dof), of_positions.get_mut(dof))
-        {
-            (*a, *q) = (acceleration, position);
+    /// Sets the standard deviations of a joint's acceleration, and of its position beside the
+    /// encoder's offset.
+    pub(super) fn set_joint(&mut self, dof: usize, acceleration: f64, [a, b]: [f64; 2]) {
+        let (accelerations, rest) = self.sigma.split_at_mut(self.dofs);
+        if let (Some(to), Some(position), Some(offset)) = (
+            accelerations.get_mut(dof),
+            rest.get_mut(dof),
+            self.encoder_offset.get(dof),
+        ) {
+            *to = acceleration;
+            *position = sum_of_squares([*offset, a, b]).sqrt();
         }
     }
 
-    /// The standard deviations of all joint accelerations, and of all joint positions.
-    fn joint_sigmas(&mut self) -> [&mut [f64]; 2] {
-        let (accelerations, rest) = self.sigma.split_at_mut(self.dofs);
-        [accelerations, rest.get_mut(..self.dofs).unwrap_or_default()]
-    }
-
-    /// Sets what extrapolation adds to the standard deviations of the base's proper acceleration.
-    pub(super) fn set_proper(&mut self, extrapolation: &[f64; 3]) {
-        let places = self.sigma.iter_mut().skip(2 * self.dofs);
-        places
-            .zip(extrapolation)
-            .for_each(|(to, from)| *to = BASE_ACCELERATION_STD.hypot(*from));
-    }
-
-    /// Sets the standard deviations of the IMU's angular acceleration.
-    pub(super) fn set_angular(&mut self, deviation: &[f64; 3]) {
-        let places = self.sigma.iter_mut().rev();
-        places
-            .zip(deviation.iter().rev())
-            .for_each(|(to, from)| *to = *from);
+    /// Sets the standard deviations of an IMU's angular acceleration, and what extrapolation adds
+    /// to those of its proper acceleration.
+    pub(super) fn set_imu(&mut self, angular: &[f64; 3], extrapolation: &[f64; 3]) {
+        let base = self.sigma.get_mut(2 * self.dofs..).unwrap_or_default();
+        if let [px, py, pz, turn @ ..] = base {
+            for (to, from) in [px, py, pz].into_iter().zip(extrapolation) {
+                *to = BASE_ACCELERATION_STD.hypot(*from);
+            }
+            for (to, from) in turn.iter_mut().zip(angular) {
+                *to = *from;
+            }
+        }
     }
 
     /// Computes the standard deviations at an instant. Does not allocate.
     ///
     /// # Errors
     /// Sizes differ, or a number is not finite.
-    pub(super) fn update(&mut self, point: &OperatingPoint<'_>) -> Result<(), DynamicsError> {
+    pub(super) fn update(&mut self, point: &Solution<'_>) -> Result<(), DynamicsError> {
         self.deviation.fill(0.0);
         let key = Some((
             *point.active,
-            point.base_link,
+            point.kinematics.base(),
             point.t.0.div_euclid(POSTURE_PERIOD.0),
         ));
         let contacts = point.structure.contacts();
@@ -196,7 +182,8 @@ impl MotionErrors {
         if self.valid_for != key || pairs.any(|(before, now)| has_jumped(before, now)) {
             self.contacts.clone_from_slice(contacts);
             self.is_known.fill(false);
-            self.kinematics.set_base(point.model, point.base_link)?;
+            self.kinematics
+                .set_base(point.model, point.kinematics.base())?;
             self.valid_for = key;
         }
         for column in 0..self.is_known.len() {
@@ -220,7 +207,7 @@ impl MotionErrors {
     fn compute_sensitivity(
         &mut self,
         column: usize,
-        point: &OperatingPoint<'_>,
+        point: &Solution<'_>,
     ) -> Result<(), DynamicsError> {
         let dofs = self.dofs;
         let (accelerations, positions) = self.perturbed.split_at_mut(dofs);
@@ -318,12 +305,10 @@ impl MotionErrors {
         self.deviation.get(..self.dofs).unwrap_or_default()
     }
 
-    /// Standard deviations of each contact's wrench, `[fx fy fz tx ty tz]` [N, Nm].
-    pub(super) fn contact_std(&self) -> impl Iterator<Item = &[f64]> {
-        self.deviation
-            .get(self.dofs..)
-            .unwrap_or_default()
-            .chunks_exact(6)
+    /// Standard deviations of a contact's wrench, `[fx fy fz tx ty tz]` [N, Nm].
+    pub(super) fn contact_std(&self, contact: usize) -> Option<[f64; 6]> {
+        let (sixes, _) = self.deviation.get(self.dofs..)?.as_chunks();
+        sixes.get(contact).copied()
     }
 
     /// Covariance of a sub-tree's imbalance [torque; force], at the origin of base coordinates.
