@@ -36,7 +36,7 @@ const FULL_SCALE: (f64, f64) = (200.0, 15.0);
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct AidinAft200Options {
     /// Period \[ms\], 1 to 65; default 10.
     pub period_ms: u32,
     /// Identifier of the force; default 1.
@@ -45,7 +45,7 @@ pub struct Options {
     pub id_torque: u16,
 }
 
-impl Default for Options {
+impl Default for AidinAft200Options {
     fn default() -> Self {
         Self {
             period_ms: 10,
@@ -55,7 +55,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl AidinAft200Options {
     fn period(&self) -> Result<Nanos, SpecError> {
         match self.period_ms {
             1..=65 => Ok(Nanos::from_millis(i64::from(self.period_ms))),
@@ -88,7 +88,7 @@ fn number(spec: &Spec) -> Result<u8, SpecError> {
     keys::address(spec, 1..=254).map(|number| number as u8)
 }
 
-impl Driver for Options {
+impl Driver for AidinAft200Options {
     const NAME: &'static str = "aidin_aft200";
     const ADDRESS: Option<u32> = Some(1);
 
@@ -153,7 +153,7 @@ struct Aft {
 }
 
 impl Aft {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    fn device(spec: &Spec, options: &AidinAft200Options) -> Result<Box<dyn Device>, SpecError> {
         let number = number(spec)?;
         let (ids, period) = (options.ids()?, options.period()?);
         let [force, _] = ids;
@@ -241,7 +241,7 @@ impl AftBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an identifier, a number or a period out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &AidinAft200Options) -> Result<Self, SpecError> {
         Ok(Self {
             number: number(spec)?,
             ids: options.ids()?,

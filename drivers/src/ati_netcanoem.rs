@@ -10,7 +10,7 @@ mod recognise;
 
 pub use board::NetcanoemBoard;
 pub use frames::{ForceUnit, TorqueUnit};
-pub use options::Options;
+pub use options::AtiNetcanoemOptions;
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
@@ -19,7 +19,7 @@ use alloc::vec::Vec;
 use frames::BASE_MOST;
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for AtiNetcanoemOptions {
     const NAME: &'static str = "ati_netcanoem";
     const ADDRESS: Option<u32> = Some(0x20);
 

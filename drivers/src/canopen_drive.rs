@@ -8,7 +8,7 @@ mod options;
 mod start;
 
 pub use board::DriveBoard;
-pub use options::{CurrentUnit, Options, PdoKeys, VelocityUnit};
+pub use options::{CanopenDriveOptions, CurrentUnit, PdoKeys, VelocityUnit};
 
 use crate::canopen::{self, Recognised};
 use crate::objects::Objects;
@@ -19,7 +19,7 @@ use alloc::format;
 use alloc::vec::Vec;
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for CanopenDriveOptions {
     const NAME: &'static str = "canopen_drive";
 
     fn outputs(&self) -> Vec<OutputInfo> {

@@ -40,7 +40,7 @@ const BY_EVENT: u8 = 254;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct CanopenEncoderOptions {
     /// Period \[ms\], 1 to 65535; default 10.
     pub period_ms: u32,
     /// Counts per turn; default the node's own.
@@ -56,7 +56,7 @@ pub struct Options {
     pub objects: Option<Objects>,
 }
 
-impl Default for Options {
+impl Default for CanopenEncoderOptions {
     fn default() -> Self {
         Self {
             period_ms: 10,
@@ -69,7 +69,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl CanopenEncoderOptions {
     fn check(&self) -> Result<(), SpecError> {
         let (key, value, expected) = if !(1..=65_535).contains(&self.period_ms) {
             ("period_ms", f64::from(self.period_ms), "1 to 65535")
@@ -111,7 +111,7 @@ struct Place {
 impl Place {
     /// As the driver maps it, or as the file says of a node that it does not map: those that a SYNC
     /// causes first, and of these the one that most SYNCs cause.
-    fn all(node: u8, options: &Options) -> Result<ArrayVec<Self, 4>, SpecError> {
+    fn all(node: u8, options: &CanopenEncoderOptions) -> Result<ArrayVec<Self, 4>, SpecError> {
         let name = options.eds.as_deref().unwrap_or_default();
         let mut places = ArrayVec::new();
         match &options.objects {
@@ -182,7 +182,7 @@ fn position_of(pdo: &Pdo) -> Option<Bits> {
     Bits::new(first, length, false)
 }
 
-impl Driver for Options {
+impl Driver for CanopenEncoderOptions {
     const NAME: &'static str = "canopen_encoder";
 
     fn outputs(&self) -> Vec<OutputInfo> {
@@ -241,7 +241,7 @@ impl Driver for Options {
 #[derive(Debug)]
 struct Start {
     node: u8,
-    options: Options,
+    options: CanopenEncoderOptions,
     scaled: bool,
     counts_per_turn: Option<f64>,
     /// Those of the file, if the node is not asked.
@@ -372,7 +372,7 @@ struct Encoder {
 }
 
 impl Encoder {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    fn device(spec: &Spec, options: &CanopenEncoderOptions) -> Result<Box<dyn Device>, SpecError> {
         options.check()?;
         let node = node_of(spec)?;
         canopen::check_file(node, options.objects.as_ref())?;
@@ -503,7 +503,7 @@ impl EncoderBoard {
     /// # Errors
     /// [`SpecError`]: a node outside 1 to 127, a key out of range.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // casts saturate
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &CanopenEncoderOptions) -> Result<Self, SpecError> {
         options.check()?;
         let id = node_of(spec)?;
         canopen::check_file(id, options.objects.as_ref())?;

@@ -16,18 +16,18 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct CanopenSyncOptions {
     /// Period \[ms\], 0.5 to 1000; default 10.
     pub period_ms: f64,
 }
 
-impl Default for Options {
+impl Default for CanopenSyncOptions {
     fn default() -> Self {
         Self { period_ms: 10.0 }
     }
 }
 
-impl Options {
+impl CanopenSyncOptions {
     fn period(&self, spec: &Spec) -> Result<Nanos, SpecError> {
         let key = |expected| SpecError::Key {
             key: "period_ms",
@@ -45,7 +45,7 @@ impl Options {
     }
 }
 
-impl Driver for Options {
+impl Driver for CanopenSyncOptions {
     const NAME: &'static str = "canopen_sync";
     const ADDRESS: Option<u32> = Some(0);
 

@@ -8,7 +8,7 @@ mod options;
 mod recognise;
 
 pub use board::CubemarsBoard;
-pub use options::{Angle, Effort, Mode, Model, Options};
+pub use options::{Angle, CubemarsOptions, Effort, Mode, Model};
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
@@ -18,7 +18,7 @@ use device::Motor;
 use frames::{DRIVE, JOINT};
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for CubemarsOptions {
     const NAME: &'static str = "cubemars";
 
     fn outputs(&self) -> Vec<OutputInfo> {

@@ -9,7 +9,7 @@ mod ranges;
 mod recognise;
 
 pub use board::DamiaoBoard;
-pub use options::{Model, Options};
+pub use options::{DamiaoOptions, Model};
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
@@ -19,7 +19,7 @@ use device::Motor;
 use frames::{FET, JOINT, MOTOR};
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for DamiaoOptions {
     const NAME: &'static str = "damiao";
 
     fn needs_fd(&self) -> bool {

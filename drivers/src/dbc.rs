@@ -7,7 +7,7 @@ mod layout;
 mod options;
 
 pub use board::DbcBoard;
-pub use options::{Options, ReadingKeys};
+pub use options::{DbcOptions, ReadingKeys};
 
 use crate::signal::Message;
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
@@ -16,7 +16,7 @@ use alloc::boxed::Box;
 use alloc::vec::Vec;
 use device::DbcDevice;
 
-impl Driver for Options {
+impl Driver for DbcOptions {
     const NAME: &'static str = "dbc";
     const ADDRESS: Option<u32> = Some(0);
 

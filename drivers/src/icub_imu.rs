@@ -9,7 +9,7 @@ mod recognise;
 
 pub use board::ImuBoard;
 pub use frames::{Fusion, Legacy, Quantity};
-pub use options::Options;
+pub use options::IcubImuOptions;
 
 use crate::icub;
 use crate::recognise::{Finding, Traffic};
@@ -19,7 +19,7 @@ use alloc::vec::Vec;
 use device::ImuDevice;
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for IcubImuOptions {
     const NAME: &'static str = "icub_imu";
 
     fn outputs(&self) -> Vec<OutputInfo> {

@@ -29,14 +29,14 @@ const RESOLUTION: u8 = 2;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct IcubMaisOptions {
     /// Period \[ms\], 1 to 255; default 10.
     pub period_ms: u32,
     /// Silence kept after power-on \[ms\]; default 0.
     pub power_on_silence_ms: u32,
 }
 
-impl Default for Options {
+impl Default for IcubMaisOptions {
     fn default() -> Self {
         Self {
             period_ms: 10,
@@ -45,7 +45,7 @@ impl Default for Options {
     }
 }
 
-impl Driver for Options {
+impl Driver for IcubMaisOptions {
     const NAME: &'static str = "icub_mais";
 
     fn outputs(&self) -> Vec<OutputInfo> {
@@ -100,7 +100,7 @@ struct Mais {
 }
 
 impl Mais {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    fn device(spec: &Spec, options: &IcubMaisOptions) -> Result<Box<dyn Device>, SpecError> {
         let address = icub::address(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let timing = icub::timing(options.power_on_silence_ms)?;
@@ -179,7 +179,7 @@ impl MaisBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an address outside 1 to 14, a period out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &IcubMaisOptions) -> Result<Self, SpecError> {
         let ms = icub::period_ms("period_ms", options.period_ms)?;
         Ok(Self {
             address: icub::address(spec)?,

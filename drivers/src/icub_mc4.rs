@@ -54,7 +54,7 @@ const MODES: [u8; 8] = [0x00, 0x01, 0x02, 0x03, 0x50, 0x60, 0xA0, 0xB0];
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct IcubMc4Options {
     /// Ticks in a turn of each joint; default 65536.
     pub ticks_per_turn: [f64; JOINTS],
     /// How many bits a velocity is shifted, 0 to 15; default 5.
@@ -65,7 +65,7 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for IcubMc4Options {
     fn default() -> Self {
         Self {
             ticks_per_turn: [65536.0; JOINTS],
@@ -83,7 +83,7 @@ struct Scale {
     velocity: f64,
 }
 
-impl Options {
+impl IcubMc4Options {
     fn scales(&self) -> Result<[Scale; JOINTS], SpecError> {
         let wrong = |key, value, expected| SpecError::Key {
             key,
@@ -113,7 +113,7 @@ impl Options {
     }
 }
 
-impl Driver for Options {
+impl Driver for IcubMc4Options {
     const NAME: &'static str = "icub_mc4";
 
     fn outputs(&self) -> Vec<OutputInfo> {
@@ -189,7 +189,7 @@ struct Mc4 {
 }
 
 impl Mc4 {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    fn device(spec: &Spec, options: &IcubMc4Options) -> Result<Box<dyn Device>, SpecError> {
         let address = icub::address(spec)?;
         icub::period_ms("period_ms", options.period_ms)?;
         let joints = options.scales()?.map(|scale| Joint {
@@ -320,7 +320,7 @@ impl Mc4Board {
     ///
     /// # Errors
     /// [`SpecError`]: an address outside 1 to 14, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &IcubMc4Options) -> Result<Self, SpecError> {
         let period = icub::period_ms("period_ms", options.period_ms)?;
         Ok(Self {
             address: icub::address(spec)?,

@@ -97,14 +97,14 @@ const DUTY_PER_LSB: f64 = 1.0 / 32000.0;
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct IcubMotorOptions {
     /// Period of its commander's requests \[ms\], 1 to 255; default 1.
     pub period_ms: u32,
     /// Whether readings contain the board's velocity; default true.
     pub velocity: bool,
 }
 
-impl Default for Options {
+impl Default for IcubMotorOptions {
     fn default() -> Self {
         Self {
             period_ms: 1,
@@ -113,7 +113,7 @@ impl Default for Options {
     }
 }
 
-impl Driver for Options {
+impl Driver for IcubMotorOptions {
     const NAME: &'static str = "icub_motor";
 
     fn outputs(&self) -> Vec<OutputInfo> {
@@ -186,7 +186,7 @@ struct Motor {
 }
 
 impl Motor {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    fn device(spec: &Spec, options: &IcubMotorOptions) -> Result<Box<dyn Device>, SpecError> {
         let address = icub::address(spec)?;
         icub::period_ms("period_ms", options.period_ms)?;
         let kinds = [
@@ -288,7 +288,7 @@ impl MotorBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an address outside 1 to 14, a period out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &IcubMotorOptions) -> Result<Self, SpecError> {
         let period =
             Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
         Ok(Self {

@@ -110,7 +110,7 @@ impl Sensor {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct IcubPosOptions {
     /// Period \[ms\], 1 to 255; default 10.
     pub period_ms: u32,
     /// The quantity that the board sends; default angles.
@@ -121,7 +121,7 @@ pub struct Options {
     pub sensors: Option<Vec<Sensor>>,
 }
 
-impl Default for Options {
+impl Default for IcubPosOptions {
     fn default() -> Self {
         Self {
             period_ms: 10,
@@ -132,7 +132,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl IcubPosOptions {
     /// The bytes of POS_CONFIG_SET, if the sensors are to be configured.
     fn configuration(&self) -> Result<Option<[u8; 8]>, SpecError> {
         let Some(sensors) = &self.sensors else {
@@ -163,7 +163,7 @@ impl Options {
     }
 }
 
-impl Driver for Options {
+impl Driver for IcubPosOptions {
     const NAME: &'static str = "icub_pos";
 
     fn outputs(&self) -> Vec<OutputInfo> {
@@ -242,7 +242,7 @@ struct Pos {
 }
 
 impl Pos {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    fn device(spec: &Spec, options: &IcubPosOptions) -> Result<Box<dyn Device>, SpecError> {
         let address = icub::address(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let timing = icub::timing(options.power_on_silence_ms)?;
@@ -353,7 +353,7 @@ impl PosBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an address outside 1 to 14, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &IcubPosOptions) -> Result<Self, SpecError> {
         options.configuration()?;
         let period =
             Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));

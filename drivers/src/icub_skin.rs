@@ -60,7 +60,7 @@ impl Compensation {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct IcubSkinOptions {
     /// Period \[ms\], 1 to 255; default 50.
     pub period_ms: u32,
     /// First and last triangle; default 0 and 15.
@@ -75,7 +75,7 @@ pub struct Options {
     pub power_on_silence_ms: u32,
 }
 
-impl Default for Options {
+impl Default for IcubSkinOptions {
     fn default() -> Self {
         Self {
             period_ms: 50,
@@ -88,7 +88,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl IcubSkinOptions {
     fn check(&self) -> Result<(), SpecError> {
         match self.triangles {
             [first, last] if first <= last && usize::from(last) < TRIANGLES => Ok(()),
@@ -100,7 +100,7 @@ impl Options {
     }
 }
 
-impl Driver for Options {
+impl Driver for IcubSkinOptions {
     const NAME: &'static str = "icub_skin";
 
     fn outputs(&self) -> Vec<OutputInfo> {
@@ -160,7 +160,7 @@ struct Patch {
 }
 
 impl Patch {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    fn device(spec: &Spec, options: &IcubSkinOptions) -> Result<Box<dyn Device>, SpecError> {
         options.check()?;
         let address = icub::address(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
@@ -299,7 +299,7 @@ impl SkinBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an address outside 1 to 14, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &IcubSkinOptions) -> Result<Self, SpecError> {
         options.check()?;
         let ms = icub::period_ms("period_ms", options.period_ms)?;
         Ok(Self {

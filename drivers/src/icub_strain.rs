@@ -8,7 +8,7 @@ mod frames;
 mod options;
 
 pub use board::StrainBoard;
-pub use options::{Options, Stream};
+pub use options::{IcubStrainOptions, Stream};
 
 use crate::icub::{self, board as boards, class};
 use crate::recognise::{self, Finding, Key, Traffic};
@@ -19,7 +19,7 @@ use device::Strain;
 use frames::kind;
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for IcubStrainOptions {
     const NAME: &'static str = "icub_strain";
 
     fn outputs(&self) -> Vec<OutputInfo> {

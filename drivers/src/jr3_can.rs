@@ -9,7 +9,7 @@ mod recognise;
 mod scales;
 
 pub use board::Jr3Board;
-pub use options::Options;
+pub use options::Jr3CanOptions;
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
@@ -18,7 +18,7 @@ use alloc::vec::Vec;
 use device::Jr3;
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for Jr3CanOptions {
     const NAME: &'static str = "jr3_can";
     const ADDRESS: Option<u32> = Some(1);
 

@@ -50,14 +50,14 @@ const TOO_HOT: f64 = 38.0;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct MoteusOptions {
     /// Period of the queries \[ms\], 1 to 1000; default 2.
     pub period_ms: u32,
     /// The host's own address; default 0.
     pub host: u8,
 }
 
-impl Default for Options {
+impl Default for MoteusOptions {
     fn default() -> Self {
         Self {
             period_ms: 2,
@@ -66,7 +66,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl MoteusOptions {
     /// The controller's address and the period.
     fn check(&self, spec: &Spec) -> Result<(u8, Nanos), SpecError> {
         let address = spec.address;
@@ -94,7 +94,7 @@ impl Options {
     }
 }
 
-impl Driver for Options {
+impl Driver for MoteusOptions {
     const NAME: &'static str = "moteus";
     const ADDRESS: Option<u32> = Some(1);
     fn needs_fd(&self) -> bool {
@@ -356,7 +356,7 @@ struct Controller {
 }
 
 impl Controller {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    fn device(spec: &Spec, options: &MoteusOptions) -> Result<Box<dyn Device>, SpecError> {
         let (node, period) = options.check(spec)?;
         let reply = id(node, options.host, 0);
         let query = id(options.host, node, WANTED);
@@ -501,7 +501,7 @@ impl MoteusBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an address outside 1 to 127, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &MoteusOptions) -> Result<Self, SpecError> {
         Ok(Self {
             node: options.check(spec)?.0,
             host: options.host,

@@ -9,7 +9,7 @@ mod recognise;
 
 pub use board::MyactuatorBoard;
 pub use frames::Protocol;
-pub use options::{Options, Position};
+pub use options::{MyactuatorOptions, Position};
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
@@ -19,7 +19,7 @@ use device::Motor;
 use frames::{JOINT, MOTOR};
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for MyactuatorOptions {
     const NAME: &'static str = "myactuator";
     const ASKED_BY_NAME: bool = true;
 

@@ -10,7 +10,7 @@ mod recognise;
 
 pub use board::OdriveBoard;
 pub use firmware::{Firmware, error_words};
-pub use options::Options;
+pub use options::OdriveOptions;
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
@@ -20,7 +20,7 @@ use device::Axis;
 use frames::{FET, JOINT, MOTOR, NODE_MOST};
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for OdriveOptions {
     const NAME: &'static str = "odrive";
 
     fn outputs(&self) -> Vec<OutputInfo> {

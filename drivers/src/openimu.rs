@@ -9,7 +9,7 @@ mod recognise;
 
 pub use board::OpenImuBoard;
 pub use frames::{Axes, Quantity, Upright};
-pub use options::Options;
+pub use options::OpenImuOptions;
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
@@ -19,7 +19,7 @@ use device::Sensor;
 use frames::{ADDRESSES, DELIVERED};
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for OpenImuOptions {
     const NAME: &'static str = "openimu";
     const ADDRESS: Option<u32> = Some(DELIVERED);
 

@@ -8,7 +8,7 @@ mod protocol;
 mod recognise;
 
 pub use board::OptoBoard;
-pub use options::Options;
+pub use options::OptoforceDaqOptions;
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
@@ -17,7 +17,7 @@ use alloc::vec::Vec;
 use device::Opto;
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for OptoforceDaqOptions {
     const NAME: &'static str = "optoforce_daq";
     const ADDRESS: Option<u32> = Some(0x100);
 

@@ -24,20 +24,20 @@ pub enum OptionsError<E> {
 }
 
 macro_rules! drivers {
-    ($($(#[$doc:meta])* $variant:ident: $module:ident,)+) => {
+    ($($(#[$doc:meta])* $variant:ident: $module:ident::$options:ident,)+) => {
         /// The names of all drivers, as gateway.toml writes them.
-        pub const DRIVERS: &[&str] = &[$(<$module::Options as Driver>::NAME),+];
+        pub const DRIVERS: &[&str] = &[$(<$module::$options as Driver>::NAME),+];
 
         /// Each driver, and whether its questions are sent only if it is named
         /// ([`Driver::ASKED_BY_NAME`]).
         pub const ASKED_BY_NAME: &[(&str, bool)] = &[
-            $((<$module::Options as Driver>::NAME, <$module::Options as Driver>::ASKED_BY_NAME),)+
+            $((<$module::$options as Driver>::NAME, <$module::$options as Driver>::ASKED_BY_NAME),)+
         ];
 
         /// What nothing in `seen` refutes, however little speaks for it; the most probable first.
         fn suspect(seen: &Traffic) -> Vec<Finding> {
             let mut all = Vec::new();
-            $(all.extend(<$module::Options as Driver>::recognise(seen));)+
+            $(all.extend(<$module::$options as Driver>::recognise(seen));)+
             recognise::together(seen, all)
         }
 
@@ -70,11 +70,11 @@ macro_rules! drivers {
                 let mut others = there.iter().filter(|finding| finding.driver != driver);
                 others.any(|other| other.commands.iter().any(|c| c.contains(&question.id)))
             };
-            $(if !<$module::Options as Driver>::ASKED_BY_NAME
-                || named.contains(&<$module::Options as Driver>::NAME)
+            $(if !<$module::$options as Driver>::ASKED_BY_NAME
+                || named.contains(&<$module::$options as Driver>::NAME)
             {
-                let driver = <$module::Options as Driver>::NAME;
-                for question in <$module::Options as Driver>::questions(seen) {
+                let driver = <$module::$options as Driver>::NAME;
+                for question in <$module::$options as Driver>::questions(seen) {
                     if !all.contains(&question) && !is_command(driver, &question) {
                         all.push(question);
                     }
@@ -87,8 +87,8 @@ macro_rules! drivers {
         #[cfg(test)]
         fn schemas() -> Vec<(&'static str, serde_json::Value)> {
             [$((
-                <$module::Options as Driver>::NAME,
-                crate::schema::of::<$module::Options>(),
+                <$module::$options as Driver>::NAME,
+                crate::schema::of::<$module::$options>(),
             )),+].into()
         }
 
@@ -96,7 +96,7 @@ macro_rules! drivers {
         #[derive(Debug, Clone, PartialEq)]
         #[non_exhaustive]
         pub enum Options {
-            $($(#[$doc])* $variant($module::Options),)+
+            $($(#[$doc])* $variant($module::$options),)+
         }
 
         impl Options {
@@ -109,8 +109,8 @@ macro_rules! drivers {
                 driver: &str,
                 keys: D,
             ) -> Result<Self, OptionsError<D::Error>> {
-                $(if driver == <$module::Options as Driver>::NAME {
-                    return $module::Options::deserialize(keys)
+                $(if driver == <$module::$options as Driver>::NAME {
+                    return <$module::$options>::deserialize(keys)
                         .map(Self::$variant)
                         .map_err(OptionsError::Keys);
                 })+
@@ -121,7 +121,7 @@ macro_rules! drivers {
             #[must_use]
             pub const fn default_address(&self) -> Option<u32> {
                 match self {
-                    $(Self::$variant(_) => <$module::Options as Driver>::ADDRESS,)+
+                    $(Self::$variant(_) => <$module::$options as Driver>::ADDRESS,)+
                 }
             }
 
@@ -206,55 +206,55 @@ macro_rules! drivers {
 
 drivers! {
     /// iCub F/T boards.
-    IcubStrain: icub_strain,
+    IcubStrain: icub_strain::IcubStrainOptions,
     /// iCub IMUs.
-    IcubImu: icub_imu,
+    IcubImu: icub_imu::IcubImuOptions,
     /// iCub 2FOC motor boards.
-    IcubMotor: icub_motor,
+    IcubMotor: icub_motor::IcubMotorOptions,
     /// Older iCub motor boards.
-    IcubMc4: icub_mc4,
+    IcubMc4: icub_mc4::IcubMc4Options,
     /// iCub POS encoders.
-    IcubPos: icub_pos,
+    IcubPos: icub_pos::IcubPosOptions,
     /// iCub skin.
-    IcubSkin: icub_skin,
+    IcubSkin: icub_skin::IcubSkinOptions,
     /// iCub Hall sensors.
-    IcubMais: icub_mais,
+    IcubMais: icub_mais::IcubMaisOptions,
     /// ATI F/T sensors.
-    AtiNetcanoem: ati_netcanoem,
+    AtiNetcanoem: ati_netcanoem::AtiNetcanoemOptions,
     /// CANopen drives.
-    CanopenDrive: canopen_drive,
+    CanopenDrive: canopen_drive::CanopenDriveOptions,
     /// CANopen encoders.
-    CanopenEncoder: canopen_encoder,
+    CanopenEncoder: canopen_encoder::CanopenEncoderOptions,
     /// The SYNC of a CANopen bus.
-    CanopenSync: canopen_sync,
+    CanopenSync: canopen_sync::CanopenSyncOptions,
     /// moteus controllers.
-    Moteus: moteus,
+    Moteus: moteus::MoteusOptions,
     /// ODrive motor controllers.
-    Odrive: odrive,
+    Odrive: odrive::OdriveOptions,
     /// CubeMars actuators.
-    Cubemars: cubemars,
+    Cubemars: cubemars::CubemarsOptions,
     /// Damiao actuators.
-    Damiao: damiao,
+    Damiao: damiao::DamiaoOptions,
     /// MyActuator RMD actuators.
-    Myactuator: myactuator,
+    Myactuator: myactuator::MyactuatorOptions,
     /// RobStride actuators and CyberGear.
-    Robstride: robstride,
+    Robstride: robstride::RobstrideOptions,
     /// VESC motor controllers.
-    Vesc: vesc,
+    Vesc: vesc::VescOptions,
     /// Xsens MTi.
-    XsensMti: xsens_mti,
+    XsensMti: xsens_mti::XsensMtiOptions,
     /// Aceinna OpenIMU and MTLT.
-    OpenImu: openimu,
+    OpenImu: openimu::OpenImuOptions,
     /// Robotous RFT force/torque sensors.
-    RobotousRft: robotous_rft,
+    RobotousRft: robotous_rft::RobotousRftOptions,
     /// AIDIN AFT200 force/torque sensors.
-    AidinAft200: aidin_aft200,
+    AidinAft200: aidin_aft200::AidinAft200Options,
     /// JR3 force/torque sensors.
-    Jr3Can: jr3_can,
+    Jr3Can: jr3_can::Jr3CanOptions,
     /// OptoForce force sensors.
-    OptoforceDaq: optoforce_daq,
+    OptoforceDaq: optoforce_daq::OptoforceDaqOptions,
     /// Devices that a .dbc file describes.
-    Dbc: dbc,
+    Dbc: dbc::DbcOptions,
 }
 
 /// Checks that the joints of `spec` are outputs of the driver, and that one that measures joints

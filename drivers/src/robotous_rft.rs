@@ -9,7 +9,7 @@ mod protocol;
 mod recognise;
 
 pub use board::RftBoard;
-pub use options::{Model, Options};
+pub use options::{Model, RobotousRftOptions};
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
@@ -18,7 +18,7 @@ use alloc::vec::Vec;
 use device::Rft;
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for RobotousRftOptions {
     const NAME: &'static str = "robotous_rft";
     const ADDRESS: Option<u32> = Some(0x64);
 

@@ -8,7 +8,7 @@ mod options;
 mod recognise;
 
 pub use board::RobstrideBoard;
-pub use options::{Model, Options, Protocol};
+pub use options::{Model, Protocol, RobstrideOptions};
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, Frame, OutputInfo, Spec, SpecError};
@@ -18,7 +18,7 @@ use device::Motor;
 use frames::{JOINT, MOTOR};
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for RobstrideOptions {
     const NAME: &'static str = "robstride";
     const ASKED_BY_NAME: bool = true;
 

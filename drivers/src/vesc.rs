@@ -8,7 +8,7 @@ mod options;
 mod recognise;
 
 pub use board::VescBoard;
-pub use options::{Options, Position};
+pub use options::{Position, VescOptions};
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
@@ -18,7 +18,7 @@ use device::Controller;
 use frames::{FET, JOINT, MOTOR};
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for VescOptions {
     const NAME: &'static str = "vesc";
 
     fn outputs(&self) -> Vec<OutputInfo> {

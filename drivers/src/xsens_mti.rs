@@ -9,7 +9,7 @@ mod recognise;
 
 pub use board::MtiBoard;
 pub use frames::{HighRate, Message};
-pub use options::Options;
+pub use options::XsensMtiOptions;
 
 use crate::recognise::{Finding, Traffic};
 use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
@@ -18,7 +18,7 @@ use alloc::vec::Vec;
 use device::Mti;
 use proprio_topics::Kind;
 
-impl Driver for Options {
+impl Driver for XsensMtiOptions {
     const NAME: &'static str = "xsens_mti";
     const ADDRESS: Option<u32> = Some(0);
 

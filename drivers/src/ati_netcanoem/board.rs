@@ -1,7 +1,7 @@
 //! The board's own side: tells its calibration, and answers requests with the gauges of its load.
 
 use super::frames::{STATUS_ANY, id, opcode, opcode_of};
-use super::options::Options;
+use super::options::AtiNetcanoemOptions;
 use crate::calibration::inverse;
 use crate::{Board, EncodeError, Format, Frame, Frames, Spec, SpecError, bytes};
 use proprio_topics::{Nanos, Quality, Reading, Wrench};
@@ -42,7 +42,7 @@ impl NetcanoemBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an address above 127, a key out of range, a matrix that is singular.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &AtiNetcanoemOptions) -> Result<Self, SpecError> {
         let (base, _) = options.check(spec)?;
         let matrix = options.matrix.as_deref().copied().unwrap_or(MATRIX);
         let counts = options.counts().unwrap_or(COUNTS);

@@ -2,7 +2,7 @@
 //! answers, or from its answers to another program.
 
 use super::frames::{ForceUnit, TorqueUnit, id, opcode};
-use super::options::{Options, is_row};
+use super::options::{AtiNetcanoemOptions, is_row};
 use crate::bringup::{Ask, Attempts, Inquiry, Timing};
 use crate::bytes::u32_be;
 use crate::{Decoded, Frame, Mode, NotSent};
@@ -59,7 +59,7 @@ pub(super) struct Calibration {
 }
 
 impl Calibration {
-    pub(super) fn new(base: u8, mode: Mode, options: &Options) -> Self {
+    pub(super) fn new(base: u8, mode: Mode, options: &AtiNetcanoemOptions) -> Self {
         let (counts, units) = (options.counts(), options.units());
         let configured = [counts.is_some(), units.is_some(), options.matrix.is_some()];
         let mut this = Self {

@@ -2,7 +2,7 @@
 
 use super::calibration::{Calibration, TIMING};
 use super::frames::{STATUS_ANY, STATUS_BUS, STATUS_FAULTS, id, opcode, opcode_of};
-use super::options::Options;
+use super::options::AtiNetcanoemOptions;
 use crate::bringup::Bringup;
 use crate::bytes::{self, i16_be, u16_be};
 use crate::family::{Family, Link, Supervised, next_in_step};
@@ -60,7 +60,10 @@ pub(super) struct Netcanoem {
 }
 
 impl Netcanoem {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &AtiNetcanoemOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         let (base, period) = options.check(spec)?;
         let bringup = Bringup::new(spec, spec.mode, TIMING, id(base, opcode::GAUGES));
         let claim = Claim {

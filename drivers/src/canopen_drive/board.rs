@@ -1,7 +1,7 @@
 //! A drive's own side: a node with mapped process data.
 
 use super::layout::{Field, Layout, Quantity, fields};
-use super::options::{CurrentUnit, Options, TorqueUnit, VelocityUnit};
+use super::options::{CanopenDriveOptions, CurrentUnit, TorqueUnit, VelocityUnit};
 use super::start::{COUNTS, PROFILE, RATED_CURRENT, RATED_TORQUE, TURNS, Told};
 use crate::canopen::{NO_RTR, Node, Pdo, SYNC, TPDO_OFF, check_file, node_of, object, tpdo};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
@@ -39,7 +39,7 @@ impl DriveBoard {
     /// # Errors
     /// [`SpecError`]: a node outside 1 to 127, a key out of range.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // casts saturate
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &CanopenDriveOptions) -> Result<Self, SpecError> {
         options.check()?;
         let id = node_of(spec)?;
         check_file(id, options.objects.as_ref())?;

@@ -1,7 +1,7 @@
 //! The host's side of a drive: puts the values of its TPDOs together.
 
 use super::layout::{Quantity, fields, values};
-use super::options::Options;
+use super::options::CanopenDriveOptions;
 use super::start::{Scales, Start};
 use crate::bringup::Bringup;
 use crate::bytes;
@@ -112,7 +112,10 @@ pub(super) struct Drive {
 }
 
 impl Drive {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &CanopenDriveOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         options.check()?;
         let node = node_of(spec)?;
         canopen::check_file(node, options.objects.as_ref())?;

@@ -139,7 +139,7 @@ pub struct PdoKeys {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct CanopenDriveOptions {
     /// Counts per turn of the motor; default the drive's own.
     pub counts_per_turn: Option<f64>,
     /// Unit of the velocity; default the drive's own, else counts per second.
@@ -169,7 +169,7 @@ pub struct Options {
     pub sync: u8,
 }
 
-impl Default for Options {
+impl Default for CanopenDriveOptions {
     fn default() -> Self {
         Self {
             counts_per_turn: None,
@@ -189,7 +189,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl CanopenDriveOptions {
     /// The process data that the keys state: none if the drive is to be asked.
     pub(super) fn pdos(&self) -> Vec<PdoKeys> {
         match self.configure && self.pdos.is_empty() {

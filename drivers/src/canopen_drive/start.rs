@@ -1,7 +1,7 @@
 //! What a drive is asked at its start: its profile, its mapping, and its scales.
 
 use super::layout::{Layout, Quantity, fields};
-use super::options::{CurrentUnit, Options, TorqueUnit, Unit};
+use super::options::{CanopenDriveOptions, CurrentUnit, TorqueUnit, Unit};
 use crate::canopen::{self, MAPPED_MOST, Object, Pdo, Plan, Step, is_free, nmt, object, tpdo};
 use crate::objects::Objects;
 use crate::{Id, Mode, SpecError};
@@ -126,7 +126,7 @@ impl Told {
 /// says.
 #[derive(Debug)]
 pub(super) struct Start {
-    options: Options,
+    options: CanopenDriveOptions,
     /// The mapping is that of the keys.
     configured: bool,
     /// The drive is set to it.
@@ -148,7 +148,11 @@ pub(super) struct Scales {
 }
 
 impl Start {
-    pub(super) fn new(node: u8, mode: Mode, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn new(
+        node: u8,
+        mode: Mode,
+        options: &CanopenDriveOptions,
+    ) -> Result<Self, SpecError> {
         let file = options.objects.as_ref();
         let of_keys = Layout::of_keys(node, &options.pdos())?;
         let configured = of_keys.position().is_some();

@@ -1,7 +1,7 @@
 //! The device's own side: a motor that sends its state as if it were commanded once a period.
 
 use super::frames::{DRIVE, ENCODER_ERROR, JOINT, Stage, quality_of};
-use super::options::{Checked, Effort, Options};
+use super::options::{Checked, CubemarsOptions, Effort};
 use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
 use proprio_topics::{Nanos, Quality, Reading};
 
@@ -20,7 +20,7 @@ impl CubemarsBoard {
     ///
     /// # Errors
     /// [`SpecError`]: a number above 254, a key out of range, ranges that are not known.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &CubemarsOptions) -> Result<Self, SpecError> {
         Ok(Self {
             keys: Checked::new(spec, options)?,
             stage: Stage {

@@ -1,7 +1,7 @@
 //! The host's side: takes the replies or uploads of one motor, and watches that they come.
 
 use super::frames::{DRIVE, ENCODER_ERROR, JOINT, Layout, Stage, quality_of};
-use super::options::{Checked, Effort, Options};
+use super::options::{Checked, CubemarsOptions, Effort};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Link, Supervised, temperature};
 use crate::held::OnChange;
@@ -18,7 +18,10 @@ pub(super) struct Motor {
 }
 
 impl Motor {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &CubemarsOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         let keys = Checked::new(spec, options)?;
         let claim = match keys.layout {
             Layout::Mit { .. } => Claim::shared(keys.id),

@@ -84,7 +84,7 @@ impl Model {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct CubemarsOptions {
     /// The motor's mode; default MIT.
     pub mode: Mode,
     /// Its model, for the defaults of other keys.
@@ -113,7 +113,7 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for CubemarsOptions {
     fn default() -> Self {
         Self {
             mode: Mode::Mit,
@@ -157,7 +157,7 @@ pub(super) struct Checked {
 }
 
 impl Checked {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn new(spec: &Spec, options: &CubemarsOptions) -> Result<Self, SpecError> {
         let number = address(spec, 0..=NUMBER_MOST)? as u8;
         let wrong = |key, value, expected| SpecError::Key {
             key,

@@ -1,7 +1,7 @@
 //! Recognising motors: by their uploads in servo mode, or by their replies in MIT mode.
 
 use super::frames::SERVO_STATUS;
-use super::options::Options;
+use super::options::CubemarsOptions;
 use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
 use crate::{Driver, Frame, Id};
 use alloc::vec::Vec;
@@ -24,7 +24,7 @@ pub(super) fn motors(seen: &Traffic) -> Vec<Finding> {
 }
 
 fn finding(evidence: Evidence<'_>, number: u8, what: &str, mode: &str) -> Option<Finding> {
-    let finding = evidence.finding(Options::NAME, number.into(), what)?;
+    let finding = evidence.finding(CubemarsOptions::NAME, number.into(), what)?;
     let mode = Key::new("mode", mode);
     let model = Key::fill_in("model", "\"AK80-9\"", "its ranges depend on it");
     Some(finding.with_keys([mode, model]).with_joints([0]))

@@ -5,7 +5,7 @@ use super::frames::{
     DISABLED, ENABLED, FET, JOINT, MOTOR, OVERLOAD, QUESTIONS, RANGES, READ, SENSOR, STATE, State,
     frame, quality_of,
 };
-use super::options::{Checked, Options};
+use super::options::{Checked, DamiaoOptions};
 use crate::mit::{self, Scale};
 use crate::{Board, EncodeError, Format, Frame, Frames, Spec, SpecError};
 use proprio_topics::{JointState, Nanos, Quality, Reading};
@@ -28,7 +28,7 @@ impl DamiaoBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an address outside 1 to 255, a key out of range, ranges that are not known.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &DamiaoOptions) -> Result<Self, SpecError> {
         let keys = Checked::new(spec, options)?;
         let mut ends = RANGES_USUAL;
         let known = keys.stated.iter().zip(&keys.of_model);

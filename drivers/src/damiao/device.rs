@@ -3,7 +3,7 @@
 use super::frames::{
     ENABLED, FET, JOINT, MOTOR, Message, SENSOR, STATE, State, quality_of, question,
 };
-use super::options::{Checked, Options};
+use super::options::{Checked, DamiaoOptions};
 use super::ranges::Ranges;
 use crate::bringup::{Bringup, Timing};
 use crate::family::{Family, Link, Rounds, Supervised, temperature};
@@ -22,7 +22,10 @@ pub(super) struct Motor {
 }
 
 impl Motor {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &DamiaoOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         let keys = Checked::new(spec, options)?;
         let (mode, timing) = match keys.request_period {
             Some(_) => (spec.mode, Timing::POLLED),

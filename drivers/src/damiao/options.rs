@@ -49,7 +49,7 @@ impl Model {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct DamiaoOptions {
     /// Its model, for ranges that neither a key nor the motor tells.
     pub model: Option<Model>,
     /// Identifier of its frames, 0 to 0x7FE; default 0.
@@ -68,7 +68,7 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for DamiaoOptions {
     fn default() -> Self {
         Self {
             model: None,
@@ -98,7 +98,7 @@ pub(super) struct Checked {
 }
 
 impl Checked {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn new(spec: &Spec, options: &DamiaoOptions) -> Result<Self, SpecError> {
         let [address, _] = address(spec, 1..=0xFF)?.to_le_bytes();
         if options.host_id > 0x7FE || options.host_id == u16::from(address) {
             return Err(SpecError::Key {

@@ -1,7 +1,7 @@
 //! Recognising motors by the frames with which they answer commands and questions.
 
 use super::frames::{Message, QUESTIONS, RANGES, READ, STATE, State, question};
-use super::options::Options;
+use super::options::DamiaoOptions;
 use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
 use crate::{Driver, Frame, Id};
 use alloc::vec::Vec;
@@ -143,7 +143,7 @@ fn motor(
     for base in [0x100, 0x200, 0x300] {
         evidence.belongs(Id::standard(base + u16::from(address)));
     }
-    let finding = evidence.finding(Options::NAME, address.into(), "Damiao motor")?;
+    let finding = evidence.finding(DamiaoOptions::NAME, address.into(), "Damiao motor")?;
     let model = Key::fill_in("model", "\"DM4310\"", "its ranges depend on it");
     let host = (host != 0).then(|| Key::new("host_id", host));
     let period = Key::period_ms(stream.period_of(is_its), 1, 60_000);

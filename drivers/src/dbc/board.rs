@@ -1,7 +1,7 @@
 //! The device's own side: sends its readings in the frames that the file describes, from power-on.
 
 use super::layout::{Layout, Part, Role, implies, shared};
-use super::options::Options;
+use super::options::DbcOptions;
 use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
 use alloc::vec::Vec;
 use proprio_topics::{Nanos, Quality, Reading};
@@ -34,7 +34,7 @@ impl DbcBoard {
     /// # Errors
     /// [`SpecError::Description`]: keys and file do not fit each other; [`SpecError::Key`] for a
     /// period outside 1 to 60000 ms.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &DbcOptions) -> Result<Self, SpecError> {
         let layout = Layout::new(spec, options)?;
         let period_ms = options.period_ms.unwrap_or(10);
         if !(1..=60_000).contains(&period_ms) {

@@ -2,7 +2,7 @@
 //! come.
 
 use super::layout::{Field, Layout, Part, ReadingLayout, Role};
-use super::options::Options;
+use super::options::DbcOptions;
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Link, Supervised};
 use crate::pairing::within;
@@ -68,7 +68,7 @@ impl DbcDevice {
     ///
     /// # Errors
     /// [`SpecError::Description`]: keys and file do not fit each other.
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(spec: &Spec, options: &DbcOptions) -> Result<Box<dyn Device>, SpecError> {
         let layout = Layout::new(spec, options)?;
         let claims: Vec<Claim> = layout.messages.iter().map(|m| m.frames).collect();
         let watched = (layout.order(0).first())

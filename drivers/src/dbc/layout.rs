@@ -1,7 +1,7 @@
 //! The table that decoding and encoding follow: per message, which of its bits are which value of
 //! which reading. Made from the keys and the file at start; every mistake in either is found here.
 
-use super::options::{Options, ReadingKeys};
+use super::options::{DbcOptions, ReadingKeys};
 use crate::signal::{Bits, Message, Raw, Signal};
 use crate::unit::{Unit, is_multiple, is_of_other_case, quantities, spellings, unit};
 use crate::{Claim, Decoded, Format, Id, Spec, SpecError};
@@ -259,7 +259,7 @@ pub(super) struct Layout {
 }
 
 impl Layout {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn new(spec: &Spec, options: &DbcOptions) -> Result<Self, SpecError> {
         let fail = |problem| Err(SpecError::Description(problem));
         if options.reading.is_empty() {
             return fail("there is no [[bus.device.reading]]: name what is to be read".into());
@@ -313,7 +313,7 @@ impl Layout {
 
     fn add(
         &mut self,
-        options: &Options,
+        options: &DbcOptions,
         spec: &Spec,
         number: usize,
         keys: &ReadingKeys,
@@ -480,7 +480,7 @@ impl Layout {
     /// Adds a signal to the part that has the same frames.
     fn field(
         &mut self,
-        options: &Options,
+        options: &DbcOptions,
         spec: &Spec,
         reading: usize,
         (message, signal): (&Message, &Signal),
@@ -576,7 +576,7 @@ const fn group(raw: u32) -> u32 {
 /// Which frames are those of `message`, and whether they are of J1939: then their parameter group
 /// counts, and what the keys ask for. Where the file has several messages of one group, their
 /// addresses count.
-fn frames(options: &Options, spec: &Spec, message: &Message) -> Result<(Claim, bool), String> {
+fn frames(options: &DbcOptions, spec: &Spec, message: &Message) -> Result<(Claim, bool), String> {
     let id = message.id.clone()?;
     let (Id::Extended(mut raw), true) = (id, options.j1939.unwrap_or(message.j1939)) else {
         let id = shifted(id, spec.address)
@@ -638,7 +638,7 @@ fn id_in(wanted: &str) -> Option<(u32, bool)> {
 }
 
 /// The messages that have the name `wanted`, or the identifier.
-fn messages_of<'o>(options: &'o Options, wanted: &str) -> Vec<&'o Message> {
+fn messages_of<'o>(options: &'o DbcOptions, wanted: &str) -> Vec<&'o Message> {
     let id = id_in(wanted);
     let is_wanted = |message: &&Message| match (id, &message.id) {
         (Some(wanted), Ok(id)) => (id.raw(), matches!(id, Id::Extended(_))) == wanted,
@@ -656,7 +656,7 @@ fn messages_of<'o>(options: &'o Options, wanted: &str) -> Vec<&'o Message> {
 }
 
 /// The message that has the name `wanted`, or the identifier.
-fn find_message<'o>(options: &'o Options, wanted: &str) -> Result<&'o Message, String> {
+fn find_message<'o>(options: &'o DbcOptions, wanted: &str) -> Result<&'o Message, String> {
     let is_id = id_in(wanted).is_some();
     let found = messages_of(options, wanted);
     match *found {
@@ -697,7 +697,7 @@ fn find_message<'o>(options: &'o Options, wanted: &str) -> Result<&'o Message, S
 }
 
 /// The message and the signal of `path`.
-fn find<'o>(options: &'o Options, path: &str) -> Result<(&'o Message, &'o Signal), String> {
+fn find<'o>(options: &'o DbcOptions, path: &str) -> Result<(&'o Message, &'o Signal), String> {
     let Some((message, signal)) = path.split_once('.') else {
         return Err("it must be written Message.Signal".into());
     };

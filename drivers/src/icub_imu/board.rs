@@ -4,7 +4,7 @@ use super::frames::{
     FIELD_LSB, LEGACY_ACCELEROMETERS, LEGACY_GYROSCOPE, Legacy, QUATERNION_LSB, Quantity, kind,
     sensor,
 };
-use super::options::{Options, Plan};
+use super::options::{IcubImuOptions, Plan};
 use crate::bytes;
 use crate::icub::{self, class, command};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
@@ -32,7 +32,7 @@ impl ImuBoard {
     ///
     /// # Errors
     /// As [`ImuDevice::new`](super::ImuDevice::new).
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &IcubImuOptions) -> Result<Self, SpecError> {
         let plan = Plan::new(spec, options)?;
         Ok(Self {
             period: Nanos::from_millis(i64::from(plan.period_ms)),

@@ -4,7 +4,7 @@
 use super::frames::{
     ACCELERATION_LSB, FIELD_LSB, Legacy, QUATERNION_LSB, Quantity, RATE_LSB, kind, sensor,
 };
-use super::options::{Options, Plan};
+use super::options::{IcubImuOptions, Plan};
 use crate::bringup::Bringup;
 use crate::bytes;
 use crate::configure::{Configure, Setting};
@@ -64,7 +64,10 @@ pub(super) struct ImuDevice {
 }
 
 impl ImuDevice {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &IcubImuOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         let plan = Plan::new(spec, options)?;
         let timing = icub::timing(options.power_on_silence_ms)?;
         let is_legacy = plan.legacy != Legacy::None;

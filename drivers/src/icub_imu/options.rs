@@ -11,7 +11,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct IcubImuOptions {
     /// The quantities of a reading; default acceleration and angular velocity.
     pub quantities: Vec<Quantity>,
     /// Period \[ms\], 1 to 255; default 10.
@@ -28,7 +28,7 @@ pub struct Options {
     pub power_on_silence_ms: u32,
 }
 
-impl Default for Options {
+impl Default for IcubImuOptions {
     fn default() -> Self {
         Self {
             quantities: [Quantity::Acceleration, Quantity::AngularVelocity].to_vec(),
@@ -59,7 +59,7 @@ pub(super) struct Plan {
 }
 
 impl Plan {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn new(spec: &Spec, options: &IcubImuOptions) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
         let period_ms = icub::period_ms("period_ms", options.period_ms)?;
         let want = options

@@ -3,7 +3,7 @@
 
 use super::exchange::MINUS_PRESENT;
 use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind, saturation_bytes};
-use super::options::{Options, Stream};
+use super::options::{IcubStrainOptions, Stream};
 use crate::bytes;
 use crate::icub::{self, class, command};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
@@ -44,7 +44,7 @@ impl StrainBoard {
     /// # Errors
     /// As [`Strain::new`](super::Strain::new), but a full scale of zero is legal: a board with a
     /// corrupt memory.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &IcubStrainOptions) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
         let configured = options.full_scale(true)?;
         let period =

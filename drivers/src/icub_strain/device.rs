@@ -3,7 +3,7 @@
 
 use super::exchange::{Exchange, Told};
 use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind};
-use super::options::{Options, Stream};
+use super::options::{IcubStrainOptions, Stream};
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry};
 use crate::bytes;
 use crate::family::{Family, Link, Supervised};
@@ -242,7 +242,10 @@ pub(super) struct Strain {
 }
 
 impl Strain {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &IcubStrainOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         let address = icub::address(spec)?;
         let period = icub::period_ms("period_ms", options.period_ms)?;
         let configured = options.full_scale(false)?;

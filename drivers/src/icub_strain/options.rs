@@ -43,7 +43,7 @@ impl Stream {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct IcubStrainOptions {
     /// Full scale of fx fy fz \[N\]; default: the board's own.
     #[serde(deserialize_with = "wrench::three")]
     pub full_scale_n: Option<[f64; 3]>,
@@ -62,7 +62,7 @@ pub struct Options {
     pub power_on_silence_ms: u32,
 }
 
-impl Default for Options {
+impl Default for IcubStrainOptions {
     fn default() -> Self {
         Self {
             full_scale_n: None,
@@ -76,7 +76,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl IcubStrainOptions {
     /// The configured full scale, force then torque.
     pub(super) fn full_scale(&self, zero_allowed: bool) -> Result<Option<[f64; 6]>, SpecError> {
         wrench::full_scale(self.full_scale_n, self.full_scale_nm, zero_allowed)

@@ -1,7 +1,7 @@
 //! The board's own side. It reports its full scales, executes the host's commands, and sends
 //! readings as frames.
 
-use super::options::Options;
+use super::options::Jr3CanOptions;
 use super::protocol::{NEWTON_METRE_PER_LSB, READY, SAMPLE, STEPS, id, node, op, op_of};
 use crate::bytes;
 use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Spec, SpecError};
@@ -29,7 +29,7 @@ impl Jr3Board {
     ///
     /// # Errors
     /// [`SpecError`]: a number outside 1 to 127, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &Jr3CanOptions) -> Result<Self, SpecError> {
         options.cutoff()?;
         Ok(Self {
             node: node(spec)?,

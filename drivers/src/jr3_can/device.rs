@@ -1,7 +1,7 @@
 //! The host's side of a board. It asks for the full scales, starts the board, and combines the
 //! frames of force and moment.
 
-use super::options::Options;
+use super::options::Jr3CanOptions;
 use super::protocol::{READY, SAMPLE, STEPS, id, node, op, op_of};
 use super::scales::{FullScales, Question};
 use crate::bringup::{Bringup, Timing};
@@ -55,7 +55,10 @@ pub(super) struct Jr3 {
 }
 
 impl Jr3 {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &Jr3CanOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         let node = node(spec)?;
         let (period, cutoff) = (options.period()?, options.cutoff()?);
         let scales = FullScales::new(node, options.full_scale()?);

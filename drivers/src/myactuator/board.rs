@@ -4,7 +4,7 @@
 use super::frames::{
     ANY_ERROR, Answer, ENCODER_ERROR, JOINT, LENGTH, MOTOR, Protocol, State, command,
 };
-use super::options::{Checked, Options, Position};
+use super::options::{Checked, MyactuatorOptions, Position};
 use crate::bytes::{quantise, quantise_i16};
 use crate::{Board, EncodeError, Format, Frame, Frames, Spec, SpecError, mit};
 use proprio_topics::{JointState, Nanos, Quality, Reading};
@@ -23,7 +23,7 @@ impl MyactuatorBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an address outside 1 to 32, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &MyactuatorOptions) -> Result<Self, SpecError> {
         Ok(Self {
             keys: Checked::new(spec, options)?,
             joint: JointState {

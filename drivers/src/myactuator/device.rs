@@ -1,7 +1,7 @@
 //! The host's side: takes the answers of one motor, and asks for them if it is told to.
 
 use super::frames::{Answer, JOINT, LENGTH, MOTOR, Protocol, State, command};
-use super::options::{Checked, Options, Position};
+use super::options::{Checked, MyactuatorOptions, Position};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Link, Rounds, Supervised, temperature};
 use crate::held::{Held, OnChange};
@@ -27,7 +27,10 @@ pub(super) struct Motor {
 }
 
 impl Motor {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &MyactuatorOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         let keys = Checked::new(spec, options)?;
         let (mode, timing) = match keys.request_period {
             Some(_) => (spec.mode, Timing::POLLED),

@@ -26,7 +26,7 @@ pub enum Position {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct MyactuatorOptions {
     /// Its protocol; default V3.
     pub protocol: Protocol,
     /// Which frames are a reading of the joint; default those with an angle.
@@ -53,7 +53,7 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for MyactuatorOptions {
     fn default() -> Self {
         Self {
             protocol: Protocol::V3,
@@ -96,7 +96,7 @@ pub(super) struct Checked {
 }
 
 impl Checked {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn new(spec: &Spec, options: &MyactuatorOptions) -> Result<Self, SpecError> {
         let address = address(spec, 1..=32)?;
         let (protocol, position) = (options.protocol, options.position);
         if position == Position::Motion && protocol == Protocol::V2 {

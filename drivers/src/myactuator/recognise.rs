@@ -1,7 +1,7 @@
 //! Recognising motors by their answers to commands and questions.
 
 use super::frames::{ANSWERS, COMMANDS, LENGTH, MOTION, command};
-use super::options::Options;
+use super::options::MyactuatorOptions;
 use crate::bytes::{i16_le, u32_le};
 use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
 use crate::{Driver, Frame, Id, mit};
@@ -69,7 +69,7 @@ const AGREE: f64 = 5.0;
 
 fn finding(evidence: Evidence<'_>, address: u16, stream: &Stream) -> Option<Finding> {
     let what = "MyActuator RMD or LKMTech motor";
-    let finding = evidence.finding(Options::NAME, address.into(), what)?;
+    let finding = evidence.finding(MyactuatorOptions::NAME, address.into(), what)?;
     let position = (!has(stream, command::ANGLE)).then(|| Key::new("position", "\"status\""));
     let commands = Id::standard(COMMANDS + address);
     Some(

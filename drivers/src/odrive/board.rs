@@ -2,7 +2,7 @@
 
 use super::firmware::{Firmware, error};
 use super::frames::{FET, JOINT, MOTOR, command, is_request};
-use super::options::{Checked, Options};
+use super::options::{Checked, OdriveOptions};
 use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
 use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
@@ -32,7 +32,7 @@ impl OdriveBoard {
     ///
     /// # Errors
     /// [`SpecError`]: a node above 63, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &OdriveOptions) -> Result<Self, SpecError> {
         Ok(Self {
             keys: Checked::new(spec, options)?,
             errors: 0,

@@ -2,7 +2,7 @@
 
 use super::firmware::{Firmware, error};
 use super::frames::{FET, JOINT, LENGTH, MOTOR, command, is_request};
-use super::options::{Checked, Options};
+use super::options::{Checked, OdriveOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes;
 use crate::family::{Family, Link, Rounds, Supervised, temperature};
@@ -29,7 +29,10 @@ pub(super) struct Axis {
 }
 
 impl Axis {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &OdriveOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         let keys = Checked::new(spec, options)?;
         let mode = match keys.request_period {
             Some(_) => spec.mode,

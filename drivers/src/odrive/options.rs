@@ -11,7 +11,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct OdriveOptions {
     /// Its firmware; default 0.6.
     pub firmware: Firmware,
     /// Torque per current \[Nm/A\]; default: the torque that firmware 0.6 sends.
@@ -24,7 +24,7 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for OdriveOptions {
     fn default() -> Self {
         Self {
             firmware: Firmware::V0_6,
@@ -48,7 +48,7 @@ pub(super) struct Checked {
 }
 
 impl Checked {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn new(spec: &Spec, options: &OdriveOptions) -> Result<Self, SpecError> {
         let node = address(spec, 0..=NODE_MOST)?;
         let torque_constant = (options.torque_constant)
             .map(|constant| above_zero("torque_constant", constant))

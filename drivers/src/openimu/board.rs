@@ -4,7 +4,7 @@ use super::frames::{
     ACCELERATION, ANGLE, Quantity, RATE, RATE_LIMIT, REPETITION, group_and_source, merit, period,
     pgn, pitch_and_roll,
 };
-use super::options::{Options, Plan};
+use super::options::{OpenImuOptions, Plan};
 use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Spec, SpecError};
 use proprio_topics::{Imu, Nanos, Quality, Reading, Saturation};
 
@@ -23,7 +23,7 @@ impl OpenImuBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an address outside 0x80 to 0xF7, a period that is none.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &OpenImuOptions) -> Result<Self, SpecError> {
         let plan = Plan::new(spec, options)?;
         Ok(Self {
             types: plan.types(),

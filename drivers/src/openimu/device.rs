@@ -5,7 +5,7 @@ use super::frames::{
     ACCELERATION, ANGLE, ANY_PRIORITY, COMMANDS, HOST, Quantity, RATE, RATE_LIMIT,
     group_and_source, identifier, merit, period, pgn, quaternion,
 };
-use super::options::{Options, Plan};
+use super::options::{OpenImuOptions, Plan};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes;
 use crate::family::{Family, Link, Supervised};
@@ -109,7 +109,10 @@ pub(super) struct Sensor {
 }
 
 impl Sensor {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &OpenImuOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         let plan = Plan::new(spec, options)?;
         let watched = plan.quantities.first().unwrap_or(&Quantity::Acceleration);
         let mut bringup = Bringup::new(spec, spec.mode, TIMING, plan.message(*watched));

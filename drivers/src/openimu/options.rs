@@ -9,7 +9,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct OpenImuOptions {
     /// The quantities of a reading; default acceleration and angular velocity.
     pub quantities: Vec<Quantity>,
     /// Period \[ms\]; default 10.
@@ -20,7 +20,7 @@ pub struct Options {
     pub acceleration_z: Upright,
 }
 
-impl Default for Options {
+impl Default for OpenImuOptions {
     fn default() -> Self {
         Self {
             quantities: [Quantity::Acceleration, Quantity::AngularVelocity].to_vec(),
@@ -43,7 +43,7 @@ pub(super) struct Plan {
 }
 
 impl Plan {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn new(spec: &Spec, options: &OpenImuOptions) -> Result<Self, SpecError> {
         let wrong_address = SpecError::Address {
             address: spec.address,
             least: *ADDRESSES.start(),

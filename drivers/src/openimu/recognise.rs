@@ -1,7 +1,7 @@
 //! Recognising sensors: by the groups that they send.
 
 use super::frames::{ADDRESSES, DIVIDERS, Quantity, identifier, period};
-use super::options::Options;
+use super::options::OpenImuOptions;
 use crate::Driver;
 use crate::recognise::{Evidence, Finding, Key, Traffic};
 use alloc::format;
@@ -30,7 +30,7 @@ pub(super) fn sensor(seen: &Traffic, address: u32) -> Option<Finding> {
         return None;
     }
     let what = "Aceinna OpenIMU or MTLT (J1939)";
-    let finding = evidence.finding(Options::NAME, address, what)?;
+    let finding = evidence.finding(OpenImuOptions::NAME, address, what)?;
     let words: String = format!("{quantities:?}");
     let mut keys = Vec::from([Key::new("quantities", words)]);
     let is_near = |divider: &&u8| {

@@ -1,6 +1,6 @@
 //! The unit's own side. It takes configurations and sends packets.
 
-use super::options::Options;
+use super::options::OptoforceDaqOptions;
 use super::protocol::{
     ANSWER, CONFIGURATION, DEFAULT_RATE, Ids, OVERLOAD_FX, PACKET, SENSOR_FAILURE, ZERO_HERE,
     period, sum,
@@ -31,7 +31,7 @@ impl OptoBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an identifier or a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &OptoforceDaqOptions) -> Result<Self, SpecError> {
         let ids = options.ids(spec)?;
         let settings = options.settings()?.filter(|_| spec.mode == Mode::Listen);
         Ok(Self {

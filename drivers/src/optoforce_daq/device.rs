@@ -1,7 +1,7 @@
 //! The host's side of a unit. It configures the unit if the keys say so, and combines the two
 //! frames of each packet.
 
-use super::options::Options;
+use super::options::OptoforceDaqOptions;
 use super::protocol::{
     ANSWER, CONFIGURATION, ERRORS, Ids, OVERLOAD_FX, PACKET, Settings, ZERO_OWN, sum,
 };
@@ -50,7 +50,10 @@ pub(super) struct Opto {
 }
 
 impl Opto {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &OptoforceDaqOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         let ids = options.ids(spec)?;
         let settings = options.settings()?;
         let mode = match settings {

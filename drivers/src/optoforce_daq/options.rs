@@ -8,7 +8,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct OptoforceDaqOptions {
     /// Steps per N of fx fy fz. Needed.
     #[serde(deserialize_with = "wrench::three")]
     pub counts_per_newton: Option<[f64; 3]>,
@@ -24,7 +24,7 @@ pub struct Options {
     pub id_config: u16,
 }
 
-impl Default for Options {
+impl Default for OptoforceDaqOptions {
     fn default() -> Self {
         Self {
             counts_per_newton: None,
@@ -37,7 +37,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl OptoforceDaqOptions {
     pub(super) fn scale(&self) -> Result<[f64; 3], SpecError> {
         let key = "counts_per_newton";
         let expected = "three numbers above 0, from the sensor's sensitivity report";

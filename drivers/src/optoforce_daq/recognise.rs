@@ -1,6 +1,6 @@
 //! Recognising a unit: by the beginning and the checksum of its packets, on any identifier.
 
-use super::options::Options;
+use super::options::OptoforceDaqOptions;
 use super::protocol::PACKET;
 use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
 use crate::{Driver, Format, Frame, Id, bytes};
@@ -33,7 +33,11 @@ pub(super) fn unit(seen: &Traffic, stream: &Stream) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, 1 << 11);
     // Four bytes and a checksum.
     evidence.explains(stream.id, 48.0);
-    let finding = evidence.finding(Options::NAME, address.into(), "OptoForce sensor at a DAQ")?;
+    let finding = evidence.finding(
+        OptoforceDaqOptions::NAME,
+        address.into(),
+        "OptoForce sensor at a DAQ",
+    )?;
     let scale = "[1.0, 1.0, 1.0]";
     let note = "from the sensor's sensitivity report";
     // Not its rate: with that key each start would change the zero.

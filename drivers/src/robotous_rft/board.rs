@@ -1,6 +1,6 @@
 //! The sensor's own side.
 
-use super::options::{Model, Options};
+use super::options::{Model, RobotousRftOptions};
 use super::protocol::{DEFAULT_RATE, Ids, OVERLOAD_FX, RATES, SET, command, period};
 use crate::bytes;
 use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Spec, SpecError};
@@ -30,7 +30,7 @@ impl RftBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an identifier or a rate out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &RobotousRftOptions) -> Result<Self, SpecError> {
         let rate_code = options.rate_code()?;
         let mut this = Self {
             ids: options.ids(spec)?,

@@ -1,7 +1,7 @@
 //! The host's side of a sensor. It sets the rate, starts the sensor, and combines the two halves of
 //! each response.
 
-use super::options::Options;
+use super::options::RobotousRftOptions;
 use super::protocol::{DEFAULT_RATE, Ids, OVERLOAD_FX, SET, command, period, send};
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry, Timing};
 use crate::family::{Family, Link, Supervised};
@@ -103,7 +103,10 @@ pub(super) struct Rft {
 }
 
 impl Rft {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &RobotousRftOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         let ids = options.ids(spec)?;
         let rate = Rate {
             id: ids.command,

@@ -71,7 +71,7 @@ impl Model {
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct RobotousRftOptions {
     /// The model; default RFT40-SA01.
     pub model: Model,
     /// Readings per second \[Hz\], one of the sensor's; default 200.
@@ -82,7 +82,7 @@ pub struct Options {
     pub id_second: u16,
 }
 
-impl Default for Options {
+impl Default for RobotousRftOptions {
     fn default() -> Self {
         Self {
             model: Model::default(),
@@ -93,7 +93,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl RobotousRftOptions {
     pub(super) fn ids(&self, spec: &Spec) -> Result<Ids, SpecError> {
         let expected = "from 1 to 255";
         let ids = Ids {

@@ -1,6 +1,6 @@
 //! Recognising a sensor with the identifiers that it is delivered with.
 
-use super::options::{Model, Options};
+use super::options::{Model, RobotousRftOptions};
 use super::protocol::{Ids, RATES, command, send};
 use crate::recognise::{Evidence, Finding, Key, Traffic};
 use crate::{Driver, Frame, Id};
@@ -72,7 +72,7 @@ pub(super) fn sensor(seen: &Traffic) -> Option<Finding> {
     let rate = RATES
         .iter()
         .find(|(rate, _)| measured.is_some_and(|hz| near(hz, *rate)));
-    let finding = evidence.finding(Options::NAME, IDS.command.raw(), what)?;
+    let finding = evidence.finding(RobotousRftOptions::NAME, IDS.command.raw(), what)?;
     let rate = rate.map(|(rate, _)| Key::new("rate_hz", rate));
     Some(finding.with_keys([model]).with_keys(rate))
 }

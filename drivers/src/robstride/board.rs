@@ -4,7 +4,7 @@
 use super::frames::{
     JOINT, LENGTH, MOTOR, OF_STATE, RUNNING, State, fault, id, kind, parameter, quality_of,
 };
-use super::options::{Checked, Options, Protocol};
+use super::options::{Checked, Protocol, RobstrideOptions};
 use crate::{Board, EncodeError, Format, Frame, Frames, Id, Spec, SpecError, bytes, mit};
 use proprio_topics::{JointState, Nanos, Quality, Reading};
 
@@ -29,7 +29,7 @@ impl RobstrideBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an address outside 1 to 253, a key out of range, ranges that are not known.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &RobstrideOptions) -> Result<Self, SpecError> {
         Ok(Self {
             keys: Checked::new(spec, options)?,
             joint: JointState {

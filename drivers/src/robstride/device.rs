@@ -3,7 +3,7 @@
 use super::frames::{
     JOINT, LENGTH, MOTOR, Message, OF_STATE, RUNNING, State, claim, id, kind, parameter, quality_of,
 };
-use super::options::{Checked, Options, Protocol};
+use super::options::{Checked, Protocol, RobstrideOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Link, Rounds, Supervised, temperature};
 use crate::held::{Held, OnChange};
@@ -26,7 +26,10 @@ pub(super) struct Motor {
 }
 
 impl Motor {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &RobstrideOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         let keys = Checked::new(spec, options)?;
         let (mode, timing) = match keys.request_period {
             Some(_) => (spec.mode, Timing::POLLED),

@@ -58,7 +58,7 @@ impl Model {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct RobstrideOptions {
     /// Its model, for the defaults of other keys.
     pub model: Option<Model>,
     /// Its protocol; default the private one.
@@ -79,7 +79,7 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for RobstrideOptions {
     fn default() -> Self {
         Self {
             model: None,
@@ -111,7 +111,7 @@ pub(super) struct Checked {
 }
 
 impl Checked {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn new(spec: &Spec, options: &RobstrideOptions) -> Result<Self, SpecError> {
         let [address, _] = address(spec, 1..=0xFD)?.to_le_bytes();
         let (protocol, host) = (options.protocol, options.host_id);
         if host == address {

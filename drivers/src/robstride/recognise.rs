@@ -1,7 +1,7 @@
 //! Recognising motors by their states, by parameters that they tell, and by their number.
 
 use super::frames::{LENGTH, Message, id, kind};
-use super::options::Options;
+use super::options::RobstrideOptions;
 use crate::bytes::{u16_be, u16_le};
 use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
 use crate::{Driver, Frame, Id};
@@ -60,7 +60,7 @@ pub(super) fn motors(seen: &Traffic) -> Vec<Finding> {
 }
 
 fn finding(evidence: Evidence<'_>, address: u8) -> Option<Finding> {
-    let finding = evidence.finding(Options::NAME, address.into(), "RobStride motor")?;
+    let finding = evidence.finding(RobstrideOptions::NAME, address.into(), "RobStride motor")?;
     let model = Key::fill_in("model", "\"RS03\"", "its ranges depend on it");
     Some(finding.with_keys([model]).with_joints([0]))
 }

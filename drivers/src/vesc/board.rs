@@ -3,7 +3,7 @@
 use super::frames::{
     AMPERE_PER_STEP, DUTY_PER_STEP, FET, JOINT, KELVIN_PER_STEP, MOTOR, STEPS_PER_TURN, command,
 };
-use super::options::{Checked, Options, Position};
+use super::options::{Checked, Position, VescOptions};
 use crate::bytes::{quantise, quantise_i16};
 use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
 use proprio_topics::{Nanos, Quality, Reading};
@@ -23,7 +23,7 @@ impl VescBoard {
     ///
     /// # Errors
     /// [`SpecError`]: an address above 254, a key out of range or missing.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &VescOptions) -> Result<Self, SpecError> {
         Ok(Self {
             keys: Checked::new(spec, options)?,
             duty: 0.0,

@@ -3,7 +3,7 @@
 use super::frames::{
     AMPERE_PER_STEP, COLDEST, DUTY_PER_STEP, FET, JOINT, KELVIN_PER_STEP, LENGTH, MOTOR, command,
 };
-use super::options::{Checked, Options, Position};
+use super::options::{Checked, Position, VescOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes::{self, i16_be, u32_be};
 use crate::family::{Family, Link, Supervised, temperature};
@@ -22,7 +22,7 @@ pub(super) struct Controller {
 }
 
 impl Controller {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(spec: &Spec, options: &VescOptions) -> Result<Box<dyn Device>, SpecError> {
         let keys = Checked::new(spec, options)?;
         let watched = keys.id(keys.with_position());
         let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, watched);

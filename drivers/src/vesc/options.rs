@@ -22,7 +22,7 @@ pub enum Position {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct VescOptions {
     /// Where the position is taken from; default the PID position.
     pub position: Position,
     /// Pairs of the motor's poles.
@@ -37,7 +37,7 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for VescOptions {
     fn default() -> Self {
         Self {
             position: Position::Pid,
@@ -64,7 +64,7 @@ pub(super) struct Checked {
 }
 
 impl Checked {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn new(spec: &Spec, options: &VescOptions) -> Result<Self, SpecError> {
         let address = address(spec, 0..=ADDRESS_MOST)?;
         let Some(pairs) = options.pole_pairs else {
             return Err(SpecError::Keys {

@@ -1,7 +1,7 @@
 //! Recognising controllers by their status messages.
 
 use super::frames::{ADDRESS_MOST, LENGTH, STEPS_PER_TURN, command};
-use super::options::Options;
+use super::options::VescOptions;
 use crate::bytes::{i16_be, u32_be};
 use crate::recognise::{Evidence, Finding, Key, Traffic};
 use crate::{Driver, Frame, Id};
@@ -57,7 +57,7 @@ fn controller(seen: &Traffic, address: u16) -> Option<Finding> {
     for command in OTHERS {
         evidence.sends_length(id(address, command), LENGTH);
     }
-    let finding = evidence.finding(Options::NAME, address.into(), "VESC motor controller")?;
+    let finding = evidence.finding(VescOptions::NAME, address.into(), "VESC motor controller")?;
     let pairs = Key::fill_in("pole_pairs", 7, "of the motor");
     let with_position = pid.or(tachometer);
     let position =

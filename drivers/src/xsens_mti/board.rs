@@ -1,7 +1,7 @@
 //! The sensor's own side.
 
 use super::frames::{ACCELERATION_LSB, Message, RATE_LSB, status};
-use super::options::{Options, Plan};
+use super::options::{Plan, XsensMtiOptions};
 use crate::bytes;
 use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
 use proprio_topics::{Nanos, Quality, Reading, Saturation};
@@ -20,7 +20,7 @@ impl MtiBoard {
     ///
     /// # Errors
     /// [`SpecError`]: identifiers or keys out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub fn new(spec: &Spec, options: &XsensMtiOptions) -> Result<Self, SpecError> {
         Ok(Self {
             plan: Plan::new(spec, options)?,
             clock: Nanos::ZERO,

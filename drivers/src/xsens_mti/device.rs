@@ -1,7 +1,7 @@
 //! The host's side of an MTi. It combines the messages of each sample into a reading.
 
 use super::frames::{ACCELERATION_LSB, BUFFER_OVERFLOW, Message, RATE_LSB, status};
-use super::options::{Options, Plan};
+use super::options::{Plan, XsensMtiOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes;
 use crate::family::{Family, Link, Supervised};
@@ -107,7 +107,10 @@ pub(super) struct Mti {
 }
 
 impl Mti {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
+    pub(super) fn device(
+        spec: &Spec,
+        options: &XsensMtiOptions,
+    ) -> Result<Box<dyn Device>, SpecError> {
         let plan = Plan::new(spec, options)?;
         let watched = plan.messages.first().map_or(plan.error, |(id, _)| *id);
         let bringup = Bringup::new(spec, Mode::Listen, TIMING, watched);

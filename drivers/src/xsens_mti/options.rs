@@ -11,7 +11,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct XsensMtiOptions {
     /// The messages of a reading; default sample time, angular velocity, acceleration.
     pub quantities: Vec<Message>,
     /// Period of the samples \[ms\], 0.5 to 1000; default 10.
@@ -30,7 +30,7 @@ pub struct Options {
     pub identifiers: BTreeMap<Message, u32>,
 }
 
-impl Default for Options {
+impl Default for XsensMtiOptions {
     fn default() -> Self {
         Self {
             quantities: [
@@ -65,7 +65,7 @@ pub(super) struct Plan {
 }
 
 impl Plan {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+    pub(super) fn new(spec: &Spec, options: &XsensMtiOptions) -> Result<Self, SpecError> {
         let key = |key, value, expected| SpecError::Key {
             key,
             value,

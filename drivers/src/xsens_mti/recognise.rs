@@ -1,7 +1,7 @@
 //! Recognising a sensor with the identifiers that it is delivered with.
 
 use super::frames::{HighRate, Message};
-use super::options::Options;
+use super::options::XsensMtiOptions;
 use crate::recognise::{Evidence, Finding, Key, Traffic};
 use crate::{Driver, Id};
 use alloc::format;
@@ -50,7 +50,7 @@ pub(super) fn sensor(seen: &Traffic, extended: bool) -> Option<Finding> {
     if measured < 2 {
         return None;
     }
-    let finding = evidence.finding(Options::NAME, 0, "Xsens MTi")?;
+    let finding = evidence.finding(XsensMtiOptions::NAME, 0, "Xsens MTi")?;
     let words: String = format!("{quantities:?}");
     let mut keys = Vec::from([Key::new("quantities", words)]);
     keys.extend(Key::period_ms(period, 1, 1000));
