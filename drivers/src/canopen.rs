@@ -17,17 +17,21 @@
 //! object 1000 (device type) of all nodes, 1018 sub 1 to 4 (identity) of those that answer, and
 //! 1800 to 1803 sub 1 and 2 (identifier and transmission of each TPDO) of drives.
 
+#[cfg(feature = "boards")]
 mod node;
 mod pdo;
 mod protocol;
+#[cfg(feature = "recognise")]
 mod recognise;
 mod script;
 
+#[cfg(feature = "boards")]
 pub(crate) use node::Node;
 pub(crate) use pdo::{Pdo, is_free};
 pub(crate) use protocol::{
     MAPPED_MOST, NMT, NO_RTR, Object, SYNC, TIMING, TPDO_OFF, nmt, object, sdo_from, sdo_to, tpdo,
 };
+#[cfg(feature = "recognise")]
 pub(crate) use recognise::{NO_PROFILE, Recognised, commands, questions, recognise};
 pub(crate) use script::{Plan, READ, Script, Step};
 

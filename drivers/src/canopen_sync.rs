@@ -1,15 +1,16 @@
 //! The driver `canopen_sync`: The SYNC of a CANopen bus. What follows is its page of the book.
 #![doc = include_str!("../../docs/book/src/devices/canopen_sync.md")]
 
+#[cfg(feature = "boards")]
+mod board;
+
 use crate::bringup::{Bringup, NoInquiry};
 use crate::canopen::{self, SYNC};
 use crate::family::{Family, Link, Supervised, next_in_step};
-use crate::{
-    Board, Decoded, Device, Driver, EncodeError, Frame, Frames, OutputInfo, Spec, SpecError,
-};
+use crate::{Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use proprio_topics::{Nanos, Quality, Reading};
+use proprio_topics::Nanos;
 use serde::Deserialize;
 
 /// The keys of `driver = "canopen_sync"`.
@@ -61,10 +62,6 @@ impl Driver for CanopenSyncOptions {
         };
         Ok(Supervised::boxed([], bringup, NoInquiry, this))
     }
-
-    fn board(&self, _spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        Ok(Box::new(Nothing))
-    }
 }
 
 /// The host's side: all of it.
@@ -99,24 +96,5 @@ impl Family for Producer {
     }
 }
 
-/// There is nothing at the other end.
-#[derive(Debug)]
-struct Nothing;
-
-impl Board for Nothing {
-    fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
-
-    fn period(&self) -> Option<Nanos> {
-        None
-    }
-
-    fn encode(
-        &mut self,
-        output: u8,
-        _reading: &Reading,
-        _quality: Quality,
-        _out: &mut Frames,
-    ) -> Result<(), EncodeError> {
-        Err(EncodeError::Output(output))
-    }
-}
+#[cfg(feature = "recognise")]
+impl crate::Recognise for CanopenSyncOptions {}

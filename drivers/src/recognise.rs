@@ -37,7 +37,7 @@ mod traffic;
 pub(crate) use explain::explain as together;
 pub use traffic::{Stream, Traffic};
 
-use crate::{Format, Frame, Id};
+use crate::{Driver, Format, Frame, Id};
 use alloc::string::{String, ToString};
 use alloc::vec::Vec;
 pub(crate) use background::log2;
@@ -154,7 +154,7 @@ pub struct Finding {
     /// The device's address, as the driver defines it.
     pub address: u32,
     /// The odds that it is there, as a logarithm to base 2; of a driver's own
-    /// [`crate::Driver::recognise`] without what its identifiers count.
+    /// [`Recognise::recognise`] without what its identifiers count.
     pub bits: f64,
     /// What it is, in words: type, firmware, serial number, as far as it is known.
     pub what: String,
@@ -501,4 +501,28 @@ impl Finding {
         self.joints.extend(joints);
         self
     }
+}
+
+/// A driver whose devices can be recognised in the traffic of a bus. What it has by default is that
+/// of one that recognises none.
+pub trait Recognise: Driver {
+    /// The devices that `seen` shows.
+    #[must_use]
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let _ = seen;
+        Vec::new()
+    }
+
+    /// Questions that make devices tell what they are. They start, move, write and reconfigure
+    /// nothing. `seen` is what was heard so far, so that a device that has answered can be asked
+    /// for more.
+    #[must_use]
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        let _ = seen;
+        Vec::new()
+    }
+
+    /// Some other family takes these questions for commands: they are sent only on a bus of which a
+    /// person says that such devices are there.
+    const ASKED_BY_NAME: bool = false;
 }

@@ -8,12 +8,13 @@ use crate::bytes::{self, i16_be, u16_be};
 use crate::family::{Family, Link, Supervised, next_in_step};
 use crate::pairing::within;
 use crate::{
-    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
-    NotSent, Output, Spec, SpecError,
+    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Driver, Frame,
+    Mode, NotSent, Output, OutputInfo, Spec, SpecError,
 };
 use alloc::boxed::Box;
+use alloc::vec::Vec;
 use arrayvec::ArrayVec;
-use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind, Wrench};
+use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, StampKind, Wrench};
 
 /// So many readings wait for second halves before a half counts as lost.
 const DEPTH: usize = 4;
@@ -60,33 +61,6 @@ pub(super) struct Netcanoem {
 }
 
 impl Netcanoem {
-    pub(super) fn device(
-        spec: &Spec,
-        options: &AtiNetcanoemOptions,
-    ) -> Result<Box<dyn Device>, SpecError> {
-        let (base, period) = options.check(spec)?;
-        let bringup = Bringup::new(spec, spec.mode, TIMING, id(base, opcode::GAUGES));
-        let claim = Claim {
-            mask: !0xF,
-            ..Claim::exclusive(id(base, 0))
-        };
-        let calibration = Calibration::new(base, spec.mode, options);
-        let this = Self {
-            base,
-            mode: spec.mode,
-            period,
-            firsts: ArrayVec::new(),
-            seconds: ArrayVec::new(),
-            joined: true,
-            asked: None,
-            untrusted: Nanos::MIN,
-            open: None,
-            next: Nanos::MIN,
-            outcome: None,
-        };
-        Ok(Supervised::boxed([claim], bringup, calibration, this))
-    }
-
     /// Drops the halves that wait.
     fn drop_all(&mut self, link: &mut Link<Calibration>, frame: &Frame, out: &mut Decoded) {
         let halves = self.firsts.len() + self.seconds.len();
@@ -208,6 +182,39 @@ fn give(
         ..Output::new(0, frame, quality, reading)
     };
     out.push(output, frame.id);
+}
+
+impl Driver for AtiNetcanoemOptions {
+    const NAME: &'static str = "ati_netcanoem";
+    const ADDRESS: Option<u32> = Some(0x20);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Wrench)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let (base, period) = self.check(spec)?;
+        let bringup = Bringup::new(spec, spec.mode, TIMING, id(base, opcode::GAUGES));
+        let claim = Claim {
+            mask: !0xF,
+            ..Claim::exclusive(id(base, 0))
+        };
+        let calibration = Calibration::new(base, spec.mode, self);
+        let this = Netcanoem {
+            base,
+            mode: spec.mode,
+            period,
+            firsts: ArrayVec::new(),
+            seconds: ArrayVec::new(),
+            joined: true,
+            asked: None,
+            untrusted: Nanos::MIN,
+            open: None,
+            next: Nanos::MIN,
+            outcome: None,
+        };
+        Ok(Supervised::boxed([claim], bringup, calibration, this))
+    }
 }
 
 impl Family for Netcanoem {

@@ -4,16 +4,20 @@ use super::layout::{Quantity, fields, values};
 use super::options::CanopenDriveOptions;
 use super::start::{Scales, Start};
 use crate::bringup::Bringup;
-use crate::bytes;
 use crate::canopen::{
     self, Cycle, NMT, NodeState, Plan, Rates, SYNC, Script, nmt, node_of, sdo_from, tpdo,
 };
 use crate::family::{Family, Link, Supervised};
-use crate::{Claim, Decoded, Device, Frame, Id, Output, Spec, SpecError};
+use crate::objects::Objects;
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Id, Output, OutputInfo, Spec, SpecError, bytes,
+};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Refusal, StampKind};
+use proprio_topics::{
+    Actuator, Counter, JointState, Kind, Nanos, Quality, Reading, Refusal, StampKind,
+};
 
 /// The fault bit of the status word.
 const FAULT: u32 = 1 << 3;
@@ -112,44 +116,6 @@ pub(super) struct Drive {
 }
 
 impl Drive {
-    pub(super) fn device(
-        spec: &Spec,
-        options: &CanopenDriveOptions,
-    ) -> Result<Box<dyn Device>, SpecError> {
-        options.check()?;
-        let node = node_of(spec)?;
-        canopen::check_file(node, options.objects.as_ref())?;
-        let start = Start::new(node, spec.mode, options)?;
-        let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, tpdo(node, 0));
-        bringup.start_with(NMT, &[nmt::START, node]);
-        let pdos = start.ids.iter().map(|id| Claim::exclusive(*id));
-        let claims: Vec<Claim> = canopen::claims(node)
-            .chain(pdos)
-            .chain([Claim::shared(SYNC)])
-            .collect();
-        let script = Script::new(node, spec.mode, start);
-        let this = Self {
-            node,
-            hold: Nanos::from_seconds(options.hold_ms * 1e-3),
-            table: None,
-            cycle: Cycle::new(0),
-            sync: None,
-            since_sync: [const { None }; 4],
-            measured: None,
-            have: 0,
-            began: Nanos::MIN,
-            suspect: false,
-            synced: None,
-            rates: Rates::default(),
-            values: [None; Quantity::JOINT],
-            status: 0,
-            mode: 0,
-            error: None,
-            state: NodeState::default(),
-        };
-        Ok(Supervised::boxed(claims, bringup, script, this))
-    }
-
     /// Makes the table, if all that it needs is known.
     fn prepare(&mut self, plan: &Start) {
         if let (Ok(()), Ok(scales)) = (plan.ready(), plan.scales()) {
@@ -323,6 +289,57 @@ impl Drive {
         let mut output = Output::new(0, frame, quality, reading);
         (output.acquired, output.stamp) = measured.unwrap_or((frame.t, frame.stamp));
         out.push(output, frame.id);
+    }
+}
+
+impl Driver for CanopenDriveOptions {
+    const NAME: &'static str = "canopen_drive";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Joint)].to_vec()
+    }
+
+    fn eds(&self) -> Option<&str> {
+        self.eds.as_deref()
+    }
+
+    fn describe_objects(&mut self, objects: Objects) {
+        self.objects = Some(objects);
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        self.check()?;
+        let node = node_of(spec)?;
+        canopen::check_file(node, self.objects.as_ref())?;
+        let start = Start::new(node, spec.mode, self)?;
+        let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, tpdo(node, 0));
+        bringup.start_with(NMT, &[nmt::START, node]);
+        let pdos = start.ids.iter().map(|id| Claim::exclusive(*id));
+        let claims: Vec<Claim> = canopen::claims(node)
+            .chain(pdos)
+            .chain([Claim::shared(SYNC)])
+            .collect();
+        let script = Script::new(node, spec.mode, start);
+        let this = Drive {
+            node,
+            hold: Nanos::from_seconds(self.hold_ms * 1e-3),
+            table: None,
+            cycle: Cycle::new(0),
+            sync: None,
+            since_sync: [const { None }; 4],
+            measured: None,
+            have: 0,
+            began: Nanos::MIN,
+            suspect: false,
+            synced: None,
+            rates: Rates::default(),
+            values: [None; Quantity::JOINT],
+            status: 0,
+            mode: 0,
+            error: None,
+            state: NodeState::default(),
+        };
+        Ok(Supervised::boxed(claims, bringup, script, this))
     }
 }
 

@@ -5,9 +5,12 @@ use super::options::{Checked, CubemarsOptions, Effort};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Link, Supervised, temperature};
 use crate::held::OnChange;
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, bytes, mit};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
+};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, Reading};
+use alloc::vec::Vec;
+use proprio_topics::{Actuator, Counter, Kind, Reading};
 
 /// The host's side of a motor.
 #[derive(Debug)]
@@ -18,23 +21,6 @@ pub(super) struct Motor {
 }
 
 impl Motor {
-    pub(super) fn device(
-        spec: &Spec,
-        options: &CubemarsOptions,
-    ) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, options)?;
-        let claim = match keys.layout {
-            Layout::Mit { .. } => Claim::shared(keys.id),
-            Layout::Servo => Claim::exclusive(keys.id),
-        };
-        let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, keys.id);
-        let this = Self {
-            keys,
-            told: OnChange::NOTHING,
-        };
-        Ok(Supervised::boxed([claim], bringup, NoInquiry, this))
-    }
-
     /// Tells the state of the power stage if its error is new, and now and then.
     fn stage(&mut self, stage: Stage, frame: &Frame, out: &mut Decoded) {
         if !self.told.is_due(stage.error, frame) {
@@ -49,6 +35,29 @@ impl Motor {
         let quality = quality_of(stage.error);
         out.push(Output::new(JOINT, frame, quality, actuator), frame.id);
         temperature(DRIVE, stage.celsius, frame, out);
+    }
+}
+
+impl Driver for CubemarsOptions {
+    const NAME: &'static str = "cubemars";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let drive = OutputInfo::temperature(DRIVE, "drive");
+        [OutputInfo::new(JOINT, Kind::Joint), drive].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let keys = Checked::new(spec, self)?;
+        let claim = match keys.layout {
+            Layout::Mit { .. } => Claim::shared(keys.id),
+            Layout::Servo => Claim::exclusive(keys.id),
+        };
+        let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, keys.id);
+        let this = Motor {
+            keys,
+            told: OnChange::NOTHING,
+        };
+        Ok(Supervised::boxed([claim], bringup, NoInquiry, this))
     }
 }
 

@@ -3,7 +3,7 @@
 use super::frames::SERVO_STATUS;
 use super::options::CubemarsOptions;
 use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
-use crate::{Driver, Frame, Id};
+use crate::{Driver, Frame, Id, Recognise};
 use alloc::vec::Vec;
 
 /// Errors, and that there is none.
@@ -16,11 +16,12 @@ fn has_error(byte: Option<&u8>) -> bool {
     byte.is_some_and(|error| usize::from(*error) < ERRORS)
 }
 
-/// The motors that `seen` shows.
-pub(super) fn motors(seen: &Traffic) -> Vec<Finding> {
-    let servo = (0..=0xFE_u8).filter_map(|number| servo(seen, number));
-    let mit = seen.streams().flat_map(|stream| mit(seen, stream));
-    servo.chain(mit).collect()
+impl Recognise for CubemarsOptions {
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let servo = (0..=0xFE_u8).filter_map(|number| servo(seen, number));
+        let mit = seen.streams().flat_map(|stream| mit(seen, stream));
+        servo.chain(mit).collect()
+    }
 }
 
 fn finding(evidence: Evidence<'_>, number: u8, what: &str, mode: &str) -> Option<Finding> {

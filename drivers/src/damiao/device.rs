@@ -8,9 +8,12 @@ use super::ranges::Ranges;
 use crate::bringup::{Bringup, Timing};
 use crate::family::{Family, Link, Rounds, Supervised, temperature};
 use crate::held::OnChange;
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, bytes, mit};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
+};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, Nanos, Quality, Reading};
+use alloc::vec::Vec;
+use proprio_topics::{Actuator, Counter, Kind, Nanos, Quality, Reading};
 
 /// The host's side of a motor.
 #[derive(Debug)]
@@ -22,26 +25,6 @@ pub(super) struct Motor {
 }
 
 impl Motor {
-    pub(super) fn device(
-        spec: &Spec,
-        options: &DamiaoOptions,
-    ) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, options)?;
-        let (mode, timing) = match keys.request_period {
-            Some(_) => (spec.mode, Timing::POLLED),
-            None => (Mode::Listen, Timing::LISTENED),
-        };
-        let bringup = Bringup::new(spec, mode, timing, keys.id);
-        let this = Self {
-            keys,
-            told: OnChange::NOTHING,
-            questions: Rounds::new(keys.request_period),
-        };
-        let claims = [Claim::shared(keys.id)];
-        let ranges = Ranges::new(keys, mode);
-        Ok(Supervised::boxed(claims, bringup, ranges, this))
-    }
-
     fn state(&mut self, told: &State, frame: &Frame, link: &mut Link<Ranges>, out: &mut Decoded) {
         let Some(scales) = link.questions.scales() else {
             return out.fault(Counter::Unexpected, 1, frame.id);
@@ -63,6 +46,37 @@ impl Motor {
         }
         let (state, saturated) = mit::measured(scales, told.raw);
         link.joint(JOINT, frame, quality | saturated, state, out);
+    }
+}
+
+impl Driver for DamiaoOptions {
+    const NAME: &'static str = "damiao";
+
+    fn needs_fd(&self) -> bool {
+        self.fd
+    }
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let temperature = OutputInfo::temperature;
+        let joint = OutputInfo::new(JOINT, Kind::Joint);
+        [joint, temperature(MOTOR, "motor"), temperature(FET, "fet")].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let keys = Checked::new(spec, self)?;
+        let (mode, timing) = match keys.request_period {
+            Some(_) => (spec.mode, Timing::POLLED),
+            None => (Mode::Listen, Timing::LISTENED),
+        };
+        let bringup = Bringup::new(spec, mode, timing, keys.id);
+        let this = Motor {
+            keys,
+            told: OnChange::NOTHING,
+            questions: Rounds::new(keys.request_period),
+        };
+        let claims = [Claim::shared(keys.id)];
+        let ranges = Ranges::new(keys, mode);
+        Ok(Supervised::boxed(claims, bringup, ranges, this))
     }
 }
 

@@ -3,7 +3,7 @@
 use super::frames::{Message, QUESTIONS, RANGES, READ, STATE, State, question};
 use super::options::DamiaoOptions;
 use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
-use crate::{Driver, Frame, Id};
+use crate::{Driver, Frame, Id, Recognise};
 use alloc::vec::Vec;
 
 /// How many motors a scan asks: people number them from 1 on.
@@ -40,19 +40,33 @@ fn message(frame: &Frame, address: u8) -> Option<Message> {
 /// those with the identifiers that most motors have.
 const MOTORS: usize = 32;
 
-/// The motors that `seen` shows.
-pub(super) fn motors(seen: &Traffic) -> Vec<Finding> {
-    let form = |frame: &Frame| {
-        let half = frame.data().first().map(|first| first & 0xF);
-        half.is_some_and(|half| message(frame, half).is_some())
-    };
-    let has_form = |stream: &&Stream| stream.frames > 0 && stream.recent().rev().take(4).all(form);
-    let mut streams: Vec<&Stream> = seen.streams().filter(has_form).collect();
-    if streams.len() > MOTORS {
-        streams.retain(|stream| stream.id.raw() < 0x20);
+impl Recognise for DamiaoOptions {
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let form = |frame: &Frame| {
+            let half = frame.data().first().map(|first| first & 0xF);
+            half.is_some_and(|half| message(frame, half).is_some())
+        };
+        let has_form =
+            |stream: &&Stream| stream.frames > 0 && stream.recent().rev().take(4).all(form);
+        let mut streams: Vec<&Stream> = seen.streams().filter(has_form).collect();
+        if streams.len() > MOTORS {
+            streams.retain(|stream| stream.id.raw() < 0x20);
+        }
+        let on = |stream: &Stream| on(seen, stream);
+        streams.into_iter().flat_map(on).collect()
     }
-    let on = |stream: &Stream| on(seen, stream);
-    streams.into_iter().flat_map(on).collect()
+
+    /// The state and a range of the first motors.
+    fn questions(_seen: &Traffic) -> Vec<Frame> {
+        let [range, ..] = RANGES;
+        let asked = |address| {
+            [
+                question(address, false, STATE, 0),
+                question(address, false, READ, range),
+            ]
+        };
+        (1..=ASKED).flat_map(asked).collect()
+    }
 }
 
 /// The motors that answer on the identifier of `stream`.
@@ -155,16 +169,4 @@ fn motor(
             .with_joints([0])
             .with_commands([command..=command]),
     )
-}
-
-/// The state and a range of the first motors.
-pub(super) fn questions() -> Vec<Frame> {
-    let [range, ..] = RANGES;
-    let asked = |address| {
-        [
-            question(address, false, STATE, 0),
-            question(address, false, READ, range),
-        ]
-    };
-    (1..=ASKED).flat_map(asked).collect()
 }

@@ -2,13 +2,14 @@
 
 use super::layout::{Layout, Part, Role, implies, shared};
 use super::options::DbcOptions;
-use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError};
+use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Nanos, Quality, Reading};
 
 /// A simulated device that a .dbc file describes. Signals that the keys do not name are zero.
 #[derive(Debug)]
-pub struct DbcBoard {
+struct DbcBoard {
     layout: Layout,
     period: Nanos,
     frames: Vec<Pending>,
@@ -28,15 +29,11 @@ struct Pending {
     fresh: u128,
 }
 
-impl DbcBoard {
+impl Simulate for DbcOptions {
     /// A device after power-on.
-    ///
-    /// # Errors
-    /// [`SpecError::Description`]: keys and file do not fit each other; [`SpecError::Key`] for a
-    /// period outside 1 to 60000 ms.
-    pub fn new(spec: &Spec, options: &DbcOptions) -> Result<Self, SpecError> {
-        let layout = Layout::new(spec, options)?;
-        let period_ms = options.period_ms.unwrap_or(10);
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        let layout = Layout::new(spec, self)?;
+        let period_ms = self.period_ms.unwrap_or(10);
         if !(1..=60_000).contains(&period_ms) {
             return Err(SpecError::Key {
                 key: "period_ms",
@@ -62,7 +59,7 @@ impl DbcBoard {
             }
         }
         let readings = 0..layout.readings.len();
-        Ok(Self {
+        Ok(Box::new(DbcBoard {
             orders: readings
                 .clone()
                 .map(|reading| layout.order(reading))
@@ -71,7 +68,7 @@ impl DbcBoard {
             layout,
             period: Nanos::from_millis(i64::from(period_ms)),
             frames,
-        })
+        }))
     }
 }
 

@@ -2,11 +2,15 @@
 //! come.
 
 use super::layout::{Field, Layout, Part, ReadingLayout, Role};
-use super::options::DbcOptions;
+use super::options::{DbcOptions, ReadingKeys};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Link, Supervised};
 use crate::pairing::within;
-use crate::{Claim, Decoded, Device, Format, Frame, Id, Mode, Output, Spec, SpecError};
+use crate::signal::Message;
+use crate::{
+    Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, Output, OutputInfo, Spec, SpecError,
+};
+use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::reading::VALUES;
@@ -61,38 +65,6 @@ struct Assembly {
     last_count: Option<u64>,
     /// The largest count.
     most: u64,
-}
-
-impl DbcDevice {
-    /// A device in its initial state.
-    ///
-    /// # Errors
-    /// [`SpecError::Description`]: keys and file do not fit each other.
-    pub(super) fn device(spec: &Spec, options: &DbcOptions) -> Result<Box<dyn Device>, SpecError> {
-        let layout = Layout::new(spec, options)?;
-        let claims: Vec<Claim> = layout.messages.iter().map(|m| m.frames).collect();
-        let watched = (layout.order(0).first())
-            .and_then(|number| layout.messages.get(*number))
-            .map_or(Id::standard(0), |message| message.frames.id);
-        let readings = layout.readings.iter().enumerate();
-        let readings = readings.map(|(number, reading)| {
-            let parts = layout.messages.iter().flat_map(|message| &message.parts);
-            let fields = parts
-                .filter(|part| part.reading == number)
-                .flat_map(|part| &part.fields);
-            let counter = fields.filter(|field| field.role == Role::Counter);
-            let most = counter
-                .map(|field| u64::MAX >> (64 - field.bits.length()))
-                .max();
-            Assembly::new(reading, most.unwrap_or(0))
-        });
-        let bringup = Bringup::new(spec, Mode::Listen, TIMING, watched);
-        let this = Self {
-            readings: readings.collect(),
-            layout,
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
 }
 
 impl Assembly {
@@ -281,6 +253,58 @@ impl Assembly {
             device_counter,
             ..Output::new(number, frame, quality, reading)
         })
+    }
+}
+
+impl Driver for DbcOptions {
+    const NAME: &'static str = "dbc";
+    const ADDRESS: Option<u32> = Some(0);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let info = |(number, reading): (u8, &ReadingKeys)| OutputInfo {
+            number,
+            kind: reading.kind,
+            suffix: Cow::Owned(reading.name.clone()),
+        };
+        (0..).zip(&self.reading).map(info).collect()
+    }
+
+    fn states_period(&self) -> bool {
+        self.period_ms.is_some()
+    }
+
+    fn description(&self) -> Option<&str> {
+        Some(&self.file)
+    }
+
+    fn describe(&mut self, messages: Vec<Message>) {
+        self.messages = messages;
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let layout = Layout::new(spec, self)?;
+        let claims: Vec<Claim> = layout.messages.iter().map(|m| m.frames).collect();
+        let watched = (layout.order(0).first())
+            .and_then(|number| layout.messages.get(*number))
+            .map_or(Id::standard(0), |message| message.frames.id);
+        let readings = layout.readings.iter().enumerate();
+        let readings = readings.map(|(number, reading)| {
+            let parts = layout.messages.iter().flat_map(|message| &message.parts);
+            let fields = parts
+                .filter(|part| part.reading == number)
+                .flat_map(|part| &part.fields);
+            let counter = fields.filter(|field| field.role == Role::Counter);
+            let most = counter
+                .map(|field| u64::MAX >> (64 - field.bits.length()))
+                .max();
+            Assembly::new(reading, most.unwrap_or(0))
+        });
+        let bringup = Bringup::new(spec, Mode::Listen, TIMING, watched);
+        let this = DbcDevice {
+            readings: readings.collect(),
+            layout,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 

@@ -5,9 +5,9 @@ use super::frames::{
     sensor,
 };
 use super::options::{IcubImuOptions, Plan};
-use crate::bytes;
 use crate::icub::{self, class, command};
-use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
+use crate::{Board, EncodeError, Frame, Frames, Mode, Simulate, Spec, SpecError, board, bytes};
+use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading};
 
 /// Duration of a simulated board's acquisition \[us\]; real boards take 2 to 6 ms.
@@ -15,7 +15,7 @@ const ACQUISITION_US: u32 = 4000;
 
 /// The board's own side.
 #[derive(Debug)]
-pub struct ImuBoard {
+struct ImuBoard {
     plan: Plan,
     period: Nanos,
     streaming: bool,
@@ -28,22 +28,6 @@ pub struct ImuBoard {
 }
 
 impl ImuBoard {
-    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
-    ///
-    /// # Errors
-    /// As [`ImuDevice::new`](super::ImuDevice::new).
-    pub fn new(spec: &Spec, options: &IcubImuOptions) -> Result<Self, SpecError> {
-        let plan = Plan::new(spec, options)?;
-        Ok(Self {
-            period: Nanos::from_millis(i64::from(plan.period_ms)),
-            streaming: spec.mode == Mode::Listen,
-            configuration: None,
-            legacy_mask: None,
-            sequence: 0,
-            plan,
-        })
-    }
-
     /// The plan for encoding a reading: the configuration received, else the keys.
     fn mask(&self) -> u16 {
         match (self.plan.legacy, self.configuration, self.legacy_mask) {
@@ -68,6 +52,21 @@ impl ImuBoard {
             icub::stream(class::PERIODIC_INERTIAL, self.plan.address, kind),
             data,
         ));
+    }
+}
+
+impl Simulate for IcubImuOptions {
+    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        let plan = Plan::new(spec, self)?;
+        Ok(Box::new(ImuBoard {
+            period: Nanos::from_millis(i64::from(plan.period_ms)),
+            streaming: spec.mode == Mode::Listen,
+            configuration: None,
+            legacy_mask: None,
+            sequence: 0,
+            plan,
+        }))
     }
 }
 
@@ -128,12 +127,7 @@ impl Board for ImuBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        let Reading::Imu(imu) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
+        let imu = board::only_imu(output, reading)?;
         let mask = self.mask();
         let sends = |quantity: Quantity| mask & quantity.bit() != 0;
         let finite = |values: &[f64]| values.iter().all(|value| value.is_finite());

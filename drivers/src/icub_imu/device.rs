@@ -6,15 +6,17 @@ use super::frames::{
 };
 use super::options::{IcubImuOptions, Plan};
 use crate::bringup::Bringup;
-use crate::bytes;
 use crate::configure::{Configure, Setting};
 use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{self, Limit, Order, Paired, Pairing};
-use crate::{Claim, Decoded, Device, Frame, NotSent, Output, Spec, SpecError};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
+};
 use alloc::boxed::Box;
+use alloc::vec::Vec;
 use arrayvec::ArrayVec;
-use proprio_topics::{Counter, Imu, Nanos, Quality, Reading, StampKind};
+use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, StampKind};
 
 /// A frame up to this many sequence numbers back is late; further back, the counter has restarted
 /// or there is a long gap.
@@ -64,71 +66,6 @@ pub(super) struct ImuDevice {
 }
 
 impl ImuDevice {
-    pub(super) fn device(
-        spec: &Spec,
-        options: &IcubImuOptions,
-    ) -> Result<Box<dyn Device>, SpecError> {
-        let plan = Plan::new(spec, options)?;
-        let timing = icub::timing(options.power_on_silence_ms)?;
-        let is_legacy = plan.legacy != Legacy::None;
-        let kinds: &[u8] = if is_legacy {
-            &[kind::LEGACY_ACCELEROMETER, kind::LEGACY_GYROSCOPE]
-        } else {
-            &[kind::TRIPLE, kind::QUATERNION, kind::STATUS]
-        };
-        let watched = icub::stream(
-            class::PERIODIC_INERTIAL,
-            plan.address,
-            *kinds.first().unwrap_or(&kind::TRIPLE),
-        );
-        let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
-        let id = icub::to_board(class::POLLING_ANALOG, plan.address);
-        let mut claims: ArrayVec<Claim, 4> =
-            icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);
-        if is_legacy {
-            bringup.start_with(
-                id,
-                &[command::ACC_GYRO_SETUP, plan.legacy_mask, plan.period_ms],
-            );
-            bringup.stop_with(id, &[command::ACC_GYRO_SETUP, 0, 0]);
-        } else {
-            bringup.start_with(id, &[command::IMU_TRANSMIT, plan.period_ms]);
-            bringup.stop_with(id, &[command::IMU_TRANSMIT, 0]);
-            claims.push(Claim::shared(icub::to_host(
-                class::POLLING_ANALOG,
-                plan.address,
-            )));
-        }
-        let setting = Setting {
-            set: Frame::new(id, &plan.configuration),
-            get: Frame::new(id, &[command::IMU_CONFIG_GET]),
-            // Mask, mode and orientation; the rest is unused.
-            compared: 1..5,
-        };
-        let period = Nanos::from_millis(i64::from(plan.period_ms));
-        // Legacy boards have no such configuration.
-        let configure = Configure::new(spec, (!is_legacy).then_some(setting), icub::TIMING);
-        let this = Self {
-            acquisition: Acquisition::NONE,
-            sequence: None,
-            may_jump: Nanos::MIN,
-            not_calibrated: false,
-            // A BNO055 board sends the accelerometer first; the order of an mtb is not documented.
-            legacy: Pairing::new(
-                Limit::of_period(period),
-                match plan.legacy {
-                    Legacy::Bno055 => Order::Usual,
-                    _ => Order::Any,
-                },
-            ),
-            together: Nanos(period.0 / 2),
-            gap: false,
-            seen: false,
-            plan,
-        };
-        Ok(Supervised::boxed(claims, bringup, configure, this))
-    }
-
     /// Whether a frame with `sequence` belongs to the open acquisition; a later `sequence` opens a
     /// new one.
     fn belongs(&mut self, sequence: u8, frame: &Frame, out: &mut Decoded) -> bool {
@@ -357,6 +294,76 @@ fn vector(data: &[u8], at: usize) -> [i16; 3] {
         bytes::i16_le(data, at + 2),
         bytes::i16_le(data, at + 4),
     ]
+}
+
+impl Driver for IcubImuOptions {
+    const NAME: &'static str = "icub_imu";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Imu)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let plan = Plan::new(spec, self)?;
+        let timing = icub::timing(self.power_on_silence_ms)?;
+        let is_legacy = plan.legacy != Legacy::None;
+        let kinds: &[u8] = if is_legacy {
+            &[kind::LEGACY_ACCELEROMETER, kind::LEGACY_GYROSCOPE]
+        } else {
+            &[kind::TRIPLE, kind::QUATERNION, kind::STATUS]
+        };
+        let watched = icub::stream(
+            class::PERIODIC_INERTIAL,
+            plan.address,
+            *kinds.first().unwrap_or(&kind::TRIPLE),
+        );
+        let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
+        let id = icub::to_board(class::POLLING_ANALOG, plan.address);
+        let mut claims: ArrayVec<Claim, 4> =
+            icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);
+        if is_legacy {
+            bringup.start_with(
+                id,
+                &[command::ACC_GYRO_SETUP, plan.legacy_mask, plan.period_ms],
+            );
+            bringup.stop_with(id, &[command::ACC_GYRO_SETUP, 0, 0]);
+        } else {
+            bringup.start_with(id, &[command::IMU_TRANSMIT, plan.period_ms]);
+            bringup.stop_with(id, &[command::IMU_TRANSMIT, 0]);
+            claims.push(Claim::shared(icub::to_host(
+                class::POLLING_ANALOG,
+                plan.address,
+            )));
+        }
+        let setting = Setting {
+            set: Frame::new(id, &plan.configuration),
+            get: Frame::new(id, &[command::IMU_CONFIG_GET]),
+            // Mask, mode and orientation; the rest is unused.
+            compared: 1..5,
+        };
+        let period = Nanos::from_millis(i64::from(plan.period_ms));
+        // Legacy boards have no such configuration.
+        let configure = Configure::new(spec, (!is_legacy).then_some(setting), icub::TIMING);
+        let this = ImuDevice {
+            acquisition: Acquisition::NONE,
+            sequence: None,
+            may_jump: Nanos::MIN,
+            not_calibrated: false,
+            // A BNO055 board sends the accelerometer first; the order of an mtb is not documented.
+            legacy: Pairing::new(
+                Limit::of_period(period),
+                match plan.legacy {
+                    Legacy::Bno055 => Order::Usual,
+                    _ => Order::Any,
+                },
+            ),
+            together: Nanos(period.0 / 2),
+            gap: false,
+            seen: false,
+            plan,
+        };
+        Ok(Supervised::boxed(claims, bringup, configure, this))
+    }
 }
 
 impl Family for ImuDevice {

@@ -5,18 +5,18 @@ use super::exchange::{Exchange, Told};
 use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind};
 use super::options::{IcubStrainOptions, Stream};
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry};
-use crate::bytes;
 use crate::family::{Family, Link, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{Limit, Order, Paired, Pairing};
 use crate::{
     Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
-    Frame, Mode, NotSent, Output, Spec, SpecError,
+    Driver, Frame, Mode, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
 };
 use alloc::boxed::Box;
+use alloc::vec::Vec;
 use arrayvec::ArrayVec;
 use proprio_topics::{
-    Counter, Gauges, Nanos, Quality, Reading, Refusal, StampKind, Temperature, Wrench,
+    Counter, Gauges, Kind, Nanos, Quality, Reading, Refusal, StampKind, Temperature, Wrench,
 };
 
 /// The full scales: configured, requested axis by axis, or from replies to another program.
@@ -242,69 +242,6 @@ pub(super) struct Strain {
 }
 
 impl Strain {
-    pub(super) fn device(
-        spec: &Spec,
-        options: &IcubStrainOptions,
-    ) -> Result<Box<dyn Device>, SpecError> {
-        let address = icub::address(spec)?;
-        let period = icub::period_ms("period_ms", options.period_ms)?;
-        let configured = options.full_scale(false)?;
-        let timing = icub::timing(options.power_on_silence_ms)?;
-        let limit = match options.pair_timeout_ms {
-            None => Limit::of_period(Nanos::from_millis(i64::from(period))),
-            Some(ms) if ms.is_finite() && ms > 0.0 && ms <= 1000.0 => {
-                Limit::fixed(Nanos::from_seconds(ms * 1e-3))
-            }
-            Some(value) => {
-                return Err(SpecError::Key {
-                    key: "pair_timeout_ms",
-                    value,
-                    expected: "above 0 and at most 1000",
-                });
-            }
-        };
-        let (force, command_id) = (
-            icub::stream(class::PERIODIC_ANALOG, address, kind::FORCE),
-            icub::to_board(class::POLLING_ANALOG, address),
-        );
-        let watched = match options.stream {
-            Stream::Uncalibrated => icub::stream(class::PERIODIC_ANALOG, address, kind::RAW_FORCE),
-            Stream::Calibrated | Stream::Both => force,
-        };
-        let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
-        bringup.start_with(command_id, &[command::SET_CANDATARATE, period]);
-        if let Some(seconds) = options.temperature_period_s {
-            let seconds = icub::period_ms("temperature_period_s", seconds)?;
-            bringup.start_with(command_id, &[command::THERMOMETER_CONFIG_SET, 1]);
-            bringup.start_with(command_id, &[command::THERMOMETER_TRANSMIT, seconds]);
-            bringup.stop_with(command_id, &[command::THERMOMETER_TRANSMIT, 0]);
-        }
-        bringup.start_with(command_id, &[command::SET_TXMODE, options.stream.code()]);
-        bringup.stop_with(command_id, &[command::SET_TXMODE, 1]);
-        let mut claims: ArrayVec<Claim, 7> = icub::claims(
-            class::PERIODIC_ANALOG,
-            address,
-            &[
-                kind::FORCE,
-                kind::TORQUE,
-                kind::RAW_FORCE,
-                kind::RAW_TORQUE,
-                kind::THERMOMETER,
-                kind::THERMOMETER_FIRMWARE,
-            ],
-        );
-        claims.push(Claim::shared(icub::to_host(class::POLLING_ANALOG, address)));
-        let scales = FullScales::new(address, configured, options.stream);
-        let this = Self {
-            address,
-            exchange: Exchange::new(address),
-            stream: options.stream,
-            calibrated: Pair::new(limit),
-            raw: Pair::new(limit),
-        };
-        Ok(Supervised::boxed(claims, bringup, scales, this))
-    }
-
     /// Outputs a reading from its two frames.
     fn give(
         &mut self,
@@ -391,6 +328,74 @@ impl Strain {
         });
         let quality = whole.quality | self.raw.take_gap();
         self.give(&whole, quality, reading, frame, link, out);
+    }
+}
+
+impl Driver for IcubStrainOptions {
+    const NAME: &'static str = "icub_strain";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Wrench)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let address = icub::address(spec)?;
+        let period = icub::period_ms("period_ms", self.period_ms)?;
+        let configured = self.full_scale(false)?;
+        let timing = icub::timing(self.power_on_silence_ms)?;
+        let limit = match self.pair_timeout_ms {
+            None => Limit::of_period(Nanos::from_millis(i64::from(period))),
+            Some(ms) if ms.is_finite() && ms > 0.0 && ms <= 1000.0 => {
+                Limit::fixed(Nanos::from_seconds(ms * 1e-3))
+            }
+            Some(value) => {
+                return Err(SpecError::Key {
+                    key: "pair_timeout_ms",
+                    value,
+                    expected: "above 0 and at most 1000",
+                });
+            }
+        };
+        let (force, command_id) = (
+            icub::stream(class::PERIODIC_ANALOG, address, kind::FORCE),
+            icub::to_board(class::POLLING_ANALOG, address),
+        );
+        let watched = match self.stream {
+            Stream::Uncalibrated => icub::stream(class::PERIODIC_ANALOG, address, kind::RAW_FORCE),
+            Stream::Calibrated | Stream::Both => force,
+        };
+        let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
+        bringup.start_with(command_id, &[command::SET_CANDATARATE, period]);
+        if let Some(seconds) = self.temperature_period_s {
+            let seconds = icub::period_ms("temperature_period_s", seconds)?;
+            bringup.start_with(command_id, &[command::THERMOMETER_CONFIG_SET, 1]);
+            bringup.start_with(command_id, &[command::THERMOMETER_TRANSMIT, seconds]);
+            bringup.stop_with(command_id, &[command::THERMOMETER_TRANSMIT, 0]);
+        }
+        bringup.start_with(command_id, &[command::SET_TXMODE, self.stream.code()]);
+        bringup.stop_with(command_id, &[command::SET_TXMODE, 1]);
+        let mut claims: ArrayVec<Claim, 7> = icub::claims(
+            class::PERIODIC_ANALOG,
+            address,
+            &[
+                kind::FORCE,
+                kind::TORQUE,
+                kind::RAW_FORCE,
+                kind::RAW_TORQUE,
+                kind::THERMOMETER,
+                kind::THERMOMETER_FIRMWARE,
+            ],
+        );
+        claims.push(Claim::shared(icub::to_host(class::POLLING_ANALOG, address)));
+        let scales = FullScales::new(address, configured, self.stream);
+        let this = Strain {
+            address,
+            exchange: Exchange::new(address),
+            stream: self.stream,
+            calibrated: Pair::new(limit),
+            raw: Pair::new(limit),
+        };
+        Ok(Supervised::boxed(claims, bringup, scales, this))
     }
 }
 

@@ -5,15 +5,15 @@ use super::options::Jr3CanOptions;
 use super::protocol::{READY, SAMPLE, STEPS, id, node, op, op_of};
 use super::scales::{FullScales, Question};
 use crate::bringup::{Bringup, Timing};
-use crate::bytes;
 use crate::family::{Family, Link, Supervised};
 use crate::wrench::{NewZero, TareCommand, at_end};
 use crate::{
     Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
-    Frame, Mode, NotSent, Output, Spec, SpecError,
+    Driver, Frame, Mode, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
 };
 use alloc::boxed::Box;
-use proprio_topics::{Counter, Nanos, Quality, Reading, Refusal, StampKind, Wrench};
+use alloc::vec::Vec;
+use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Refusal, StampKind, Wrench};
 
 /// A command that is not acknowledged within this time has taken effect, or was lost.
 const ACKNOWLEDGED: Nanos = Nanos::from_millis(100);
@@ -55,43 +55,6 @@ pub(super) struct Jr3 {
 }
 
 impl Jr3 {
-    pub(super) fn device(
-        spec: &Spec,
-        options: &Jr3CanOptions,
-    ) -> Result<Box<dyn Device>, SpecError> {
-        let node = node(spec)?;
-        let (period, cutoff) = (options.period()?, options.cutoff()?);
-        let scales = FullScales::new(node, options.full_scale()?);
-        let mut bringup = Bringup::new(spec, spec.mode, Timing::USUAL, id(op::FORCE, node));
-        let [c0, c1] = cutoff.to_le_bytes();
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // at most a second
-        let [p0, p1, p2, p3] = ((period.0 / 1000) as u32).to_le_bytes();
-        bringup.start_with(id(op::START, node), &[c0, c1, p0, p1, p2, p3]);
-        bringup.stop_with(id(op::STOP, node), &[]);
-        let own = [op::FORCE, op::MOMENT, op::ACKNOWLEDGE, op::BOOT_UP];
-        let heard = [
-            op::START_SYNC,
-            op::START,
-            op::ZERO,
-            op::GET_FORCE_SCALES,
-            op::GET_MOMENT_SCALES,
-        ];
-        let own = own.map(|op| Claim::exclusive(id(op, node)));
-        let heard = heard.map(|op| Claim::shared(id(op, node)));
-        let this = Self {
-            node,
-            period,
-            waiting: None,
-            joined: false,
-            last: None,
-            zero: NewZero::default(),
-            tare: TareCommand::default(),
-            outcome: None,
-        };
-        let claims = own.into_iter().chain(heard);
-        Ok(Supervised::boxed(claims, bringup, scales, this))
-    }
-
     /// A command that changes the zero was sent at `t`.
     fn expect_zero(&mut self, t: Nanos) {
         self.zero.expect(t + ACKNOWLEDGED);
@@ -193,6 +156,49 @@ impl Jr3 {
     fn periods(&self, samples: u16) -> u32 {
         let passed = i64::from(samples) * SAMPLE.0;
         u32::try_from((passed + self.period.0 / 2) / self.period.0).unwrap_or(0)
+    }
+}
+
+impl Driver for Jr3CanOptions {
+    const NAME: &'static str = "jr3_can";
+    const ADDRESS: Option<u32> = Some(1);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Wrench)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let node = node(spec)?;
+        let (period, cutoff) = (self.period()?, self.cutoff()?);
+        let scales = FullScales::new(node, self.full_scale()?);
+        let mut bringup = Bringup::new(spec, spec.mode, Timing::USUAL, id(op::FORCE, node));
+        let [c0, c1] = cutoff.to_le_bytes();
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // at most a second
+        let [p0, p1, p2, p3] = ((period.0 / 1000) as u32).to_le_bytes();
+        bringup.start_with(id(op::START, node), &[c0, c1, p0, p1, p2, p3]);
+        bringup.stop_with(id(op::STOP, node), &[]);
+        let own = [op::FORCE, op::MOMENT, op::ACKNOWLEDGE, op::BOOT_UP];
+        let heard = [
+            op::START_SYNC,
+            op::START,
+            op::ZERO,
+            op::GET_FORCE_SCALES,
+            op::GET_MOMENT_SCALES,
+        ];
+        let own = own.map(|op| Claim::exclusive(id(op, node)));
+        let heard = heard.map(|op| Claim::shared(id(op, node)));
+        let this = Jr3 {
+            node,
+            period,
+            waiting: None,
+            joined: false,
+            last: None,
+            zero: NewZero::default(),
+            tare: TareCommand::default(),
+            outcome: None,
+        };
+        let claims = own.into_iter().chain(heard);
+        Ok(Supervised::boxed(claims, bringup, scales, this))
     }
 }
 

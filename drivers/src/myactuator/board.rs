@@ -6,12 +6,13 @@ use super::frames::{
 };
 use super::options::{Checked, MyactuatorOptions, Position};
 use crate::bytes::{quantise, quantise_i16};
-use crate::{Board, EncodeError, Format, Frame, Frames, Spec, SpecError, mit};
+use crate::{Board, EncodeError, Format, Frame, Frames, Simulate, Spec, SpecError, mit};
+use alloc::boxed::Box;
 use proprio_topics::{JointState, Nanos, Quality, Reading};
 
 /// A simulated motor.
 #[derive(Debug)]
-pub struct MyactuatorBoard {
+struct MyactuatorBoard {
     keys: Checked,
     joint: JointState,
     errors: u16,
@@ -19,23 +20,6 @@ pub struct MyactuatorBoard {
 }
 
 impl MyactuatorBoard {
-    /// A motor at 25 degrees Celsius.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 32, a key out of range.
-    pub fn new(spec: &Spec, options: &MyactuatorOptions) -> Result<Self, SpecError> {
-        Ok(Self {
-            keys: Checked::new(spec, options)?,
-            joint: JointState {
-                position: 0.0,
-                velocity: 0.0,
-                ..JointState::ABSENT
-            },
-            errors: 0,
-            celsius: 25,
-        })
-    }
-
     fn frame(&self, answer: Answer) -> Frame {
         let data = answer.pack(self.keys.protocol, self.celsius);
         Frame::new(self.keys.answers(), &data)
@@ -147,6 +131,22 @@ impl MyactuatorBoard {
             _ => return Err(EncodeError::Output(output)),
         }
         Ok((self.errors != errors, sent))
+    }
+}
+
+impl Simulate for MyactuatorOptions {
+    /// A motor at 25 degrees Celsius.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(MyactuatorBoard {
+            keys: Checked::new(spec, self)?,
+            joint: JointState {
+                position: 0.0,
+                velocity: 0.0,
+                ..JointState::ABSENT
+            },
+            errors: 0,
+            celsius: 25,
+        }))
     }
 }
 

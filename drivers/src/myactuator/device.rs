@@ -5,9 +5,12 @@ use super::options::{Checked, MyactuatorOptions, Position};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Link, Rounds, Supervised, temperature};
 use crate::held::{Held, OnChange};
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, bytes, mit};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
+};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading};
+use alloc::vec::Vec;
+use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
 
 /// How often the errors are asked for.
 const ERRORS_PERIOD: Nanos = Nanos::from_millis(1000);
@@ -27,34 +30,6 @@ pub(super) struct Motor {
 }
 
 impl Motor {
-    pub(super) fn device(
-        spec: &Spec,
-        options: &MyactuatorOptions,
-    ) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, options)?;
-        let (mode, timing) = match keys.request_period {
-            Some(_) => (spec.mode, Timing::POLLED),
-            None => (Mode::Listen, Timing::LISTENED),
-        };
-        let mut claims = [Claim::exclusive(keys.answers())].to_vec();
-        if keys.position == Position::Motion {
-            claims.insert(0, Claim::exclusive(keys.motion()));
-        }
-        let watched = claims.first().map_or(keys.answers(), |claim| claim.id);
-        let bringup = Bringup::new(spec, mode, timing, watched);
-        let this = Self {
-            keys,
-            errors: 0,
-            told: OnChange::NOTHING,
-            temperature: OnChange::NOTHING,
-            velocity: Held::ABSENT,
-            current: Held::ABSENT,
-            questions: Rounds::new(keys.request_period),
-            of_errors: Rounds::new(keys.request_period.map(|_| ERRORS_PERIOD)),
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
     /// A reading at `position`, with the speed and the current that are known.
     fn joint(
         &self,
@@ -133,6 +108,40 @@ impl Motor {
         let (state, saturated) = mit::measured(self.keys.scales, raw);
         let quality = self.keys.quality(self.errors) | saturated;
         link.joint(JOINT, frame, quality, state, out);
+    }
+}
+
+impl Driver for MyactuatorOptions {
+    const NAME: &'static str = "myactuator";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let motor = OutputInfo::temperature(MOTOR, "motor");
+        [OutputInfo::new(JOINT, Kind::Joint), motor].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let keys = Checked::new(spec, self)?;
+        let (mode, timing) = match keys.request_period {
+            Some(_) => (spec.mode, Timing::POLLED),
+            None => (Mode::Listen, Timing::LISTENED),
+        };
+        let mut claims = [Claim::exclusive(keys.answers())].to_vec();
+        if keys.position == Position::Motion {
+            claims.insert(0, Claim::exclusive(keys.motion()));
+        }
+        let watched = claims.first().map_or(keys.answers(), |claim| claim.id);
+        let bringup = Bringup::new(spec, mode, timing, watched);
+        let this = Motor {
+            keys,
+            errors: 0,
+            told: OnChange::NOTHING,
+            temperature: OnChange::NOTHING,
+            velocity: Held::ABSENT,
+            current: Held::ABSENT,
+            questions: Rounds::new(keys.request_period),
+            of_errors: Rounds::new(keys.request_period.map(|_| ERRORS_PERIOD)),
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 

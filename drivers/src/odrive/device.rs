@@ -4,13 +4,15 @@ use super::firmware::{Firmware, error};
 use super::frames::{FET, JOINT, LENGTH, MOTOR, command, is_request};
 use super::options::{Checked, OdriveOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::bytes;
 use crate::family::{Family, Link, Rounds, Supervised, temperature};
 use crate::held::Held;
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+};
 use alloc::boxed::Box;
+use alloc::vec::Vec;
 use core::f64::consts::TAU;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading};
+use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
 
 /// The float in half `half` of a payload.
 fn float(data: &[u8], half: usize) -> f64 {
@@ -29,28 +31,6 @@ pub(super) struct Axis {
 }
 
 impl Axis {
-    pub(super) fn device(
-        spec: &Spec,
-        options: &OdriveOptions,
-    ) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, options)?;
-        let mode = match keys.request_period {
-            Some(_) => spec.mode,
-            None => Mode::Listen,
-        };
-        let bringup = Bringup::new(spec, mode, Timing::LISTENED, keys.id(command::ESTIMATES));
-        let commands = keys.firmware.commands().iter();
-        let claims = commands.map(|command| Claim::exclusive(keys.id(*command)));
-        let this = Self {
-            keys,
-            status: Quality::GOOD,
-            current: Held::ABSENT,
-            torque: Held::ABSENT,
-            requests: Rounds::new(keys.request_period),
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
     fn estimates(&self, data: &[u8], frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
         let (position, velocity) = (float(data, 0) * TAU, float(data, 1) * TAU);
         if !position.is_finite() {
@@ -94,6 +74,40 @@ impl Axis {
             faults,
         });
         out.push(Output::new(JOINT, frame, self.status, reading), frame.id);
+    }
+}
+
+impl Driver for OdriveOptions {
+    const NAME: &'static str = "odrive";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let temperature = OutputInfo::temperature;
+        let joint = OutputInfo::new(JOINT, Kind::Joint);
+        match self.firmware {
+            Firmware::V0_5 => [joint].to_vec(),
+            Firmware::V0_6 => {
+                [joint, temperature(MOTOR, "motor"), temperature(FET, "fet")].to_vec()
+            }
+        }
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let keys = Checked::new(spec, self)?;
+        let mode = match keys.request_period {
+            Some(_) => spec.mode,
+            None => Mode::Listen,
+        };
+        let bringup = Bringup::new(spec, mode, Timing::LISTENED, keys.id(command::ESTIMATES));
+        let commands = keys.firmware.commands().iter();
+        let claims = commands.map(|command| Claim::exclusive(keys.id(*command)));
+        let this = Axis {
+            keys,
+            status: Quality::GOOD,
+            current: Held::ABSENT,
+            torque: Held::ABSENT,
+            requests: Rounds::new(keys.request_period),
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 

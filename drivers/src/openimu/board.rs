@@ -5,12 +5,13 @@ use super::frames::{
     pgn, pitch_and_roll,
 };
 use super::options::{OpenImuOptions, Plan};
-use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Spec, SpecError};
+use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Simulate, Spec, SpecError, board};
+use alloc::boxed::Box;
 use proprio_topics::{Imu, Nanos, Quality, Reading, Saturation};
 
 /// The sensor's own side. From power-on it sends the quantities of its keys at 100 Hz.
 #[derive(Debug)]
-pub struct OpenImuBoard {
+struct OpenImuBoard {
     plan: Plan,
     /// The messages to send, as bits of the command.
     types: u8,
@@ -19,22 +20,6 @@ pub struct OpenImuBoard {
 }
 
 impl OpenImuBoard {
-    /// A sensor after power-on; in [`Mode::Listen`] another program has set its rate already.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 0x80 to 0xF7, a period that is none.
-    pub fn new(spec: &Spec, options: &OpenImuOptions) -> Result<Self, SpecError> {
-        let plan = Plan::new(spec, options)?;
-        Ok(Self {
-            types: plan.types(),
-            divider: match spec.mode {
-                Mode::Supervise => 1,
-                Mode::Listen => plan.divider,
-            },
-            plan,
-        })
-    }
-
     /// Six bytes of three values in x, y, z.
     fn six(&self, counts: [u32; 3]) -> [u8; 6] {
         let [[a, b, ..], [c, d, ..], [e, f, ..]] =
@@ -93,6 +78,21 @@ impl OpenImuBoard {
     }
 }
 
+impl Simulate for OpenImuOptions {
+    /// A sensor after power-on; in [`Mode::Listen`] another program has set its rate already.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        let plan = Plan::new(spec, self)?;
+        Ok(Box::new(OpenImuBoard {
+            types: plan.types(),
+            divider: match spec.mode {
+                Mode::Supervise => 1,
+                Mode::Listen => plan.divider,
+            },
+            plan,
+        }))
+    }
+}
+
 impl Board for OpenImuBoard {
     fn on_frame(&mut self, frame: &Frame, _out: &mut Frames) {
         let (Some((pgn, _)), Format::Classic) = (group_and_source(frame.id), frame.format) else {
@@ -116,12 +116,7 @@ impl Board for OpenImuBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        let Reading::Imu(imu) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
+        let imu = board::only_imu(output, reading)?;
         let mut sent = Frames::new();
         for quantity in Quantity::ALL {
             if self.types & quantity.pgn_priority_bit().2 != 0 {

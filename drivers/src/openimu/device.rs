@@ -2,18 +2,18 @@
 //! period into a reading.
 
 use super::frames::{
-    ACCELERATION, ANGLE, ANY_PRIORITY, COMMANDS, HOST, Quantity, RATE, RATE_LIMIT,
+    ACCELERATION, ANGLE, ANY_PRIORITY, COMMANDS, DELIVERED, HOST, Quantity, RATE, RATE_LIMIT,
     group_and_source, identifier, merit, period, pgn, quaternion,
 };
 use super::options::{OpenImuOptions, Plan};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::bytes;
 use crate::family::{Family, Link, Supervised};
 use crate::group::Group;
 use crate::pairing::Limit;
-use crate::{Claim, Decoded, Device, Frame, Output, Spec, SpecError};
+use crate::{Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Spec, SpecError, bytes};
 use alloc::boxed::Box;
-use proprio_topics::{Counter, Imu, Nanos, Quality, Reading, Saturation};
+use alloc::vec::Vec;
+use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Saturation};
 
 /// How long the host waits for these sensors, which answer nothing.
 const TIMING: Timing = Timing {
@@ -108,12 +108,16 @@ pub(super) struct Sensor {
     group: Group<Sample>,
 }
 
-impl Sensor {
-    pub(super) fn device(
-        spec: &Spec,
-        options: &OpenImuOptions,
-    ) -> Result<Box<dyn Device>, SpecError> {
-        let plan = Plan::new(spec, options)?;
+impl Driver for OpenImuOptions {
+    const NAME: &'static str = "openimu";
+    const ADDRESS: Option<u32> = Some(DELIVERED);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Imu)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let plan = Plan::new(spec, self)?;
         let watched = plan.quantities.first().unwrap_or(&Quantity::Acceleration);
         let mut bringup = Bringup::new(spec, spec.mode, TIMING, plan.message(*watched));
         let command = |pgn| identifier(COMMANDS, pgn, HOST);
@@ -126,7 +130,7 @@ impl Sensor {
             ..Claim::exclusive(plan.message(quantity))
         });
         let limit = Limit::of_period(period(plan.divider));
-        let this = Self {
+        let this = Sensor {
             group: Group::new(plan.quantities.len(), limit),
             plan,
         };

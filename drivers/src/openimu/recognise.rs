@@ -2,15 +2,23 @@
 
 use super::frames::{ADDRESSES, DIVIDERS, Quantity, identifier, period};
 use super::options::OpenImuOptions;
-use crate::Driver;
 use crate::recognise::{Evidence, Finding, Key, Traffic};
+use crate::{Driver, Recognise};
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
 
+impl Recognise for OpenImuOptions {
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        ADDRESSES
+            .filter_map(|address| sensor(seen, address))
+            .collect()
+    }
+}
+
 /// The sensor at `address`, if `seen` shows it. One group alone may be that of a tilt sensor of
 /// another maker.
-pub(super) fn sensor(seen: &Traffic, address: u32) -> Option<Finding> {
+fn sensor(seen: &Traffic, address: u32) -> Option<Finding> {
     let source = u8::try_from(address).ok()?;
     let mut evidence = Evidence::new(seen, ADDRESSES.count());
     let mut quantities: Vec<&str> = Vec::new();

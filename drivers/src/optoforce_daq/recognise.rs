@@ -3,10 +3,19 @@
 use super::options::OptoforceDaqOptions;
 use super::protocol::PACKET;
 use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
-use crate::{Driver, Format, Frame, Id, bytes};
+use crate::{Driver, Format, Frame, Id, Recognise, bytes};
+use alloc::vec::Vec;
+
+impl Recognise for OptoforceDaqOptions {
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        seen.streams()
+            .filter_map(|stream| unit(seen, stream))
+            .collect()
+    }
+}
 
 /// The unit that sends on `stream`, if it is one.
-pub(super) fn unit(seen: &Traffic, stream: &Stream) -> Option<Finding> {
+fn unit(seen: &Traffic, stream: &Stream) -> Option<Finding> {
     let Id::Standard(address) = stream.id else {
         return None;
     };

@@ -8,11 +8,12 @@ use crate::family::{Family, Link, Supervised};
 use crate::pairing::{Limit, Order, Paired, Pairing};
 use crate::wrench::{self, NewZero, TareCommand};
 use crate::{
-    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Id,
-    Mode, NotSent, Output, Spec, SpecError, bytes,
+    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Driver, Frame,
+    Id, Mode, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
 };
 use alloc::boxed::Box;
-use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind, Wrench};
+use alloc::vec::Vec;
+use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, StampKind, Wrench};
 
 /// A tare has taken effect within this time: it is not answered.
 const TARED: Nanos = Nanos::from_millis(100);
@@ -103,32 +104,6 @@ pub(super) struct Rft {
 }
 
 impl Rft {
-    pub(super) fn device(
-        spec: &Spec,
-        options: &RobotousRftOptions,
-    ) -> Result<Box<dyn Device>, SpecError> {
-        let ids = options.ids(spec)?;
-        let rate = Rate {
-            id: ids.command,
-            code: options.rate_code()?,
-            attempts: Attempts::new(Timing::USUAL),
-            step: Step::Stop,
-            sent: Step::Stop,
-        };
-        let mut bringup = Bringup::new(spec, spec.mode, Timing::USUAL, ids.first);
-        bringup.start_with(ids.command, send(ids.command, command::START, 0).data());
-        bringup.stop_with(ids.command, send(ids.command, command::STOP, 0).data());
-        let claims = [ids.first, ids.second].map(Claim::exclusive);
-        let this = Self {
-            ids,
-            divisors: options.model.divisors(),
-            pairing: Pairing::new(Limit::of_period(period(options.rate_hz)), Order::Usual),
-            tare: TareCommand::default(),
-            zero: NewZero::default(),
-        };
-        Ok(Supervised::boxed(claims, bringup, rate, this))
-    }
-
     /// The reading of both frames' bytes.
     fn wrench(&self, first: [u8; 8], second: [u8; 8]) -> (Wrench, Quality) {
         let [_, fx, fx_low, fy, fy_low, fz, fz_low, tx] = first;
@@ -178,6 +153,38 @@ impl Rft {
             ..Output::new(0, frame, quality, Reading::Wrench(wrench))
         };
         out.push(output, frame.id);
+    }
+}
+
+impl Driver for RobotousRftOptions {
+    const NAME: &'static str = "robotous_rft";
+    const ADDRESS: Option<u32> = Some(0x64);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Wrench)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let ids = self.ids(spec)?;
+        let rate = Rate {
+            id: ids.command,
+            code: self.rate_code()?,
+            attempts: Attempts::new(Timing::USUAL),
+            step: Step::Stop,
+            sent: Step::Stop,
+        };
+        let mut bringup = Bringup::new(spec, spec.mode, Timing::USUAL, ids.first);
+        bringup.start_with(ids.command, send(ids.command, command::START, 0).data());
+        bringup.stop_with(ids.command, send(ids.command, command::STOP, 0).data());
+        let claims = [ids.first, ids.second].map(Claim::exclusive);
+        let this = Rft {
+            ids,
+            divisors: self.model.divisors(),
+            pairing: Pairing::new(Limit::of_period(period(self.rate_hz)), Order::Usual),
+            tare: TareCommand::default(),
+            zero: NewZero::default(),
+        };
+        Ok(Supervised::boxed(claims, bringup, rate, this))
     }
 }
 

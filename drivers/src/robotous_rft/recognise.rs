@@ -3,7 +3,7 @@
 use super::options::{Model, RobotousRftOptions};
 use super::protocol::{Ids, RATES, command, send};
 use crate::recognise::{Evidence, Finding, Key, Traffic};
-use crate::{Driver, Frame, Id};
+use crate::{Driver, Frame, Id, Recognise};
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
@@ -25,7 +25,7 @@ const COMMANDS: [u8; 8] = [
 ];
 
 /// The sensor, if `seen` shows it.
-pub(super) fn sensor(seen: &Traffic) -> Option<Finding> {
+fn sensor(seen: &Traffic) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, 1);
     let first = evidence.sends(IDS.first, |frame| match *frame.data() {
         [command, _, _, _, _, _, _, _] => COMMANDS.contains(&command),
@@ -77,9 +77,17 @@ pub(super) fn sensor(seen: &Traffic) -> Option<Finding> {
     Some(finding.with_keys([model]).with_keys(rate))
 }
 
-/// A sensor that streams ignores them.
-pub(super) fn questions() -> Vec<Frame> {
-    [command::NAME, command::SERIAL, command::GET_RATE]
-        .map(|command| send(IDS.command, command, 0))
-        .to_vec()
+impl Recognise for RobotousRftOptions {
+    const ASKED_BY_NAME: bool = true;
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        sensor(seen).into_iter().collect()
+    }
+
+    /// A sensor that streams ignores them.
+    fn questions(_seen: &Traffic) -> Vec<Frame> {
+        [command::NAME, command::SERIAL, command::GET_RATE]
+            .map(|command| send(IDS.command, command, 0))
+            .to_vec()
+    }
 }

@@ -5,7 +5,8 @@ use super::frames::{
     JOINT, LENGTH, MOTOR, OF_STATE, RUNNING, State, fault, id, kind, parameter, quality_of,
 };
 use super::options::{Checked, Protocol, RobstrideOptions};
-use crate::{Board, EncodeError, Format, Frame, Frames, Id, Spec, SpecError, bytes, mit};
+use crate::{Board, EncodeError, Format, Frame, Frames, Id, Simulate, Spec, SpecError, bytes, mit};
+use alloc::boxed::Box;
 use proprio_topics::{JointState, Nanos, Quality, Reading};
 
 /// The number of a simulated motor's processor.
@@ -13,7 +14,7 @@ const UID: [u8; 8] = [0x36, 0x31, 0x30, 0x14, 0x0B, 0x33, 0x33, 0x31];
 
 /// A simulated motor.
 #[derive(Debug)]
-pub struct RobstrideBoard {
+struct RobstrideBoard {
     keys: Checked,
     joint: JointState,
     mode: u8,
@@ -25,25 +26,6 @@ pub struct RobstrideBoard {
 }
 
 impl RobstrideBoard {
-    /// A running motor at 25 degrees Celsius.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 253, a key out of range, ranges that are not known.
-    pub fn new(spec: &Spec, options: &RobstrideOptions) -> Result<Self, SpecError> {
-        Ok(Self {
-            keys: Checked::new(spec, options)?,
-            joint: JointState {
-                position: 0.0,
-                velocity: 0.0,
-                ..JointState::ABSENT
-            },
-            mode: RUNNING,
-            of_state: 0,
-            faults: 0,
-            tenths: 250,
-        })
-    }
-
     /// The current state; an absent torque is 0.
     fn state(&self) -> Frame {
         let Checked { address, host, .. } = self.keys;
@@ -136,6 +118,24 @@ impl RobstrideBoard {
             _ => return Err(EncodeError::Output(output)),
         }
         Ok(frames)
+    }
+}
+
+impl Simulate for RobstrideOptions {
+    /// A running motor at 25 degrees Celsius.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(RobstrideBoard {
+            keys: Checked::new(spec, self)?,
+            joint: JointState {
+                position: 0.0,
+                velocity: 0.0,
+                ..JointState::ABSENT
+            },
+            mode: RUNNING,
+            of_state: 0,
+            faults: 0,
+            tenths: 250,
+        }))
     }
 }
 

@@ -7,9 +7,13 @@ use super::options::{Checked, Protocol, RobstrideOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Link, Rounds, Supervised, temperature};
 use crate::held::{Held, OnChange};
-use crate::{Claim, Decoded, Device, Frame, Id, Mode, Output, Spec, SpecError, bytes, mit};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Id, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+    mit,
+};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading};
+use alloc::vec::Vec;
+use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
 
 /// The host's side of a motor.
 #[derive(Debug)]
@@ -26,39 +30,6 @@ pub(super) struct Motor {
 }
 
 impl Motor {
-    pub(super) fn device(
-        spec: &Spec,
-        options: &RobstrideOptions,
-    ) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, options)?;
-        let (mode, timing) = match keys.request_period {
-            Some(_) => (spec.mode, Timing::POLLED),
-            None => (Mode::Listen, Timing::LISTENED),
-        };
-        let (address, host) = (keys.address, keys.host);
-        let mut claims = match keys.protocol {
-            Protocol::Private => kind::READ.map(|kind| claim(kind, address, host)).to_vec(),
-            Protocol::Mit => [Claim::shared(Id::standard(host.into()))].to_vec(),
-        };
-        // What is watched is the first.
-        if keys.request_period.is_some() {
-            claims.swap(0, 1);
-        }
-        let watched = claims.first().map_or(Id::standard(0), |claim| claim.id);
-        let bringup = Bringup::new(spec, mode, timing, watched);
-        let this = Self {
-            keys,
-            mode: 0,
-            faults: 0,
-            of_state: 0,
-            told: OnChange::NOTHING,
-            velocity: Held::ABSENT,
-            current: Held::ABSENT,
-            questions: Rounds::new(keys.request_period),
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
     /// Tells mode and faults if they are new, and now and then. Returns whether it did.
     fn tell(&mut self, frame: &Frame, out: &mut Decoded) -> bool {
         let faults = self.faults | self.of_state;
@@ -154,6 +125,45 @@ impl Motor {
             Some(kind) => Some(Message::of_private(kind, upper, data)),
             None => Message::of_mit(address, data),
         }
+    }
+}
+
+impl Driver for RobstrideOptions {
+    const NAME: &'static str = "robstride";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let motor = OutputInfo::temperature(MOTOR, "motor");
+        [OutputInfo::new(JOINT, Kind::Joint), motor].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let keys = Checked::new(spec, self)?;
+        let (mode, timing) = match keys.request_period {
+            Some(_) => (spec.mode, Timing::POLLED),
+            None => (Mode::Listen, Timing::LISTENED),
+        };
+        let (address, host) = (keys.address, keys.host);
+        let mut claims = match keys.protocol {
+            Protocol::Private => kind::READ.map(|kind| claim(kind, address, host)).to_vec(),
+            Protocol::Mit => [Claim::shared(Id::standard(host.into()))].to_vec(),
+        };
+        // What is watched is the first.
+        if keys.request_period.is_some() {
+            claims.swap(0, 1);
+        }
+        let watched = claims.first().map_or(Id::standard(0), |claim| claim.id);
+        let bringup = Bringup::new(spec, mode, timing, watched);
+        let this = Motor {
+            keys,
+            mode: 0,
+            faults: 0,
+            of_state: 0,
+            told: OnChange::NOTHING,
+            velocity: Held::ABSENT,
+            current: Held::ABSENT,
+            questions: Rounds::new(keys.request_period),
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 

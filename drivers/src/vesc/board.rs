@@ -5,12 +5,13 @@ use super::frames::{
 };
 use super::options::{Checked, Position, VescOptions};
 use crate::bytes::{quantise, quantise_i16};
-use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board};
+use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading};
 
 /// A simulated controller.
 #[derive(Debug)]
-pub struct VescBoard {
+struct VescBoard {
     keys: Checked,
     /// The duty cycle that it was told.
     duty: f64,
@@ -19,18 +20,6 @@ pub struct VescBoard {
 }
 
 impl VescBoard {
-    /// A controller at 25 degrees Celsius.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address above 254, a key out of range or missing.
-    pub fn new(spec: &Spec, options: &VescOptions) -> Result<Self, SpecError> {
-        Ok(Self {
-            keys: Checked::new(spec, options)?,
-            duty: 0.0,
-            temperatures: [25.0; 2],
-        })
-    }
-
     fn status(&self, velocity: f64, amperes: f64) -> [u8; 8] {
         let most = i64::from(i32::MAX);
         #[allow(clippy::cast_possible_truncation)] // limited
@@ -60,6 +49,17 @@ impl VescBoard {
     }
 }
 
+impl Simulate for VescOptions {
+    /// A controller at 25 degrees Celsius.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(VescBoard {
+            keys: Checked::new(spec, self)?,
+            duty: 0.0,
+            temperatures: [25.0; 2],
+        }))
+    }
+}
+
 impl Board for VescBoard {
     fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
 
@@ -84,9 +84,7 @@ impl Board for VescBoard {
                 };
                 let amperes = if amperes.is_nan() { 0.0 } else { amperes };
                 let values = [joint.position, joint.velocity, amperes];
-                if values.iter().any(|value| !value.is_finite()) {
-                    return Err(EncodeError::NotFinite);
-                }
+                board::finite(&values)?;
                 self.send(command::STATUS, self.status(joint.velocity, amperes), out);
                 let (step, most) = (self.keys.position_step, i64::from(i32::MAX));
                 match self.keys.position {
@@ -105,9 +103,7 @@ impl Board for VescBoard {
             }
             (JOINT, Reading::Actuator(actuator)) => self.duty = actuator.duty,
             (MOTOR | FET, Reading::Temperature(temperature)) => {
-                if !temperature.celsius.is_finite() {
-                    return Err(EncodeError::NotFinite);
-                }
+                board::finite(&[temperature.celsius])?;
                 let [fet, motor] = &mut self.temperatures;
                 *(if output == MOTOR { motor } else { fet }) = temperature.celsius;
                 if self.keys.position == Position::Tachometer {

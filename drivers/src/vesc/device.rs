@@ -8,9 +8,10 @@ use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes::{self, i16_be, u32_be};
 use crate::family::{Family, Link, Supervised, temperature};
 use crate::held::Held;
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
+use crate::{Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, JointState, Quality, Reading};
+use alloc::vec::Vec;
+use proprio_topics::{Actuator, Counter, JointState, Kind, Quality, Reading};
 
 /// The host's side of a controller.
 #[derive(Debug)]
@@ -22,20 +23,6 @@ pub(super) struct Controller {
 }
 
 impl Controller {
-    pub(super) fn device(spec: &Spec, options: &VescOptions) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, options)?;
-        let watched = keys.id(keys.with_position());
-        let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, watched);
-        let commands = [command::STATUS, command::STATUS_4, command::STATUS_5];
-        let claims = commands.map(|command| Claim::exclusive(keys.id(command)));
-        let this = Self {
-            keys,
-            velocity: Held::ABSENT,
-            current: Held::ABSENT,
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
     fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
         let [current, duty] = [4, 6].map(|at| i16_be(data, at));
         let velocity = f64::from(u32_be(data, 0).cast_signed()) * self.keys.velocity_step;
@@ -68,6 +55,30 @@ impl Controller {
             ..JointState::ABSENT
         };
         link.joint(JOINT, frame, Quality::GOOD, state, out);
+    }
+}
+
+impl Driver for VescOptions {
+    const NAME: &'static str = "vesc";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let temperature = OutputInfo::temperature;
+        let joint = OutputInfo::new(JOINT, Kind::Joint);
+        [joint, temperature(MOTOR, "motor"), temperature(FET, "fet")].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let keys = Checked::new(spec, self)?;
+        let watched = keys.id(keys.with_position());
+        let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, watched);
+        let commands = [command::STATUS, command::STATUS_4, command::STATUS_5];
+        let claims = commands.map(|command| Claim::exclusive(keys.id(command)));
+        let this = Controller {
+            keys,
+            velocity: Held::ABSENT,
+            current: Held::ABSENT,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 

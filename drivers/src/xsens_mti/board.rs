@@ -2,13 +2,13 @@
 
 use super::frames::{ACCELERATION_LSB, Message, RATE_LSB, status};
 use super::options::{Plan, XsensMtiOptions};
-use crate::bytes;
-use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board, bytes};
+use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading, Saturation};
 
 /// The sensor's own side. It streams from power-on, as it was configured over its serial port.
 #[derive(Debug)]
-pub struct MtiBoard {
+struct MtiBoard {
     plan: Plan,
     /// The sensor's clock at the next sample.
     clock: Nanos,
@@ -16,18 +16,6 @@ pub struct MtiBoard {
 }
 
 impl MtiBoard {
-    /// A sensor that streams at once.
-    ///
-    /// # Errors
-    /// [`SpecError`]: identifiers or keys out of range.
-    pub fn new(spec: &Spec, options: &XsensMtiOptions) -> Result<Self, SpecError> {
-        Ok(Self {
-            plan: Plan::new(spec, options)?,
-            clock: Nanos::ZERO,
-            counter: 0,
-        })
-    }
-
     /// The status word of a sample with `quality`.
     fn status(quality: Quality) -> u32 {
         let mut word = status::SELF_TEST | status::FILTER_VALID;
@@ -46,6 +34,17 @@ impl MtiBoard {
     }
 }
 
+impl Simulate for XsensMtiOptions {
+    /// A sensor that streams at once.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(MtiBoard {
+            plan: Plan::new(spec, self)?,
+            clock: Nanos::ZERO,
+            counter: 0,
+        }))
+    }
+}
+
 impl Board for MtiBoard {
     fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
 
@@ -60,12 +59,7 @@ impl Board for MtiBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        let Reading::Imu(imu) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
+        let imu = board::only_imu(output, reading)?;
         let mut sent = Frames::new();
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // it overflows
         let ticks = (self.clock.0 / self.plan.tick.0) as u32;
@@ -77,9 +71,7 @@ impl Board for MtiBoard {
                 Message::MagneticField => (&imu.magnetic_field, self.plan.field_lsb),
                 _ => (&[], 1.0),
             };
-            if !values.iter().all(|value| value.is_finite()) {
-                return Err(EncodeError::NotFinite);
-            }
+            board::finite(values)?;
             let mut counts = [[0; 2]; 4];
             for (count, value) in counts.iter_mut().zip(values) {
                 *count = bytes::quantise_i16(*value, lsb).to_be_bytes();

@@ -3,14 +3,15 @@
 use super::frames::{ACCELERATION_LSB, BUFFER_OVERFLOW, Message, RATE_LSB, status};
 use super::options::{Plan, XsensMtiOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::bytes;
 use crate::family::{Family, Link, Supervised};
 use crate::group::{Group, Part};
 use crate::pairing::Limit;
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use proprio_topics::{Counter, Imu, Nanos, Quality, Reading, Saturation};
+use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Saturation};
 
 /// Only the watching counts: nothing is sent. A sensor that was never heard is silent after a
 /// second and a half.
@@ -107,26 +108,6 @@ pub(super) struct Mti {
 }
 
 impl Mti {
-    pub(super) fn device(
-        spec: &Spec,
-        options: &XsensMtiOptions,
-    ) -> Result<Box<dyn Device>, SpecError> {
-        let plan = Plan::new(spec, options)?;
-        let watched = plan.messages.first().map_or(plan.error, |(id, _)| *id);
-        let bringup = Bringup::new(spec, Mode::Listen, TIMING, watched);
-        let streams = plan.messages.iter().map(|(id, _)| *id);
-        let claims: Vec<Claim> = (streams.chain([plan.error]))
-            .map(Claim::exclusive)
-            .collect();
-        let this = Self {
-            group: Group::new(plan.messages.len(), Limit::of_period(plan.period)),
-            clock: None,
-            counter: None,
-            plan,
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
     /// The sample time in ns, without overflow. A clock that goes back has started again.
     fn time(&mut self, ticks: u32) -> Nanos {
         let since = |earlier: u32| ticks.wrapping_sub(earlier);
@@ -185,6 +166,32 @@ impl Mti {
             ..Output::new(0, frame, quality, Reading::Imu(sample.imu))
         };
         out.push(output, frame.id);
+    }
+}
+
+impl Driver for XsensMtiOptions {
+    const NAME: &'static str = "xsens_mti";
+    const ADDRESS: Option<u32> = Some(0);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Imu)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let plan = Plan::new(spec, self)?;
+        let watched = plan.messages.first().map_or(plan.error, |(id, _)| *id);
+        let bringup = Bringup::new(spec, Mode::Listen, TIMING, watched);
+        let streams = plan.messages.iter().map(|(id, _)| *id);
+        let claims: Vec<Claim> = (streams.chain([plan.error]))
+            .map(Claim::exclusive)
+            .collect();
+        let this = Mti {
+            group: Group::new(plan.messages.len(), Limit::of_period(plan.period)),
+            clock: None,
+            counter: None,
+            plan,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 

@@ -3,7 +3,7 @@
 use super::frames::{HighRate, Message};
 use super::options::XsensMtiOptions;
 use crate::recognise::{Evidence, Finding, Key, Traffic};
-use crate::{Driver, Id};
+use crate::{Driver, Id, Recognise};
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
@@ -19,9 +19,16 @@ const QUANTITIES: [(Message, &str); 7] = [
     (Message::MagneticField, "magnetic_field"),
 ];
 
+impl Recognise for XsensMtiOptions {
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let found = [false, true].map(|extended| sensor(seen, extended));
+        found.into_iter().flatten().collect()
+    }
+}
+
 /// The sensor, if `seen` shows it with identifiers of 29 bits (`extended`) or 11. Two quantities
 /// that it measures must be there.
-pub(super) fn sensor(seen: &Traffic, extended: bool) -> Option<Finding> {
+fn sensor(seen: &Traffic, extended: bool) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, 1);
     let id = |message: Message, high_rate| match extended {
         true => Id::extended(message.identifier(high_rate)),
