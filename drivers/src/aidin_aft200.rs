@@ -8,8 +8,8 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Link, Supervised};
-use crate::pairing::{Limit, Order, Paired, Pairing};
+use crate::family::{Family, Supervised, Supervision};
+use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::{
     Claim, Decoded, Device, Driver, Frame, Id, Output, OutputInfo, Spec, SpecError, bytes, keys,
     wrench,
@@ -110,7 +110,7 @@ impl Driver for AidinAft200Options {
         bringup.start_with(COMMAND, &[number, command::PERIOD, high, low, 0, 0, 0, 0]);
         let start = [number, command::TRANSMIT, CONTINUOUSLY, 0, 0, 0, 0, 0];
         bringup.start_with(COMMAND, &start);
-        let pairing = Pairing::new(Limit::of_period(period), Order::Usual);
+        let pairing = Pairing::new(Limit::of_period(period), HalfOrder::Usual);
         let claims = ids.map(Claim::exclusive);
         let this = Aft { ids, pairing };
         Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
@@ -138,7 +138,7 @@ fn axes(half: [u8; 6], scale: (f64, f64), axis: u32, quality: &mut Quality) -> [
 impl Family for Aft {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let [force, torque] = self.ids;
         let second = frame.id == torque;
         if !second && frame.id != force {

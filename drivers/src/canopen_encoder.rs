@@ -8,10 +8,10 @@ mod recognise;
 
 use crate::bringup::Bringup;
 use crate::canopen::{
-    self, Cycle, NMT, NodeState, Object, Pdo, Plan, Rates, SYNC, Script, Step, is_free, nmt,
-    node_of, object, tpdo,
+    self, Cycle, NMT, NodeState, Object, Pdo, Rates, SYNC, Script, ScriptStep, StartPlan, is_free,
+    nmt, node_of, object, tpdo,
 };
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::objects::Objects;
 use crate::signal::Bits;
 use crate::{
@@ -103,14 +103,14 @@ impl CanopenEncoderOptions {
 
 /// Where the position is: in which frame, and where in it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Place {
+struct PositionMapping {
     id: Id,
     bits: Bits,
     /// The node sends it after each n-th SYNC; 0: by itself.
     sync: u8,
 }
 
-impl Place {
+impl PositionMapping {
     /// As the driver maps it, or as the file says of a node that it does not map: those that a SYNC
     /// causes first, and of these the one that most SYNCs cause.
     fn all(node: u8, options: &CanopenEncoderOptions) -> Result<ArrayVec<Self, 4>, SpecError> {
@@ -203,7 +203,7 @@ impl Driver for CanopenEncoderOptions {
         self.check()?;
         let node = node_of(spec)?;
         canopen::check_file(node, self.objects.as_ref())?;
-        let places = Place::all(node, self)?;
+        let places = PositionMapping::all(node, self)?;
         let listens = spec.mode == Mode::Listen;
         if let (true, None, Some(file)) = (listens, self.counts_per_turn, &self.objects) {
             let scales = [OPERATING, SCALED_PER_TURN, PER_TURN];
@@ -215,7 +215,7 @@ impl Driver for CanopenEncoderOptions {
         let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, first);
         bringup.start_with(NMT, &[nmt::START, node]);
         bringup.stop_with(NMT, &[nmt::PRE_OPERATIONAL, node]);
-        let start = Start {
+        let start = EncoderStart {
             node,
             counts_per_turn: self.counts_per_turn,
             of_file: self.counts_of_file().filter(|_| listens),
@@ -241,7 +241,7 @@ impl Driver for CanopenEncoderOptions {
 
 /// The start of an encoder.
 #[derive(Debug)]
-struct Start {
+struct EncoderStart {
     node: u8,
     options: CanopenEncoderOptions,
     scaled: bool,
@@ -257,9 +257,9 @@ const FIRST_SETUP: usize = 4;
 const CYCLE_STEP: usize = FIRST_SETUP + Pdo::SETUP - 1;
 const LAST_SETUP: usize = CYCLE_STEP + 1;
 
-impl Plan for Start {
-    fn step(&self, at: usize) -> Option<Step> {
-        let write = |object, value, bytes| Step::Write {
+impl StartPlan for EncoderStart {
+    fn step(&self, at: usize) -> Option<ScriptStep> {
+        let write = |object, value, bytes| ScriptStep::Write {
             object,
             value,
             bytes,
@@ -277,11 +277,11 @@ impl Plan for Start {
         };
         let setup = |at| pdo.setup(0, period, at).filter(|_| self.options.configure);
         let (step, needed) = match at {
-            0 => (Step::Nmt(nmt::PRE_OPERATIONAL), true),
-            1 => (Step::Read(object::DEVICE_TYPE), true),
-            2 => (Step::Read(OPERATING), asks),
-            3 if self.scaled => (Step::Read(SCALED_PER_TURN), asks),
-            3 => (Step::Read(PER_TURN), asks),
+            0 => (ScriptStep::Nmt(nmt::PRE_OPERATIONAL), true),
+            1 => (ScriptStep::Read(object::DEVICE_TYPE), true),
+            2 => (ScriptStep::Read(OPERATING), asks),
+            3 if self.scaled => (ScriptStep::Read(SCALED_PER_TURN), asks),
+            3 => (ScriptStep::Read(PER_TURN), asks),
             LAST_SETUP => return setup(Pdo::SETUP - 1),
             at if at < CYCLE_STEP => return setup(at - FIRST_SETUP),
             CYCLE_STEP => {
@@ -355,7 +355,7 @@ impl Plan for Start {
     }
 }
 
-impl Start {
+impl EncoderStart {
     /// The counts per turn: the node's own, else its file's.
     fn known(&self) -> Option<f64> {
         self.counts_per_turn.or(self.of_file)
@@ -367,7 +367,7 @@ impl Start {
 struct Encoder {
     node: u8,
     /// The best first.
-    places: ArrayVec<Place, 4>,
+    places: ArrayVec<PositionMapping, 4>,
     rates: Rates,
     cycle: Cycle,
     state: NodeState,
@@ -379,7 +379,7 @@ impl Encoder {
         at: usize,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Script<Start>>,
+        link: &mut Supervision<Script<EncoderStart>>,
         out: &mut Decoded,
     ) {
         let Some(place) = self.places.get(at).copied() else {
@@ -424,9 +424,14 @@ impl Encoder {
 }
 
 impl Family for Encoder {
-    type Questions = Script<Start>;
+    type Questions = Script<EncoderStart>;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Script<Start>>, out: &mut Decoded) {
+    fn on_frame(
+        &mut self,
+        frame: &Frame,
+        link: &mut Supervision<Script<EncoderStart>>,
+        out: &mut Decoded,
+    ) {
         if self.state.on_frame(self.node, frame, link, out) {
             return;
         }

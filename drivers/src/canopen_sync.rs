@@ -6,7 +6,7 @@ mod board;
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::canopen::{self, SYNC};
-use crate::family::{Family, Link, Supervised, next_in_step};
+use crate::family::{Family, Supervised, Supervision, next_in_step};
 use crate::{Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -74,12 +74,13 @@ struct Producer {
 impl Family for Producer {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, _frame: &Frame, _link: &mut Link<NoInquiry>, _out: &mut Decoded) {}
+    fn on_frame(&mut self, _frame: &Frame, _link: &mut Supervision<NoInquiry>, _out: &mut Decoded) {
+    }
 
     fn request(
         &mut self,
         now: Nanos,
-        link: &mut Link<NoInquiry>,
+        link: &mut Supervision<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         if now < self.next {

@@ -9,4 +9,4 @@ mod options;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-pub use options::{Angle, CubemarsOptions, Effort, Mode, Model};
+pub use options::{Angle, CubemarsMode, CubemarsModel, CubemarsOptions, Effort};

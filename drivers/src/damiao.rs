@@ -10,4 +10,4 @@ mod ranges;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-pub use options::{DamiaoOptions, Model};
+pub use options::{DamiaoModel, DamiaoOptions};

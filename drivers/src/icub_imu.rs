@@ -9,5 +9,5 @@ mod options;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-pub use frames::{Fusion, Legacy, Quantity};
+pub use frames::{Fusion, ImuQuantity, Legacy};
 pub use options::IcubImuOptions;

@@ -7,7 +7,7 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
 use crate::{
     Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Outputs, Spec, SpecError, bytes,
@@ -93,7 +93,7 @@ struct Mais {
 impl Family for Mais {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address);
         let (first, length) = match stream {
             Some(HES0TO6) => (0, SECOND),

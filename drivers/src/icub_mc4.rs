@@ -7,8 +7,8 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry};
-use crate::family::{Family, Link, Supervised};
-use crate::held::Held;
+use crate::family::{Family, Supervised, Supervision};
+use crate::held::HeldValue;
 use crate::icub::{self, class};
 use crate::icub_motor::mode;
 use crate::{
@@ -81,13 +81,13 @@ impl Default for IcubMc4Options {
 
 /// A step of a joint's position \[rad\] and velocity \[rad/s\].
 #[derive(Debug, Clone, Copy)]
-struct Scale {
+struct StepSizes {
     position: f64,
     velocity: f64,
 }
 
 impl IcubMc4Options {
-    fn scales(&self) -> Result<[Scale; JOINTS], SpecError> {
+    fn scales(&self) -> Result<[StepSizes; JOINTS], SpecError> {
         let wrong = |key, value, expected| SpecError::Key {
             key,
             value,
@@ -111,7 +111,7 @@ impl IcubMc4Options {
         Ok([(ticks0, shift0), (ticks1, shift1)].map(|(ticks, shift)| {
             let position = TAU / ticks;
             let velocity = position * 1000.0 / f64::from(1_u32 << shift);
-            Scale { position, velocity }
+            StepSizes { position, velocity }
         }))
     }
 }
@@ -128,9 +128,9 @@ impl Driver for IcubMc4Options {
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
         let address = icub::address(spec)?;
         icub::period_ms("period_ms", self.period_ms)?;
-        let joints = self.scales()?.map(|scale| Joint {
+        let joints = self.scales()?.map(|scale| Mc4Joint {
             scale,
-            velocity: Held::ABSENT,
+            velocity: HeldValue::ABSENT,
             status: Quality::GOOD,
         });
         let kinds = [kind::POSITION, kind::STATUS, kind::VELOCITY];
@@ -164,9 +164,9 @@ fn quality_of(faults: u32, mode: u32) -> Quality {
 
 /// A joint of a board, as the host knows it.
 #[derive(Debug)]
-struct Joint {
-    scale: Scale,
-    velocity: Held,
+struct Mc4Joint {
+    scale: StepSizes,
+    velocity: HeldValue,
     /// The quality from the last status.
     status: Quality,
 }
@@ -177,11 +177,17 @@ struct Mc4 {
     address: u8,
     outputs: Outputs,
     hold: Nanos,
-    joints: [Joint; JOINTS],
+    joints: [Mc4Joint; JOINTS],
 }
 
 impl Mc4 {
-    fn positions(&self, data: &[u8], frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn positions(
+        &self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Supervision<NoInquiry>,
+        out: &mut Decoded,
+    ) {
         let gap = link.bringup.reading(frame.t);
         for (joint, output) in self.joints.iter().zip(0_u8..) {
             if !self.outputs.0.contains(&output) {
@@ -233,7 +239,7 @@ impl Mc4 {
 impl Family for Mc4 {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_MOTOR, self.address);
         let Some(kind @ (kind::POSITION | kind::STATUS | kind::VELOCITY)) = stream else {
             return;
@@ -250,7 +256,7 @@ impl Family for Mc4 {
             _ => {
                 for (joint, at) in self.joints.iter_mut().zip([0, 2]) {
                     let steps = f64::from(bytes::i16_le(data, at));
-                    joint.velocity = Held::new(frame, steps * joint.scale.velocity);
+                    joint.velocity = HeldValue::new(frame, steps * joint.scale.velocity);
                 }
             }
         }
@@ -258,7 +264,7 @@ impl Family for Mc4 {
 
     fn reset(&mut self) {
         for joint in &mut self.joints {
-            (joint.velocity, joint.status) = (Held::ABSENT, Quality::GOOD);
+            (joint.velocity, joint.status) = (HeldValue::ABSENT, Quality::GOOD);
         }
     }
 }

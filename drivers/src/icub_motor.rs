@@ -7,7 +7,7 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class};
 use crate::{
     Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes,
@@ -134,7 +134,7 @@ impl Driver for IcubMotorOptions {
         let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::TWO_FOC);
         let claims: ArrayVec<Claim, 4> = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
         let bringup = Bringup::new(spec, Mode::Listen, icub::TIMING, watched);
-        let this = Motor {
+        let this = TwoFoc {
             address,
             velocity: self.velocity,
             status: Quality::GOOD,
@@ -160,15 +160,21 @@ fn quality_of(actuator: &Actuator) -> Quality {
 
 /// The host's side of a motor board.
 #[derive(Debug)]
-struct Motor {
+struct TwoFoc {
     address: u8,
     velocity: bool,
     /// The quality from the last status.
     status: Quality,
 }
 
-impl Motor {
-    fn motion(&self, data: &[u8], frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+impl TwoFoc {
+    fn motion(
+        &self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Supervision<NoInquiry>,
+        out: &mut Decoded,
+    ) {
         let mut quality = self.status;
         if quality.contains(Quality::DEVICE_FAULT) {
             out.fault(Counter::DeviceFault, 1, frame.id);
@@ -205,10 +211,10 @@ impl Motor {
     }
 }
 
-impl Family for Motor {
+impl Family for TwoFoc {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let Some(stream) = icub::stream_type(frame.id, class::PERIODIC_MOTOR, self.address) else {
             return;
         };

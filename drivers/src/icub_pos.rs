@@ -8,7 +8,7 @@ mod recognise;
 
 use crate::bringup::Bringup;
 use crate::configure::{Configure, Setting};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
 use crate::{
     Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Outputs, Spec, SpecError, bytes,
@@ -35,7 +35,7 @@ const METRE_PER_LSB: f64 = 1e-4;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum Quantity {
+pub enum PosQuantity {
     /// Angles \[rad\].
     #[default]
     Angle,
@@ -43,7 +43,7 @@ pub enum Quantity {
     Length,
 }
 
-impl Quantity {
+impl PosQuantity {
     /// Its number in a frame, and one step \[rad or m\].
     const fn code_and_lsb(self) -> (u8, f64) {
         match self {
@@ -57,7 +57,7 @@ impl Quantity {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Sensor {
+pub struct PosSensor {
     /// Its label, which is the joint's channel.
     pub label: u8,
     /// Negate its value; default false.
@@ -68,7 +68,7 @@ pub struct Sensor {
     pub zero_deg: f64,
 }
 
-impl Sensor {
+impl PosSensor {
     /// Its three bytes in POS_CONFIG_SET.
     fn bytes(&self) -> Result<[u8; 3], SpecError> {
         let rotation = match self.rotation_deg {
@@ -116,18 +116,18 @@ pub struct IcubPosOptions {
     /// Period \[ms\], 1 to 255; default 10.
     pub period_ms: u32,
     /// The quantity that the board sends; default angles.
-    pub quantity: Quantity,
+    pub quantity: PosQuantity,
     /// Silence kept after power-on \[ms\]; default 0.
     pub power_on_silence_ms: u32,
     /// Configuration of its sensors, at most two; default: keep the board's own.
-    pub sensors: Option<Vec<Sensor>>,
+    pub sensors: Option<Vec<PosSensor>>,
 }
 
 impl Default for IcubPosOptions {
     fn default() -> Self {
         Self {
             period_ms: 10,
-            quantity: Quantity::Angle,
+            quantity: PosQuantity::Angle,
             power_on_silence_ms: 0,
             sensors: None,
         }
@@ -211,7 +211,7 @@ impl Driver for IcubPosOptions {
 #[derive(Debug)]
 struct Pos {
     address: u8,
-    quantity: Quantity,
+    quantity: PosQuantity,
     outputs: Outputs,
     /// Labels whose next reading follows a gap, one bit each.
     gap: u16,
@@ -222,7 +222,7 @@ struct Pos {
 impl Family for Pos {
     type Questions = Configure;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Configure>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<Configure>, out: &mut Decoded) {
         if frame.id == icub::to_host(class::POLLING_ANALOG, self.address) {
             // Answers to other questions are for other devices.
             if let Some(data) = bytes::payload(frame, out)

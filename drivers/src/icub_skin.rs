@@ -7,9 +7,9 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
-use crate::pairing::{Limit, Order, Paired, Pairing};
+use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::{Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Spec, SpecError, bytes};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -142,11 +142,11 @@ impl Driver for IcubSkinOptions {
             mask: !0xF,
             ..Claim::exclusive(icub::stream(class::PERIODIC_SKIN, address, 0))
         };
-        let this = Patch {
+        let this = SkinPatch {
             address,
             no_load: self.no_load,
             triangles: self.triangles,
-            pairing: core::array::from_fn(|_| Pairing::new(limit, Order::Usual)),
+            pairing: core::array::from_fn(|_| Pairing::new(limit, HalfOrder::Usual)),
             gap: 0,
             seen: 0,
         };
@@ -156,7 +156,7 @@ impl Driver for IcubSkinOptions {
 
 /// The host's side of a skin board.
 #[derive(Debug)]
-struct Patch {
+struct SkinPatch {
     address: u8,
     no_load: u8,
     triangles: [u8; 2],
@@ -167,7 +167,7 @@ struct Patch {
     seen: u16,
 }
 
-impl Patch {
+impl SkinPatch {
     /// The reading of both frames' bytes.
     fn skin(&self, triangle: u8, first: [u8; 7], second: [u8; 7]) -> (Skin, Quality) {
         let [p7, p8, p9, p10, p11, high, low] = second;
@@ -188,10 +188,10 @@ impl Patch {
     }
 }
 
-impl Family for Patch {
+impl Family for SkinPatch {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_SKIN, self.address);
         let Some(triangle) = stream else { return };
         let Some(data) = bytes::payload(frame, out) else {

@@ -10,4 +10,4 @@ mod options;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-pub use options::{IcubStrainOptions, Stream};
+pub use options::{IcubStrainOptions, StrainStream};

@@ -36,17 +36,17 @@
 //! [`recognise()`] tells which devices a bus has, and [`questions()`] what to ask them: each family
 //! knows its own.
 //!
-//! Boards are behind the feature `boards`, recognition behind `recognise`. Both are on by default; a
-//! program that only decodes needs neither.
+//! Boards are behind the feature `boards`, recognition behind `recognise`. Both are on by default;
+//! a program that only decodes needs neither.
 //!
-//! To add a family, write a module with a type of its keys in gateway.toml (documented at the top of
-//! the module) that implements [`Driver`], [`Simulate`] and [`Recognise`], a `Family` (see
-//! `family.rs`) and a `Board`, and add its line to the list in `registry.rs`. Families share `bringup.rs` (starting a board),
-//! `configure.rs` (confirming its configuration), `pairing.rs` and `group.rs` (combining two
-//! frames, or more), `held.rs` (values of other instants), `bytes.rs` (the numbers of a payload),
-//! `wrench.rs` and [`calibration`] (force/torque sensors), `keys.rs` (addresses, identifiers),
-//! `board.rs` (what a board can encode) and [`mod@recognise`] (the evidence for a device in the
-//! traffic of a bus).
+//! To add a family, write a module with a type of its keys in gateway.toml (documented at the top
+//! of the module) that implements [`Driver`], [`Simulate`] and [`Recognise`], a `Family` (see
+//! `family.rs`) and a `Board`, and add its line to the list in `registry.rs`. Families share
+//! `bringup.rs` (starting a board), `configure.rs` (confirming its configuration), `pairing.rs` and
+//! `group.rs` (combining two frames, or more), `held.rs` (values of other instants), `bytes.rs` (the
+//! numbers of a payload), `wrench.rs` and [`calibration`] (force/torque sensors), `keys.rs`
+//! (addresses, identifiers), `board.rs` (what a board can encode) and [`mod@recognise`] (the
+//! evidence for a device in the traffic of a bus).
 #![no_std]
 // Without a feature, what only its modules use is not used.
 #![cfg_attr(

@@ -8,7 +8,7 @@ mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes::{self, i16_le, u32_le};
-use crate::family::{Family, Link, Supervised, next_in_step};
+use crate::family::{Family, Supervised, Supervision, next_in_step};
 use crate::held::OnChange;
 use crate::{
     Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, NotSent, Output, OutputInfo, Spec,
@@ -118,7 +118,7 @@ impl Driver for MoteusOptions {
         let Some(query) = fd(query, &QUERY) else {
             return Err(SpecError::Joints("the query does not fit a frame"));
         };
-        let this = Controller {
+        let this = MoteusController {
             query,
             reply,
             period,
@@ -266,7 +266,7 @@ impl<'d> Cursor<'d> {
 
 /// What a reply tells.
 #[derive(Debug, Clone, Copy, Default)]
-struct Told {
+struct Reply {
     mode: Option<f64>,
     position: Option<f64>,
     velocity: Option<f64>,
@@ -280,7 +280,7 @@ struct Told {
 /// Four bits of an opcode are fixed, and four of a register that is read here; all of a filler.
 const BITS: u32 = 4;
 
-impl Told {
+impl Reply {
     /// Reads a reply; `None` if it is none, or cut off.
     fn parse(data: &[u8]) -> Option<Self> {
         let (mut told, mut cursor) = (Self::default(), Cursor(data));
@@ -324,7 +324,7 @@ impl Told {
 
 /// The host's side of a controller.
 #[derive(Debug)]
-struct Controller {
+struct MoteusController {
     query: Frame,
     reply: Id,
     period: Nanos,
@@ -338,7 +338,7 @@ struct Controller {
     temperature: OnChange<()>,
 }
 
-impl Controller {
+impl MoteusController {
     fn quality(&self) -> Quality {
         let mut quality = Quality::GOOD;
         if f64::from(self.mode) == MODE_FAULT {
@@ -351,10 +351,10 @@ impl Controller {
     }
 }
 
-impl Family for Controller {
+impl Family for MoteusController {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         // Short frames are sent as classic ones by some programs.
         let Some(data) = bytes::fd_payload(frame, out) else {
             return;
@@ -362,7 +362,7 @@ impl Family for Controller {
         if frame.id != self.reply {
             return;
         }
-        let Some(told) = Told::parse(data) else {
+        let Some(told) = Reply::parse(data) else {
             return out.fault(Counter::Value, 1, frame.id);
         };
         // A reply to nobody is an old one, which a queue of an adapter has held back.
@@ -418,7 +418,7 @@ impl Family for Controller {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Link<NoInquiry>,
+        _link: &mut Supervision<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         if now < self.next {

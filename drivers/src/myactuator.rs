@@ -9,5 +9,5 @@ mod options;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-pub use frames::Protocol;
-pub use options::{MyactuatorOptions, Position};
+pub use frames::MyactuatorProtocol;
+pub use options::{MyactuatorOptions, MyactuatorPosition};

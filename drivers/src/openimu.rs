@@ -9,5 +9,5 @@ mod options;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-pub use frames::{Axes, Quantity, Upright};
+pub use frames::{AxisOrder, OpenImuQuantity, Upright};
 pub use options::OpenImuOptions;

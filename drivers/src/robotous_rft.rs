@@ -10,4 +10,4 @@ mod protocol;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-pub use options::{Model, RobotousRftOptions};
+pub use options::{RftModel, RobotousRftOptions};

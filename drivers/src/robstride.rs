@@ -9,4 +9,4 @@ mod options;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-pub use options::{Model, Protocol, RobstrideOptions};
+pub use options::{RobstrideModel, RobstrideOptions, RobstrideProtocol};

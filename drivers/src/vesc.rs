@@ -9,4 +9,4 @@ mod options;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-pub use options::{Position, VescOptions};
+pub use options::{VescOptions, VescPosition};

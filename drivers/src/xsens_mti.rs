@@ -9,5 +9,5 @@ mod options;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-pub use frames::{HighRate, Message};
+pub use frames::{HighRate, MtiMessage};
 pub use options::XsensMtiOptions;

@@ -1,11 +1,11 @@
 //! The host's side: asks for the readings, and combines the two halves of each.
 
-use super::calibration::{Calibration, TIMING};
+use super::calibration::{CalibrationQuery, TIMING};
 use super::frames::{STATUS_ANY, STATUS_BUS, STATUS_FAULTS, id, opcode, opcode_of};
 use super::options::AtiNetcanoemOptions;
 use crate::bringup::Bringup;
 use crate::bytes::{self, i16_be, u16_be};
-use crate::family::{Family, Link, Supervised, next_in_step};
+use crate::family::{Family, Supervised, Supervision, next_in_step};
 use crate::pairing::within;
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Driver, Frame,
@@ -62,7 +62,12 @@ pub(super) struct Netcanoem {
 
 impl Netcanoem {
     /// Drops the halves that wait.
-    fn drop_all(&mut self, link: &mut Link<Calibration>, frame: &Frame, out: &mut Decoded) {
+    fn drop_all(
+        &mut self,
+        link: &mut Supervision<CalibrationQuery>,
+        frame: &Frame,
+        out: &mut Decoded,
+    ) {
         let halves = self.firsts.len() + self.seconds.len();
         if halves > 0 {
             link.bringup.lost();
@@ -80,7 +85,7 @@ impl Netcanoem {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Calibration>,
+        link: &mut Supervision<CalibrationQuery>,
         out: &mut Decoded,
     ) {
         self.joined = false;
@@ -113,7 +118,7 @@ impl Netcanoem {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Calibration>,
+        link: &mut Supervision<CalibrationQuery>,
         out: &mut Decoded,
     ) {
         let in_time = self
@@ -146,7 +151,7 @@ fn give(
     second: [i16; 3],
     is_trusted: bool,
     frame: &Frame,
-    link: &mut Link<Calibration>,
+    link: &mut Supervision<CalibrationQuery>,
     out: &mut Decoded,
 ) {
     let Some(per_count) = link.questions.per_count() else {
@@ -199,7 +204,7 @@ impl Driver for AtiNetcanoemOptions {
             mask: !0xF,
             ..Claim::exclusive(id(base, 0))
         };
-        let calibration = Calibration::new(base, spec.mode, self);
+        let calibration = CalibrationQuery::new(base, spec.mode, self);
         let this = Netcanoem {
             base,
             mode: spec.mode,
@@ -218,9 +223,14 @@ impl Driver for AtiNetcanoemOptions {
 }
 
 impl Family for Netcanoem {
-    type Questions = Calibration;
+    type Questions = CalibrationQuery;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Calibration>, out: &mut Decoded) {
+    fn on_frame(
+        &mut self,
+        frame: &Frame,
+        link: &mut Supervision<CalibrationQuery>,
+        out: &mut Decoded,
+    ) {
         let Some(opcode) = opcode_of(frame.id, self.base) else {
             return;
         };
@@ -254,7 +264,7 @@ impl Family for Netcanoem {
     fn request(
         &mut self,
         now: Nanos,
-        link: &mut Link<Calibration>,
+        link: &mut Supervision<CalibrationQuery>,
         out: &mut Decoded,
     ) -> Option<Frame> {
         if now < self.request_at()? {
@@ -295,7 +305,7 @@ impl Family for Netcanoem {
         &mut self,
         command: Command,
         _now: Nanos,
-        link: &Link<Calibration>,
+        link: &Supervision<CalibrationQuery>,
     ) -> Result<(), CommandRefused> {
         if command != Command::Calibration {
             return Err(CommandRefused::Unsupported);
@@ -308,7 +318,7 @@ impl Family for Netcanoem {
 
     fn outcome(
         &mut self,
-        _link: &Link<Calibration>,
+        _link: &Supervision<CalibrationQuery>,
     ) -> Option<Result<CommandOutcome, CommandFailed>> {
         self.outcome.take().map(Ok)
     }

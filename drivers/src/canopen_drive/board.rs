@@ -1,9 +1,11 @@
 //! A drive's own side: a node with mapped process data.
 
-use super::layout::{Field, Layout, Quantity, fields};
-use super::options::{CanopenDriveOptions, CurrentUnit, TorqueUnit, VelocityUnit};
-use super::start::{COUNTS, PROFILE, RATED_CURRENT, RATED_TORQUE, TURNS, Told};
-use crate::canopen::{NO_RTR, Node, Pdo, SYNC, TPDO_OFF, check_file, node_of, object, tpdo};
+use super::layout::{DriveQuantity, MappedObject, PdoMapping, fields};
+use super::options::{CanopenDriveOptions, CurrentUnit, RatedTorqueUnit, VelocityUnit};
+use super::start::{COUNTS, PROFILE, RATED_CURRENT, RATED_TORQUE, ScaleObjects, TURNS};
+use crate::canopen::{
+    NO_RTR, Pdo, SYNC, SimulatedNode, TPDO_OFF, check_file, node_of, object, tpdo,
+};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Simulate, Spec, SpecError, board};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -27,24 +29,24 @@ const OVERCURRENT: u16 = 0x2310;
 /// The drive's own side.
 #[derive(Debug)]
 struct DriveBoard {
-    node: Node,
+    node: SimulatedNode,
     /// SI units per step of position, velocity, torque and current.
-    per_step: [f64; Quantity::JOINT],
+    per_step: [f64; DriveQuantity::JOINT],
     state: JointState,
     quality: Quality,
 }
 
 impl DriveBoard {
     /// Its mapping, as it is set now.
-    fn layout(&self) -> Layout {
+    fn layout(&self) -> PdoMapping {
         let of_node = |number| Pdo::of_node(number, |object| self.node.value(object));
-        Layout {
+        PdoMapping {
             pdos: [0, 1, 2, 3].map(of_node),
         }
     }
 
     /// The raw number of a field; 0 for a value that the joint does not have.
-    fn raw(&self, field: &Field) -> f64 {
+    fn raw(&self, field: &MappedObject) -> f64 {
         let JointState {
             position,
             velocity,
@@ -56,13 +58,13 @@ impl DriveBoard {
             .quality
             .intersects(Quality::DRIVE_FAULT | Quality::DEVICE_FAULT);
         let value = match field.quantity {
-            Quantity::Position => position,
-            Quantity::Velocity => velocity,
-            Quantity::Torque => torque,
-            Quantity::Current => current,
-            Quantity::Status => return if has_fault { FAULTY } else { ENABLED },
-            Quantity::Mode => return CST,
-            Quantity::Error => return f64::from(self.error()),
+            DriveQuantity::Position => position,
+            DriveQuantity::Velocity => velocity,
+            DriveQuantity::Torque => torque,
+            DriveQuantity::Current => current,
+            DriveQuantity::Status => return if has_fault { FAULTY } else { ENABLED },
+            DriveQuantity::Mode => return CST,
+            DriveQuantity::Error => return f64::from(self.error()),
         };
         let per_step = self.per_step.get(field.quantity as usize);
         let steps = value / per_step.copied().unwrap_or(1.0);
@@ -107,18 +109,18 @@ impl Simulate for CanopenDriveOptions {
         check_file(id, self.objects.as_ref())?;
         let pdos = self.pdos();
         let of_file = self.objects.as_ref().filter(|_| pdos.is_empty());
-        let of_file = of_file.map(|file| Layout::of_file(id, file));
+        let of_file = of_file.map(|file| PdoMapping::of_file(id, file));
         let layout = match of_file.filter(|file| file.position().is_some()) {
             Some(layout) => layout,
             // As its maker delivers it: nothing is mapped.
-            None if self.configure && spec.mode == Mode::Supervise => Layout::default(),
-            None if pdos.is_empty() => Layout::of_keys(id, &self.usual_pdos())?,
-            None => Layout::of_keys(id, &pdos)?,
+            None if self.configure && spec.mode == Mode::Supervise => PdoMapping::default(),
+            None if pdos.is_empty() => PdoMapping::of_keys(id, &self.usual_pdos())?,
+            None => PdoMapping::of_keys(id, &pdos)?,
         };
-        let file = Told::of_file(self.objects.as_ref());
+        let file = ScaleObjects::of_file(self.objects.as_ref());
         let counts_per_turn = self.counts_per_turn.or(file.counts_per_turn());
         let counts_per_turn = counts_per_turn.unwrap_or(COUNTS_PER_TURN);
-        let torque_unit = self.rated_torque_unit.unwrap_or(TorqueUnit::Milli);
+        let torque_unit = self.rated_torque_unit.unwrap_or(RatedTorqueUnit::Milli);
         let of_file = file.rated_torque(self.rated_torque_unit);
         let torque = self.rated_torque.or(of_file).unwrap_or(TORQUE);
         let current = self.rated_current.or(file.rated_current());
@@ -150,7 +152,7 @@ impl Simulate for CanopenDriveOptions {
             }
         }
         Ok(Box::new(DriveBoard {
-            node: Node::new(id, spec.mode == Mode::Listen, &entries),
+            node: SimulatedNode::new(id, spec.mode == Mode::Listen, &entries),
             per_step: [
                 TAU / counts_per_turn,
                 velocity.unit().radians(TAU / counts_per_turn),

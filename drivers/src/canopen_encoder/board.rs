@@ -1,7 +1,9 @@
 //! The device's own side: a node with an object dictionary, and a position in TPDO 1.
 
-use super::{BY_EVENT, CanopenEncoderOptions, OPERATING, PER_TURN, POSITION, PROFILE, Place};
-use crate::canopen::{self, NO_RTR, Node, SYNC, TPDO_OFF, node_of, object, tpdo};
+use super::{
+    BY_EVENT, CanopenEncoderOptions, OPERATING, PER_TURN, POSITION, PROFILE, PositionMapping,
+};
+use crate::canopen::{self, NO_RTR, SYNC, SimulatedNode, TPDO_OFF, node_of, object, tpdo};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Simulate, Spec, SpecError, board, bytes};
 use alloc::boxed::Box;
 use core::f64::consts::TAU;
@@ -15,8 +17,8 @@ const HARDWARE: u16 = 0x5000;
 /// The encoder's own side.
 #[derive(Debug)]
 struct EncoderBoard {
-    node: Node,
-    place: Place,
+    node: SimulatedNode,
+    place: PositionMapping,
     counts: u32,
     quality: Quality,
 }
@@ -48,7 +50,7 @@ impl Simulate for CanopenEncoderOptions {
         self.check()?;
         let id = node_of(spec)?;
         canopen::check_file(id, self.objects.as_ref())?;
-        let places = Place::all(id, self)?;
+        let places = PositionMapping::all(id, self)?;
         let place = places.first().copied().ok_or(SpecError::Keys {
             key: "eds",
             expected: "a file in which a TPDO has the position (6004), if configure = false",
@@ -78,7 +80,7 @@ impl Simulate for CanopenEncoderOptions {
             (PER_TURN, per_turn, 4),
         ];
         Ok(Box::new(EncoderBoard {
-            node: Node::new(id, spec.mode == Mode::Listen, &entries),
+            node: SimulatedNode::new(id, spec.mode == Mode::Listen, &entries),
             place,
             counts: 0,
             quality: Quality::GOOD,

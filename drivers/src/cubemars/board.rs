@@ -1,7 +1,7 @@
 //! The device's own side: a motor that sends its state as if it were commanded once a period.
 
 use super::frames::{DRIVE, ENCODER_ERROR, JOINT, Stage, quality_of};
-use super::options::{Checked, CubemarsOptions, Effort};
+use super::options::{CubemarsKeys, CubemarsOptions, Effort};
 use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board};
 use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading};
@@ -12,7 +12,7 @@ const OVER_CURRENT: u8 = 2;
 /// A simulated motor. It streams without commands.
 #[derive(Debug)]
 struct CubemarsBoard {
-    keys: Checked,
+    keys: CubemarsKeys,
     stage: Stage,
 }
 
@@ -20,7 +20,7 @@ impl Simulate for CubemarsOptions {
     /// A motor at 25 degrees Celsius.
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(CubemarsBoard {
-            keys: Checked::new(spec, self)?,
+            keys: CubemarsKeys::new(spec, self)?,
             stage: Stage {
                 celsius: 25.0,
                 error: 0,

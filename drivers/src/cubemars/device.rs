@@ -1,9 +1,9 @@
 //! The host's side: takes the replies or uploads of one motor, and watches that they come.
 
-use super::frames::{DRIVE, ENCODER_ERROR, JOINT, Layout, Stage, quality_of};
-use super::options::{Checked, CubemarsOptions, Effort};
+use super::frames::{DRIVE, ENCODER_ERROR, JOINT, PayloadLayout, Stage, quality_of};
+use super::options::{CubemarsKeys, CubemarsOptions, Effort};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Link, Supervised, temperature};
+use crate::family::{Family, Supervised, Supervision, temperature};
 use crate::held::OnChange;
 use crate::{
     Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
@@ -14,13 +14,13 @@ use proprio_topics::{Actuator, Counter, Kind, Reading};
 
 /// The host's side of a motor.
 #[derive(Debug)]
-pub(super) struct Motor {
-    keys: Checked,
+pub(super) struct CubemarsMotor {
+    keys: CubemarsKeys,
     /// The error of the power stage.
     told: OnChange<u8>,
 }
 
-impl Motor {
+impl CubemarsMotor {
     /// Tells the state of the power stage if its error is new, and now and then.
     fn stage(&mut self, stage: Stage, frame: &Frame, out: &mut Decoded) {
         if !self.told.is_due(stage.error, frame) {
@@ -47,13 +47,13 @@ impl Driver for CubemarsOptions {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, self)?;
+        let keys = CubemarsKeys::new(spec, self)?;
         let claim = match keys.layout {
-            Layout::Mit { .. } => Claim::shared(keys.id),
-            Layout::Servo => Claim::exclusive(keys.id),
+            PayloadLayout::Mit { .. } => Claim::shared(keys.id),
+            PayloadLayout::Servo => Claim::exclusive(keys.id),
         };
         let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, keys.id);
-        let this = Motor {
+        let this = CubemarsMotor {
             keys,
             told: OnChange::NOTHING,
         };
@@ -61,15 +61,15 @@ impl Driver for CubemarsOptions {
     }
 }
 
-impl Family for Motor {
+impl Family for CubemarsMotor {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         if frame.id != self.keys.id {
             return;
         }
         // Replies of other motors, and commands, are none of this motor's.
-        let others = matches!(self.keys.layout, Layout::Mit { .. })
+        let others = matches!(self.keys.layout, PayloadLayout::Mit { .. })
             && frame.data().first() != Some(&self.keys.number);
         if others {
             return;

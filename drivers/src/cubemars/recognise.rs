@@ -2,7 +2,7 @@
 
 use super::frames::SERVO_STATUS;
 use super::options::CubemarsOptions;
-use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
+use crate::recognise::{Evidence, Finding, IdUse, Key, Stream, Traffic};
 use crate::{Driver, Frame, Id, Recognise};
 use alloc::vec::Vec;
 
@@ -131,7 +131,7 @@ fn on_zero(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
         if few && numbers.len() > 1 {
             evidence.add(-3.0);
         }
-        evidence.sends_as(Part::Sends(Some(*number)), stream.id, |frame| {
+        evidence.sends_as(IdUse::Sends(Some(*number)), stream.id, |frame| {
             let first = frame.data().first();
             first.is_some_and(|first| (!few || numbers.contains(first)) && is_reply(frame, *first))
         })?;

@@ -2,10 +2,10 @@
 //! commanded once a period.
 
 use super::frames::{
-    DISABLED, ENABLED, FET, JOINT, MOTOR, OVERLOAD, QUESTIONS, RANGES, READ, SENSOR, STATE, State,
-    frame, quality_of,
+    DISABLED, DamiaoState, ENABLED, FET, JOINT, MOTOR, OVERLOAD, QUESTIONS, RANGES, READ, SENSOR,
+    STATE, frame, quality_of,
 };
-use super::options::{Checked, DamiaoOptions};
+use super::options::{DamiaoKeys, DamiaoOptions};
 use crate::mit::{self, Scale};
 use crate::{Board, EncodeError, Format, Frame, Frames, Simulate, Spec, SpecError, board};
 use alloc::boxed::Box;
@@ -17,11 +17,11 @@ const RANGES_USUAL: [f64; 3] = [12.5, 30.0, 10.0];
 /// A simulated motor.
 #[derive(Debug)]
 struct DamiaoBoard {
-    keys: Checked,
+    keys: DamiaoKeys,
     /// The ends of its ranges, and their scales.
     ends: [f64; 3],
     scales: [Scale; 3],
-    state: State,
+    state: DamiaoState,
 }
 
 impl DamiaoBoard {
@@ -82,7 +82,7 @@ impl DamiaoBoard {
 impl Simulate for DamiaoOptions {
     /// An enabled motor at 25 degrees Celsius.
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        let keys = Checked::new(spec, self)?;
+        let keys = DamiaoKeys::new(spec, self)?;
         let mut ends = RANGES_USUAL;
         let known = keys.stated.iter().zip(&keys.of_model);
         for (end, (stated, model)) in ends.iter_mut().zip(known) {
@@ -94,7 +94,7 @@ impl Simulate for DamiaoOptions {
             Scale::range(velocity, 12),
             Scale::range(torque, 12),
         ];
-        let state = State {
+        let state = DamiaoState {
             state: ENABLED,
             raw: scales.map(|scale| scale.raw(0.0)),
             celsius: [25; 2],

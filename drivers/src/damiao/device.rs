@@ -1,12 +1,12 @@
 //! The host's side: takes the frames of one motor, and asks for them if it is told to.
 
 use super::frames::{
-    ENABLED, FET, JOINT, MOTOR, Message, SENSOR, STATE, State, quality_of, question,
+    DamiaoMessage, DamiaoState, ENABLED, FET, JOINT, MOTOR, SENSOR, STATE, quality_of, question,
 };
-use super::options::{Checked, DamiaoOptions};
+use super::options::{DamiaoKeys, DamiaoOptions};
 use super::ranges::Ranges;
 use crate::bringup::{Bringup, Timing};
-use crate::family::{Family, Link, Rounds, Supervised, temperature};
+use crate::family::{Family, Rounds, Supervised, Supervision, temperature};
 use crate::held::OnChange;
 use crate::{
     Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
@@ -17,15 +17,21 @@ use proprio_topics::{Actuator, Counter, Kind, Nanos, Quality, Reading};
 
 /// The host's side of a motor.
 #[derive(Debug)]
-pub(super) struct Motor {
-    keys: Checked,
+pub(super) struct DamiaoMotor {
+    keys: DamiaoKeys,
     /// The motor's state.
     told: OnChange<u8>,
     questions: Rounds,
 }
 
-impl Motor {
-    fn state(&mut self, told: &State, frame: &Frame, link: &mut Link<Ranges>, out: &mut Decoded) {
+impl DamiaoMotor {
+    fn state(
+        &mut self,
+        told: &DamiaoState,
+        frame: &Frame,
+        link: &mut Supervision<Ranges>,
+        out: &mut Decoded,
+    ) {
         let Some(scales) = link.questions.scales() else {
             return out.fault(Counter::Unexpected, 1, frame.id);
         };
@@ -63,13 +69,13 @@ impl Driver for DamiaoOptions {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, self)?;
+        let keys = DamiaoKeys::new(spec, self)?;
         let (mode, timing) = match keys.request_period {
             Some(_) => (spec.mode, Timing::POLLED),
             None => (Mode::Listen, Timing::LISTENED),
         };
         let bringup = Bringup::new(spec, mode, timing, keys.id);
-        let this = Motor {
+        let this = DamiaoMotor {
             keys,
             told: OnChange::NOTHING,
             questions: Rounds::new(keys.request_period),
@@ -80,10 +86,10 @@ impl Driver for DamiaoOptions {
     }
 }
 
-impl Family for Motor {
+impl Family for DamiaoMotor {
     type Questions = Ranges;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Ranges>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<Ranges>, out: &mut Decoded) {
         if frame.id != self.keys.id {
             return;
         }
@@ -93,13 +99,13 @@ impl Family for Motor {
         if data.len() != 8 {
             return out.fault(Counter::Length, 1, frame.id);
         }
-        match Message::parse(self.keys.address, data) {
-            Some(Message::State(state)) => self.state(&state, frame, link, out),
-            Some(Message::Register(register, value)) => {
+        match DamiaoMessage::parse(self.keys.address, data) {
+            Some(DamiaoMessage::State(state)) => self.state(&state, frame, link, out),
+            Some(DamiaoMessage::Register(register, value)) => {
                 link.questions.answer(register, value, frame, out);
             }
             // Answers to other programs, and frames of other motors.
-            Some(Message::Other) | None => {}
+            Some(DamiaoMessage::Other) | None => {}
         }
     }
 
@@ -110,7 +116,7 @@ impl Family for Motor {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Link<Ranges>,
+        _link: &mut Supervision<Ranges>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         let command = self.questions.ask(&[STATE], now)?;

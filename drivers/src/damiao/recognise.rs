@@ -1,8 +1,8 @@
 //! Recognising motors by the frames with which they answer commands and questions.
 
-use super::frames::{Message, QUESTIONS, RANGES, READ, STATE, State, question};
+use super::frames::{DamiaoMessage, DamiaoState, QUESTIONS, RANGES, READ, STATE, question};
 use super::options::DamiaoOptions;
-use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
+use crate::recognise::{Evidence, Finding, IdUse, Key, Stream, Traffic};
 use crate::{Driver, Frame, Id, Recognise};
 use alloc::vec::Vec;
 
@@ -23,16 +23,16 @@ const TELLS: f64 = 16.0;
 const ASKS: f64 = 6.0;
 
 /// What `frame` tells of the motor at `address`, if it may be its frame.
-fn message(frame: &Frame, address: u8) -> Option<Message> {
+fn message(frame: &Frame, address: u8) -> Option<DamiaoMessage> {
     let data = (frame.len() == 8).then(|| frame.data())?;
-    Message::parse(address, data).filter(|message| match message {
-        Message::State(State { state, celsius, .. }) => {
+    DamiaoMessage::parse(address, data).filter(|message| match message {
+        DamiaoMessage::State(DamiaoState { state, celsius, .. }) => {
             let is_known = matches!(state, 0 | 1 | 5 | 6 | 8..=0xE);
             let [fet, rotor] = celsius;
             let are_usual = CELSIUS.contains(fet) && CELSIUS.contains(rotor);
             is_known && are_usual && fet.abs_diff(*rotor) <= APART
         }
-        Message::Register(..) | Message::Other => true,
+        DamiaoMessage::Register(..) | DamiaoMessage::Other => true,
     })
 }
 
@@ -121,14 +121,14 @@ fn motor(
     if halves.len() > 1 {
         evidence.add(-3.0);
     }
-    evidence.sends_as(Part::Sends(shared), stream.id, |frame| {
+    evidence.sends_as(IdUse::Sends(shared), stream.id, |frame| {
         let own = frame.data().first().map(|first| first & 0xF);
         own.is_some_and(|own| halves.contains(&own) && message(frame, own).is_some())
     })?;
     let is_its =
         |frame: &Frame| frame.data().first().map(|first| first & 0xF) == Some(address & 0xF);
     let has_told = |frame: &Frame| match message(frame, address) {
-        Some(Message::Register(register, value)) => {
+        Some(DamiaoMessage::Register(register, value)) => {
             RANGES.contains(&register) && ENDS.contains(&value)
         }
         _ => false,
@@ -138,7 +138,7 @@ fn motor(
     }
     evidence.measures(stream);
     evidence.moves(stream, |frame| match message(frame, address) {
-        Some(Message::State(State {
+        Some(DamiaoMessage::State(DamiaoState {
             raw: [position, velocity, _],
             ..
         })) if is_its(frame) => Some((position as f64, velocity as f64 - 2047.5)),

@@ -1,6 +1,6 @@
 //! The device's own side: sends its readings in the frames that the file describes, from power-on.
 
-use super::layout::{Layout, Part, Role, implies, shared};
+use super::layout::{DbcLayout, SignalGroup, SignalRole, implies, shared};
 use super::options::DbcOptions;
 use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError};
 use alloc::boxed::Box;
@@ -10,7 +10,7 @@ use proprio_topics::{Nanos, Quality, Reading};
 /// A simulated device that a .dbc file describes. Signals that the keys do not name are zero.
 #[derive(Debug)]
 struct DbcBoard {
-    layout: Layout,
+    layout: DbcLayout,
     period: Nanos,
     frames: Vec<Pending>,
     /// The messages of each reading, in the order that they are sent in.
@@ -23,7 +23,7 @@ struct DbcBoard {
 #[derive(Debug)]
 struct Pending {
     message: usize,
-    parts: Vec<Part>,
+    parts: Vec<SignalGroup>,
     data: [u8; 64],
     /// The parts whose values are new, one bit each.
     fresh: u128,
@@ -32,7 +32,7 @@ struct Pending {
 impl Simulate for DbcOptions {
     /// A device after power-on.
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        let layout = Layout::new(spec, self)?;
+        let layout = DbcLayout::new(spec, self)?;
         let period_ms = self.period_ms.unwrap_or(10);
         if !(1..=60_000).contains(&period_ms) {
             return Err(SpecError::Key {
@@ -49,7 +49,7 @@ impl Simulate for DbcOptions {
                     let raw = condition.ranges.first().map_or(0, |range| range.0);
                     condition.bits.set(raw, &mut data);
                 }
-                let has = |part: &&Part| implies(&conditions, &part.conditions);
+                let has = |part: &&SignalGroup| implies(&conditions, &part.conditions);
                 frames.push(Pending {
                     message,
                     parts: layout.parts.iter().filter(has).cloned().collect(),
@@ -128,9 +128,9 @@ impl Board for DbcBoard {
                     for field in &part.fields {
                         let length = field.bits.length();
                         let raw = match field.role {
-                            Role::Counter => count,
-                            Role::Fault => u64::from(quality.contains(Quality::DEVICE_FAULT)),
-                            Role::Value {
+                            SignalRole::Counter => count,
+                            SignalRole::Fault => u64::from(quality.contains(Quality::DEVICE_FAULT)),
+                            SignalRole::Value {
                                 index,
                                 gain,
                                 offset,

@@ -1,10 +1,10 @@
 //! The host's side: collects the values of each reading out of the frames, and watches that they
 //! come.
 
-use super::layout::{Field, Layout, Part, ReadingLayout, Role};
+use super::layout::{DbcLayout, ReadingLayout, SignalGroup, SignalRole, UsedSignal};
 use super::options::{DbcOptions, ReadingKeys};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::pairing::within;
 use crate::signal::Message;
 use crate::{
@@ -34,7 +34,7 @@ const TIMING: Timing = Timing {
 /// The host's side of a device that a .dbc file describes.
 #[derive(Debug)]
 pub(super) struct DbcDevice {
-    layout: Layout,
+    layout: DbcLayout,
     readings: Vec<Assembly>,
 }
 
@@ -106,7 +106,13 @@ impl Assembly {
     }
 
     /// Takes the values of a frame. True if the reading is complete.
-    fn take(&mut self, part: &Part, sender: Option<u8>, frame: &Frame, out: &mut Decoded) -> bool {
+    fn take(
+        &mut self,
+        part: &SignalGroup,
+        sender: Option<u8>,
+        frame: &Frame,
+        out: &mut Decoded,
+    ) -> bool {
         let begun = (self.t, self.stamp);
         let in_time = within(begun, (frame.t, frame.stamp), self.layout.limit);
         if self.have != 0 && in_time && sender.zip(self.sender).is_some_and(|(a, b)| a != b) {
@@ -118,15 +124,15 @@ impl Assembly {
         // The values that have come, and those that ride along, one bit each.
         let (mut come, mut along): (u16, u16) = (0, 0);
         for field in &part.fields {
-            let Field { bits, raw, .. } = *field;
+            let UsedSignal { bits, raw, .. } = *field;
             let Some(found) = bits.of(frame.data()) else {
                 continue;
             };
             let is_none = field.is_none(found);
             match field.role {
-                Role::Counter => self.count = Some(found),
-                Role::Fault => self.fault = found != 0 && !is_none,
-                Role::Value {
+                SignalRole::Counter => self.count = Some(found),
+                SignalRole::Fault => self.fault = found != 0 && !is_none,
+                SignalRole::Value {
                     index,
                     gain,
                     offset,
@@ -282,7 +288,7 @@ impl Driver for DbcOptions {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        let layout = Layout::new(spec, self)?;
+        let layout = DbcLayout::new(spec, self)?;
         let claims: Vec<Claim> = layout.messages.iter().map(|m| m.frames).collect();
         let watched = (layout.order(0).first())
             .and_then(|number| layout.messages.get(*number))
@@ -293,7 +299,7 @@ impl Driver for DbcOptions {
             let fields = parts
                 .filter(|part| part.reading == number)
                 .flat_map(|part| &part.fields);
-            let counter = fields.filter(|field| field.role == Role::Counter);
+            let counter = fields.filter(|field| field.role == SignalRole::Counter);
             let most = counter
                 .map(|field| u64::MAX >> (64 - field.bits.length()))
                 .max();
@@ -311,7 +317,7 @@ impl Driver for DbcOptions {
 impl Family for DbcDevice {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         // Who asks for a frame of the device says nothing of it.
         if matches!(frame.format, Format::Error | Format::Remote) {
             return;

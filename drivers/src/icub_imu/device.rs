@@ -2,14 +2,14 @@
 //! acquisition into a reading.
 
 use super::frames::{
-    ACCELERATION_LSB, FIELD_LSB, Legacy, QUATERNION_LSB, Quantity, RATE_LSB, kind, sensor,
+    ACCELERATION_LSB, FIELD_LSB, ImuQuantity, Legacy, QUATERNION_LSB, RATE_LSB, kind, sensor,
 };
-use super::options::{IcubImuOptions, Plan};
+use super::options::{IcubImuOptions, ImuKeys};
 use crate::bringup::Bringup;
 use crate::configure::{Configure, Setting};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
-use crate::pairing::{self, Limit, Order, Paired, Pairing};
+use crate::pairing::{self, HalfOrder, Limit, Paired, Pairing};
 use crate::{
     Claim, Decoded, Device, Driver, Frame, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
 };
@@ -49,7 +49,7 @@ impl Acquisition {
 /// The host's side of an IMU.
 #[derive(Debug)]
 pub(super) struct ImuDevice {
-    plan: Plan,
+    plan: ImuKeys,
     acquisition: Acquisition,
     /// SEQ of the last acquisition begun.
     sequence: Option<u8>,
@@ -112,7 +112,13 @@ impl ImuDevice {
 
     /// Records that the acquisition has `bit`; outputs the reading when all wanted quantities are
     /// present.
-    fn hold(&mut self, bit: u16, frame: &Frame, link: &mut Link<Configure>, out: &mut Decoded) {
+    fn hold(
+        &mut self,
+        bit: u16,
+        frame: &Frame,
+        link: &mut Supervision<Configure>,
+        out: &mut Decoded,
+    ) {
         self.acquisition.have |= bit;
         if self.acquisition.have & self.plan.want != self.plan.want {
             return;
@@ -141,7 +147,7 @@ impl ImuDevice {
         device_counter: u32,
         mut quality: Quality,
         frame: &Frame,
-        link: &mut Link<Configure>,
+        link: &mut Supervision<Configure>,
         out: &mut Decoded,
     ) {
         if core::mem::take(&mut self.gap) | link.bringup.reading(frame.t) {
@@ -161,7 +167,7 @@ impl ImuDevice {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Configure>,
+        link: &mut Supervision<Configure>,
         out: &mut Decoded,
     ) {
         let &[sequence, sensor, ..] = data else {
@@ -192,10 +198,10 @@ impl ImuDevice {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Configure>,
+        link: &mut Supervision<Configure>,
         out: &mut Decoded,
     ) {
-        let bit = Quantity::Orientation.bit();
+        let bit = ImuQuantity::Orientation.bit();
         // Before the first acquisition that is heard it belongs to an earlier one.
         if self.plan.want & bit == 0 || self.sequence.is_none() {
             return;
@@ -218,7 +224,7 @@ impl ImuDevice {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Configure>,
+        link: &mut Supervision<Configure>,
         out: &mut Decoded,
     ) {
         let &[sequence, gyroscope, accelerometer, magnetometer, ..] = data else {
@@ -227,16 +233,16 @@ impl ImuDevice {
         if gyroscope > 3 || accelerometer > 3 || magnetometer > 3 {
             return out.fault(Counter::Value, 1, frame.id);
         }
-        let bit = Quantity::Status.bit();
+        let bit = ImuQuantity::Status.bit();
         if self.plan.want & bit == 0 || !self.belongs(sequence, frame, out) {
             return;
         }
-        let lacks = |quantity: Quantity, calibration| {
+        let lacks = |quantity: ImuQuantity, calibration| {
             self.plan.want & quantity.bit() != 0 && calibration == 0
         };
-        self.not_calibrated = lacks(Quantity::Acceleration, accelerometer)
-            || lacks(Quantity::AngularVelocity, gyroscope)
-            || lacks(Quantity::MagneticField, magnetometer);
+        self.not_calibrated = lacks(ImuQuantity::Acceleration, accelerometer)
+            || lacks(ImuQuantity::AngularVelocity, gyroscope)
+            || lacks(ImuQuantity::MagneticField, magnetometer);
         self.hold(bit, frame, link, out);
     }
 
@@ -245,13 +251,13 @@ impl ImuDevice {
         is_gyroscope: bool,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Configure>,
+        link: &mut Supervision<Configure>,
         out: &mut Decoded,
     ) {
         let quantity = if is_gyroscope {
-            Quantity::AngularVelocity
+            ImuQuantity::AngularVelocity
         } else {
-            Quantity::Acceleration
+            ImuQuantity::Acceleration
         };
         if self.plan.want & quantity.bit() == 0 {
             return;
@@ -304,7 +310,7 @@ impl Driver for IcubImuOptions {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        let plan = Plan::new(spec, self)?;
+        let plan = ImuKeys::new(spec, self)?;
         let timing = icub::timing(self.power_on_silence_ms)?;
         let is_legacy = plan.legacy != Legacy::None;
         let kinds: &[u8] = if is_legacy {
@@ -353,8 +359,8 @@ impl Driver for IcubImuOptions {
             legacy: Pairing::new(
                 Limit::of_period(period),
                 match plan.legacy {
-                    Legacy::Bno055 => Order::Usual,
-                    _ => Order::Any,
+                    Legacy::Bno055 => HalfOrder::Usual,
+                    _ => HalfOrder::Any,
                 },
             ),
             together: Nanos(period.0 / 2),
@@ -369,7 +375,7 @@ impl Driver for IcubImuOptions {
 impl Family for ImuDevice {
     type Questions = Configure;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Configure>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<Configure>, out: &mut Decoded) {
         let is_legacy = self.plan.legacy != Legacy::None;
         if let Some(stream) =
             icub::stream_type(frame.id, class::PERIODIC_INERTIAL, self.plan.address)

@@ -1,7 +1,8 @@
 //! The device's own side: a board that streams at once.
 
 use super::{
-    CALIBRATION, FRAME, IcubMc4Options, JOINTS, POSITION_CONTROL, Scale, fault, kind, quality_of,
+    CALIBRATION, FRAME, IcubMc4Options, JOINTS, POSITION_CONTROL, StepSizes, fault, kind,
+    quality_of,
 };
 use crate::icub::{self, class};
 use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, bytes};
@@ -10,8 +11,8 @@ use proprio_topics::{Nanos, Quality, Reading};
 
 /// A joint of a simulated board.
 #[derive(Debug)]
-struct Simulated {
-    scale: Scale,
+struct SimulatedJoint {
+    scale: StepSizes,
     ticks: i32,
     /// None as long as no velocity is given.
     steps: Option<i16>,
@@ -25,7 +26,7 @@ struct Simulated {
 struct Mc4Board {
     address: u8,
     period: Nanos,
-    joints: [Simulated; JOINTS],
+    joints: [SimulatedJoint; JOINTS],
     /// The joints in use, and those of them that are new, one bit each.
     used: u8,
     fresh: u8,
@@ -51,7 +52,7 @@ impl Simulate for IcubMc4Options {
         Ok(Box::new(Mc4Board {
             address: icub::address(spec)?,
             period: Nanos::from_millis(i64::from(period)),
-            joints: self.scales()?.map(|scale| Simulated {
+            joints: self.scales()?.map(|scale| SimulatedJoint {
                 scale,
                 ticks: 0,
                 steps: None,

@@ -1,6 +1,6 @@
 //! The device's own side: a board that streams once it is told to.
 
-use super::{IcubPosOptions, LABEL_MOST, POS, Quantity};
+use super::{IcubPosOptions, LABEL_MOST, POS, PosQuantity};
 use crate::icub::{self, class, command};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Simulate, Spec, SpecError, board, bytes};
 use alloc::boxed::Box;
@@ -13,7 +13,7 @@ struct PosBoard {
     address: u8,
     period: Nanos,
     streaming: bool,
-    quantity: Quantity,
+    quantity: PosQuantity,
     /// The configuration received, in the form of POS_CONFIG_SET.
     configuration: [u8; 8],
 }

@@ -2,8 +2,8 @@
 //! readings as frames.
 
 use super::exchange::MINUS_PRESENT;
-use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind, saturation_bytes};
-use super::options::{IcubStrainOptions, Stream};
+use super::frames::{CELSIUS_PER_LSB, STEPS, StrainHalf, ZERO, kind, saturation_bytes};
+use super::options::{IcubStrainOptions, StrainStream};
 use crate::icub::{self, class, command};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Simulate, Spec, SpecError, board, bytes};
 use alloc::boxed::Box;
@@ -27,7 +27,7 @@ struct StrainBoard {
     scale_known: bool,
     period: Nanos,
     /// The stream selected by the host; `None` while it is silent.
-    stream: Option<Stream>,
+    stream: Option<StrainStream>,
     /// The calibrated counts of the last vector that was not saturated.
     last_good: Option<[u16; 6]>,
     /// The gauges of the last vector.
@@ -47,7 +47,7 @@ impl StrainBoard {
             (first_kind + 1, [d, e, f], saturation[1]),
         ] {
             let id = icub::stream(class::PERIODIC_ANALOG, self.address, kind);
-            let _ = out.try_push(Half { counts, saturation }.frame(id));
+            let _ = out.try_push(StrainHalf { counts, saturation }.frame(id));
         }
     }
 }
@@ -148,7 +148,7 @@ impl Board for StrainBoard {
             Some(&[command::SET_CANDATARATE, ms]) if ms > 0 => {
                 self.period = Nanos::from_millis(i64::from(ms));
             }
-            Some(&[command::SET_TXMODE, mode]) => self.stream = Stream::from_code(mode),
+            Some(&[command::SET_TXMODE, mode]) => self.stream = StrainStream::from_code(mode),
             _ => {}
         }
     }
@@ -216,10 +216,10 @@ impl Board for StrainBoard {
                 // A board that was not started encodes a recording, in which a wrench is a
                 // calibrated reading.
                 let stream = self.stream.unwrap_or_default();
-                if stream != Stream::Uncalibrated {
+                if stream != StrainStream::Uncalibrated {
                     self.send(kind::FORCE, counts, saturation, out);
                 }
-                if stream != Stream::Calibrated {
+                if stream != StrainStream::Calibrated {
                     self.send(kind::RAW_FORCE, raw, saturation, out);
                 }
             }

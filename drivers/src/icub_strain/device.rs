@@ -2,12 +2,12 @@
 //! two halves of each reading.
 
 use super::exchange::{Exchange, Told};
-use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind};
-use super::options::{IcubStrainOptions, Stream};
+use super::frames::{CELSIUS_PER_LSB, STEPS, StrainHalf, ZERO, kind};
+use super::options::{IcubStrainOptions, StrainStream};
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
-use crate::pairing::{Limit, Order, Paired, Pairing};
+use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::{
     Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
     Driver, Frame, Mode, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
@@ -21,7 +21,7 @@ use proprio_topics::{
 
 /// The full scales: configured, requested axis by axis, or from replies to another program.
 #[derive(Debug)]
-pub(super) struct FullScales {
+pub(super) struct StrainScales {
     /// The scale is configured, or not needed because only raw gauges are streamed: nothing to ask.
     settled: bool,
     /// N or Nm per step of the stream, once all six are known.
@@ -38,10 +38,10 @@ pub(super) struct FullScales {
     open: [u8; 6],
 }
 
-impl FullScales {
-    fn new(address: u8, configured: Option<[f64; 6]>, stream: Stream) -> Self {
+impl StrainScales {
+    fn new(address: u8, configured: Option<[f64; 6]>, stream: StrainStream) -> Self {
         Self {
-            settled: configured.is_some() || stream == Stream::Uncalibrated,
+            settled: configured.is_some() || stream == StrainStream::Uncalibrated,
             per_step: configured.map(|all| all.map(|full_scale| full_scale / STEPS)),
             told: [None; 6],
             refusal: None,
@@ -110,7 +110,7 @@ impl FullScales {
     }
 }
 
-impl Inquiry for FullScales {
+impl Inquiry for StrainScales {
     fn begin(&mut self) {
         self.axis = 0;
         self.attempts.begin();
@@ -166,22 +166,22 @@ impl Inquiry for FullScales {
 struct Whole {
     acquired: Nanos,
     stamp: StampKind,
-    first: Half,
-    second: Half,
+    first: StrainHalf,
+    second: StrainHalf,
     quality: Quality,
 }
 
 /// One of the two streams: its halves, and whether a reading was lost since the last one.
 #[derive(Debug)]
 struct Pair {
-    pairing: Pairing<Half>,
+    pairing: Pairing<StrainHalf>,
     gap: bool,
 }
 
 impl Pair {
     const fn new(limit: Limit) -> Self {
         Self {
-            pairing: Pairing::new(limit, Order::Usual),
+            pairing: Pairing::new(limit, HalfOrder::Usual),
             gap: false,
         }
     }
@@ -194,7 +194,7 @@ impl Pair {
         frame: &Frame,
         out: &mut Decoded,
     ) -> Option<Whole> {
-        let half = match Half::parse(data) {
+        let half = match StrainHalf::parse(data) {
             Ok(half) => half,
             Err(counter) => {
                 out.fault(counter, 1, frame.id);
@@ -236,7 +236,7 @@ impl Pair {
 pub(super) struct Strain {
     address: u8,
     exchange: Exchange,
-    stream: Stream,
+    stream: StrainStream,
     calibrated: Pair,
     raw: Pair,
 }
@@ -249,7 +249,7 @@ impl Strain {
         quality: Quality,
         reading: Reading,
         frame: &Frame,
-        link: &mut Link<FullScales>,
+        link: &mut Supervision<StrainScales>,
         out: &mut Decoded,
     ) {
         if quality.contains(Quality::SATURATED) {
@@ -273,7 +273,7 @@ impl Strain {
         second: bool,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<FullScales>,
+        link: &mut Supervision<StrainScales>,
         out: &mut Decoded,
     ) {
         let Some(whole) = self.calibrated.push(second, data, frame, out) else {
@@ -316,7 +316,7 @@ impl Strain {
         second: bool,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<FullScales>,
+        link: &mut Supervision<StrainScales>,
         out: &mut Decoded,
     ) {
         let Some(whole) = self.raw.push(second, data, frame, out) else {
@@ -361,8 +361,10 @@ impl Driver for IcubStrainOptions {
             icub::to_board(class::POLLING_ANALOG, address),
         );
         let watched = match self.stream {
-            Stream::Uncalibrated => icub::stream(class::PERIODIC_ANALOG, address, kind::RAW_FORCE),
-            Stream::Calibrated | Stream::Both => force,
+            StrainStream::Uncalibrated => {
+                icub::stream(class::PERIODIC_ANALOG, address, kind::RAW_FORCE)
+            }
+            StrainStream::Calibrated | StrainStream::Both => force,
         };
         let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
         bringup.start_with(command_id, &[command::SET_CANDATARATE, period]);
@@ -387,7 +389,7 @@ impl Driver for IcubStrainOptions {
             ],
         );
         claims.push(Claim::shared(icub::to_host(class::POLLING_ANALOG, address)));
-        let scales = FullScales::new(address, configured, self.stream);
+        let scales = StrainScales::new(address, configured, self.stream);
         let this = Strain {
             address,
             exchange: Exchange::new(address),
@@ -400,9 +402,9 @@ impl Driver for IcubStrainOptions {
 }
 
 impl Family for Strain {
-    type Questions = FullScales;
+    type Questions = StrainScales;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<FullScales>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<StrainScales>, out: &mut Decoded) {
         if let Some(stream) = icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) {
             let known = matches!(stream, kind::RAW_FORCE..=kind::TORQUE | kind::THERMOMETER..);
             let Some(data) = known.then(|| bytes::payload(frame, out)).flatten() else {
@@ -446,7 +448,7 @@ impl Family for Strain {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Link<FullScales>,
+        _link: &mut Supervision<StrainScales>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         self.exchange.poll(now)
@@ -468,10 +470,11 @@ impl Family for Strain {
         &mut self,
         command: Command,
         now: Nanos,
-        link: &Link<FullScales>,
+        link: &Supervision<StrainScales>,
     ) -> Result<(), CommandRefused> {
         let tares = command == Command::Tare;
-        if tares && self.stream == Stream::Uncalibrated && link.bringup.mode() != Mode::Listen {
+        if tares && self.stream == StrainStream::Uncalibrated && link.bringup.mode() != Mode::Listen
+        {
             return Err(CommandRefused::Useless(
                 "this device streams raw gauges alone, which a tare does not change",
             ));
@@ -486,7 +489,7 @@ impl Family for Strain {
 
     fn outcome(
         &mut self,
-        link: &Link<FullScales>,
+        link: &Supervision<StrainScales>,
     ) -> Option<Result<CommandOutcome, CommandFailed>> {
         Some(match self.exchange.outcome()? {
             Ok((Command::Tare, told)) => {

@@ -8,7 +8,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum Stream {
+pub enum StrainStream {
     /// Wrenches.
     #[default]
     Calibrated,
@@ -18,7 +18,7 @@ pub enum Stream {
     Both,
 }
 
-impl Stream {
+impl StrainStream {
     /// The mode of SET_TXMODE.
     pub(super) const fn code(self) -> u8 {
         match self {
@@ -53,7 +53,7 @@ pub struct IcubStrainOptions {
     /// Period \[ms\], 1 to 255; default 10.
     pub period_ms: u32,
     /// The streamed quantities; default calibrated.
-    pub stream: Stream,
+    pub stream: StrainStream,
     /// Period of the temperature \[s\], 1 to 255; default none.
     pub temperature_period_s: Option<u32>,
     /// Longest time from a force frame to its torque frame \[ms\]; default by the period.
@@ -68,7 +68,7 @@ impl Default for IcubStrainOptions {
             full_scale_n: None,
             full_scale_nm: None,
             period_ms: 10,
-            stream: Stream::Calibrated,
+            stream: StrainStream::Calibrated,
             temperature_period_s: None,
             pair_timeout_ms: None,
             power_on_silence_ms: 0,

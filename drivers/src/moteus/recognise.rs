@@ -1,6 +1,6 @@
 //! Recognising controllers by replies that read as registers.
 
-use super::{BITS, MoteusOptions, QUERY, REPLY, Told, WANTED, fd, id};
+use super::{BITS, MoteusOptions, QUERY, REPLY, Reply, WANTED, fd, id};
 use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
 use crate::{Driver, Frame, Recognise};
 use alloc::vec::Vec;
@@ -15,10 +15,12 @@ impl Recognise for MoteusOptions {
                 return None;
             }
             let first = stream.kept().next()?;
-            let bits = f64::from(Told::parse(first.data())?.structure);
+            let bits = f64::from(Reply::parse(first.data())?.structure);
             // Of 127 controllers and 128 hosts.
             let mut evidence = Evidence::with_fd(seen, 127 * 128);
-            evidence.sends_rarely(stream.id, bits, |frame| Told::parse(frame.data()).is_some());
+            evidence.sends_rarely(stream.id, bits, |frame| {
+                Reply::parse(frame.data()).is_some()
+            });
             let query = id(host, node, WANTED);
             evidence.sends_rarely(query, f64::from(BITS), |frame| {
                 let opcode = frame.data().first();

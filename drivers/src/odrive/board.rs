@@ -2,7 +2,7 @@
 
 use super::firmware::{Firmware, error};
 use super::frames::{FET, JOINT, MOTOR, command, is_request};
-use super::options::{Checked, OdriveOptions};
+use super::options::{OdriveKeys, OdriveOptions};
 use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board};
 use alloc::boxed::Box;
 use arrayvec::ArrayVec;
@@ -16,7 +16,7 @@ const VERSION: [u8; 8] = [2, 4, 4, 58, 0, 6, 9, 0];
 /// that it is asked.
 #[derive(Debug)]
 struct OdriveBoard {
-    keys: Checked,
+    keys: OdriveKeys,
     errors: u32,
     state: u8,
     estimates: [f64; 2],
@@ -120,7 +120,7 @@ impl Simulate for OdriveOptions {
     /// An axis in closed-loop control.
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(OdriveBoard {
-            keys: Checked::new(spec, self)?,
+            keys: OdriveKeys::new(spec, self)?,
             errors: 0,
             state: 8,
             estimates: [0.0; 2],

@@ -2,10 +2,10 @@
 
 use super::firmware::{Firmware, error};
 use super::frames::{FET, JOINT, LENGTH, MOTOR, command, is_request};
-use super::options::{Checked, OdriveOptions};
+use super::options::{OdriveKeys, OdriveOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Link, Rounds, Supervised, temperature};
-use crate::held::Held;
+use crate::family::{Family, Rounds, Supervised, Supervision, temperature};
+use crate::held::HeldValue;
 use crate::{
     Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes,
 };
@@ -21,17 +21,23 @@ fn float(data: &[u8], half: usize) -> f64 {
 
 /// The host's side of an axis.
 #[derive(Debug)]
-pub(super) struct Axis {
-    keys: Checked,
+pub(super) struct OdriveAxis {
+    keys: OdriveKeys,
     /// The quality from the last heartbeat.
     status: Quality,
-    current: Held,
-    torque: Held,
+    current: HeldValue,
+    torque: HeldValue,
     requests: Rounds,
 }
 
-impl Axis {
-    fn estimates(&self, data: &[u8], frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+impl OdriveAxis {
+    fn estimates(
+        &self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Supervision<NoInquiry>,
+        out: &mut Decoded,
+    ) {
         let (position, velocity) = (float(data, 0) * TAU, float(data, 1) * TAU);
         if !position.is_finite() {
             link.bringup.lost();
@@ -92,7 +98,7 @@ impl Driver for OdriveOptions {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, self)?;
+        let keys = OdriveKeys::new(spec, self)?;
         let mode = match keys.request_period {
             Some(_) => spec.mode,
             None => Mode::Listen,
@@ -100,21 +106,21 @@ impl Driver for OdriveOptions {
         let bringup = Bringup::new(spec, mode, Timing::LISTENED, keys.id(command::ESTIMATES));
         let commands = keys.firmware.commands().iter();
         let claims = commands.map(|command| Claim::exclusive(keys.id(*command)));
-        let this = Axis {
+        let this = OdriveAxis {
             keys,
             status: Quality::GOOD,
-            current: Held::ABSENT,
-            torque: Held::ABSENT,
+            current: HeldValue::ABSENT,
+            torque: HeldValue::ABSENT,
             requests: Rounds::new(keys.request_period),
         };
         Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 
-impl Family for Axis {
+impl Family for OdriveAxis {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let Some(command) = self.keys.command(frame.id) else {
             return;
         };
@@ -129,8 +135,8 @@ impl Family for Axis {
         }
         match command {
             command::ESTIMATES => self.estimates(data, frame, link, out),
-            command::IQ => self.current = Held::new(frame, float(data, 1)),
-            command::TORQUES => self.torque = Held::new(frame, float(data, 1)),
+            command::IQ => self.current = HeldValue::new(frame, float(data, 1)),
+            command::TORQUES => self.torque = HeldValue::new(frame, float(data, 1)),
             command::TEMPERATURE => {
                 temperature(FET, float(data, 0), frame, out);
                 temperature(MOTOR, float(data, 1), frame, out);
@@ -141,13 +147,13 @@ impl Family for Axis {
 
     fn reset(&mut self) {
         self.status = Quality::GOOD;
-        (self.current, self.torque) = (Held::ABSENT, Held::ABSENT);
+        (self.current, self.torque) = (HeldValue::ABSENT, HeldValue::ABSENT);
     }
 
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Link<NoInquiry>,
+        _link: &mut Supervision<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         let command = self.requests.ask(self.keys.firmware.requests(), now)?;

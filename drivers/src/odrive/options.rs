@@ -38,7 +38,7 @@ impl Default for OdriveOptions {
 
 /// The keys of a device, checked.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Checked {
+pub(super) struct OdriveKeys {
     pub(super) node: u16,
     pub(super) firmware: Firmware,
     pub(super) torque_constant: Option<f64>,
@@ -47,7 +47,7 @@ pub(super) struct Checked {
     pub(super) period: Nanos,
 }
 
-impl Checked {
+impl OdriveKeys {
     pub(super) fn new(spec: &Spec, options: &OdriveOptions) -> Result<Self, SpecError> {
         let node = address(spec, 0..=NODE_MOST)?;
         let torque_constant = (options.torque_constant)

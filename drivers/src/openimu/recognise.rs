@@ -1,6 +1,6 @@
 //! Recognising sensors: by the groups that they send.
 
-use super::frames::{ADDRESSES, DIVIDERS, Quantity, identifier, period};
+use super::frames::{ADDRESSES, DIVIDERS, OpenImuQuantity, identifier, period};
 use super::options::OpenImuOptions;
 use crate::recognise::{Evidence, Finding, Key, Traffic};
 use crate::{Driver, Recognise};
@@ -24,9 +24,9 @@ fn sensor(seen: &Traffic, address: u32) -> Option<Finding> {
     let mut quantities: Vec<&str> = Vec::new();
     let mut measured = None;
     for (quantity, name) in [
-        (Quantity::Orientation, "orientation"),
-        (Quantity::Acceleration, "acceleration"),
-        (Quantity::AngularVelocity, "angular_velocity"),
+        (OpenImuQuantity::Orientation, "orientation"),
+        (OpenImuQuantity::Acceleration, "acceleration"),
+        (OpenImuQuantity::AngularVelocity, "angular_velocity"),
     ] {
         let (pgn, priority, _) = quantity.pgn_priority_bit();
         if let Some(stream) = evidence.sends_length(identifier(priority, pgn, source), 8) {

@@ -2,7 +2,7 @@
 
 use super::options::OptoforceDaqOptions;
 use super::protocol::{
-    ANSWER, CONFIGURATION, DEFAULT_RATE, Ids, OVERLOAD_FX, PACKET, SENSOR_FAILURE, ZERO_HERE,
+    ANSWER, CONFIGURATION, DEFAULT_RATE, OVERLOAD_FX, OptoIds, PACKET, SENSOR_FAILURE, ZERO_HERE,
     period, sum,
 };
 use crate::{
@@ -14,7 +14,7 @@ use proprio_topics::{Nanos, Quality, Reading, Saturation};
 /// The unit's own side.
 #[derive(Debug)]
 struct OptoBoard {
-    ids: Ids,
+    ids: OptoIds,
     /// Steps per N.
     scale: [f64; 3],
     /// `None` while it is stopped.

@@ -3,10 +3,10 @@
 
 use super::options::OptoforceDaqOptions;
 use super::protocol::{
-    ANSWER, CONFIGURATION, ERRORS, Ids, OVERLOAD_FX, PACKET, Settings, ZERO_OWN, sum,
+    ANSWER, CONFIGURATION, ERRORS, OVERLOAD_FX, OptoIds, OptoSettings, PACKET, ZERO_OWN, sum,
 };
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::wrench::{self, NewZero};
 use crate::{
     Claim, Decoded, Device, Driver, Frame, Id, Mode, NotSent, Output, OutputInfo, Spec, SpecError,
@@ -20,9 +20,9 @@ use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, StampKind, Wrench};
 const ANSWERED: Nanos = Nanos::from_millis(100);
 
 /// The frames of a configuration.
-fn frames(id: Id, settings: Settings, fill: bool) -> [Frame; 2] {
+fn frames(id: Id, settings: OptoSettings, fill: bool) -> [Frame; 2] {
     let [a, b, c, d] = CONFIGURATION;
-    let Settings {
+    let OptoSettings {
         speed,
         filter,
         zero,
@@ -39,7 +39,7 @@ fn frames(id: Id, settings: Settings, fill: bool) -> [Frame; 2] {
 /// The host's side of a unit.
 #[derive(Debug)]
 pub(super) struct Opto {
-    ids: Ids,
+    ids: OptoIds,
     /// Steps per N.
     scale: [f64; 3],
     /// The first frame that waits for its second, and its stamp.
@@ -76,7 +76,7 @@ impl Opto {
         halves: [[u8; 8]; 2],
         first: (Nanos, StampKind),
         frame: &Frame,
-        link: &mut Link<NoInquiry>,
+        link: &mut Supervision<NoInquiry>,
         out: &mut Decoded,
     ) {
         let [[_, _, _, _, c0, c1, s0, s1], [a, b, c, d, e, f, _, _]] = halves;
@@ -150,7 +150,7 @@ impl Driver for OptoforceDaqOptions {
             for frame in frames(ids.config, settings, self.fill) {
                 bringup.start_with(frame.id, frame.data());
             }
-            let stopped = Settings {
+            let stopped = OptoSettings {
                 speed: 0,
                 zero: ZERO_OWN,
                 ..settings
@@ -175,7 +175,7 @@ impl Driver for OptoforceDaqOptions {
 impl Family for Opto {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         if frame.id != self.ids.data {
             return;
         }

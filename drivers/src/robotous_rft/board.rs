@@ -1,7 +1,7 @@
 //! The sensor's own side.
 
-use super::options::{Model, RobotousRftOptions};
-use super::protocol::{DEFAULT_RATE, Ids, OVERLOAD_FX, RATES, SET, command, period};
+use super::options::{RftModel, RobotousRftOptions};
+use super::protocol::{DEFAULT_RATE, OVERLOAD_FX, RATES, RftIds, SET, command, period};
 use crate::{
     Board, EncodeError, Format, Frame, Frames, Mode, Simulate, Spec, SpecError, board, bytes,
 };
@@ -15,7 +15,7 @@ const RANGE_ERROR: u8 = 2;
 /// The sensor's own side.
 #[derive(Debug)]
 struct RftBoard {
-    ids: Ids,
+    ids: RftIds,
     name: &'static str,
     divisors: [f64; 6],
     rate_code: u8,
@@ -64,7 +64,7 @@ impl Simulate for RobotousRftOptions {
         let rate_code = self.rate_code()?;
         let mut this = RftBoard {
             ids: self.ids(spec)?,
-            name: (Model::NAMES.get(self.model as usize).copied()).unwrap_or_default(),
+            name: (RftModel::NAMES.get(self.model as usize).copied()).unwrap_or_default(),
             divisors: self.model.divisors(),
             rate_code,
             period: period(self.rate_hz),

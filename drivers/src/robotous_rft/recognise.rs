@@ -1,14 +1,14 @@
 //! Recognising a sensor with the identifiers that it is delivered with.
 
-use super::options::{Model, RobotousRftOptions};
-use super::protocol::{Ids, RATES, command, send};
+use super::options::{RftModel, RobotousRftOptions};
+use super::protocol::{RATES, RftIds, command, send};
 use crate::recognise::{Evidence, Finding, Key, Traffic};
 use crate::{Driver, Frame, Id, Recognise};
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
 
-const IDS: Ids = Ids {
+const IDS: RftIds = RftIds {
     command: Id::standard(0x64),
     first: Id::standard(1),
     second: Id::standard(2),
@@ -56,7 +56,7 @@ fn sensor(seen: &Traffic) -> Option<Finding> {
     if let Some(name) = text(command::NAME) {
         // Fifteen letters, digits and signs.
         evidence.add(8.0);
-        if Model::NAMES.contains(&name.as_str()) {
+        if RftModel::NAMES.contains(&name.as_str()) {
             model = Key::new("model", format!("{name:?}"));
         }
         what = name;

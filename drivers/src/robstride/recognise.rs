@@ -1,9 +1,9 @@
 //! Recognising motors by their states, by parameters that they tell, and by their number.
 
-use super::frames::{LENGTH, Message, id, kind};
+use super::frames::{LENGTH, RobstrideMessage, id, kind};
 use super::options::RobstrideOptions;
 use crate::bytes::{u16_be, u16_le};
-use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
+use crate::recognise::{Evidence, Finding, IdUse, Key, Stream, Traffic};
 use crate::{Driver, Frame, Id, Recognise};
 use alloc::vec::Vec;
 
@@ -151,13 +151,13 @@ fn mit_motors(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
         if numbers.len() > 1 {
             evidence.add(-3.0);
         }
-        evidence.sends_as(Part::Sends(Some(*address)), stream.id, |frame| {
+        evidence.sends_as(IdUse::Sends(Some(*address)), stream.id, |frame| {
             let first = frame.data().first();
             let is_own = first.is_some_and(|first| numbers.contains(first));
             is_own && is_state(frame)
         })?;
-        let read = |frame: &Frame| match Message::of_mit(*address, frame.data()) {
-            Some(Message::State(state)) => Some(state.raw),
+        let read = |frame: &Frame| match RobstrideMessage::of_mit(*address, frame.data()) {
+            Some(RobstrideMessage::State(state)) => Some(state.raw),
             _ => None,
         };
         evidence.moves(stream, |frame| {

@@ -3,7 +3,7 @@
 use super::frames::{
     AMPERE_PER_STEP, DUTY_PER_STEP, FET, JOINT, KELVIN_PER_STEP, MOTOR, STEPS_PER_TURN, command,
 };
-use super::options::{Checked, Position, VescOptions};
+use super::options::{VescKeys, VescOptions, VescPosition};
 use crate::bytes::{quantise, quantise_i16};
 use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board};
 use alloc::boxed::Box;
@@ -12,7 +12,7 @@ use proprio_topics::{Nanos, Quality, Reading};
 /// A simulated controller.
 #[derive(Debug)]
 struct VescBoard {
-    keys: Checked,
+    keys: VescKeys,
     /// The duty cycle that it was told.
     duty: f64,
     /// Of FETs and motor \[degrees Celsius\].
@@ -53,7 +53,7 @@ impl Simulate for VescOptions {
     /// A controller at 25 degrees Celsius.
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(VescBoard {
-            keys: Checked::new(spec, self)?,
+            keys: VescKeys::new(spec, self)?,
             duty: 0.0,
             temperatures: [25.0; 2],
         }))
@@ -88,12 +88,12 @@ impl Board for VescBoard {
                 self.send(command::STATUS, self.status(joint.velocity, amperes), out);
                 let (step, most) = (self.keys.position_step, i64::from(i32::MAX));
                 match self.keys.position {
-                    Position::Pid => {
+                    VescPosition::Pid => {
                         let steps = quantise(joint.position, step, i64::MIN, i64::MAX);
                         let data = self.status_4(steps.rem_euclid(STEPS_PER_TURN));
                         self.send(command::STATUS_4, data, out);
                     }
-                    Position::Tachometer => {
+                    VescPosition::Tachometer => {
                         #[allow(clippy::cast_possible_truncation)] // limited
                         let count = quantise(joint.position, step, -most, most) as i32;
                         let [t0, t1, t2, t3] = count.to_be_bytes();
@@ -106,7 +106,7 @@ impl Board for VescBoard {
                 board::finite(&[temperature.celsius])?;
                 let [fet, motor] = &mut self.temperatures;
                 *(if output == MOTOR { motor } else { fet }) = temperature.celsius;
-                if self.keys.position == Position::Tachometer {
+                if self.keys.position == VescPosition::Tachometer {
                     self.send(command::STATUS_4, self.status_4(0), out);
                 }
             }

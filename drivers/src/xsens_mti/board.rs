@@ -1,7 +1,7 @@
 //! The sensor's own side.
 
-use super::frames::{ACCELERATION_LSB, Message, RATE_LSB, status};
-use super::options::{Plan, XsensMtiOptions};
+use super::frames::{ACCELERATION_LSB, MtiMessage, RATE_LSB, status};
+use super::options::{MtiKeys, XsensMtiOptions};
 use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board, bytes};
 use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading, Saturation};
@@ -9,7 +9,7 @@ use proprio_topics::{Nanos, Quality, Reading, Saturation};
 /// The sensor's own side. It streams from power-on, as it was configured over its serial port.
 #[derive(Debug)]
 struct MtiBoard {
-    plan: Plan,
+    plan: MtiKeys,
     /// The sensor's clock at the next sample.
     clock: Nanos,
     counter: u16,
@@ -38,7 +38,7 @@ impl Simulate for XsensMtiOptions {
     /// A sensor that streams at once.
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         Ok(Box::new(MtiBoard {
-            plan: Plan::new(spec, self)?,
+            plan: MtiKeys::new(spec, self)?,
             clock: Nanos::ZERO,
             counter: 0,
         }))
@@ -65,10 +65,10 @@ impl Board for MtiBoard {
         let ticks = (self.clock.0 / self.plan.tick.0) as u32;
         for &(id, message) in &self.plan.messages {
             let (values, lsb): (&[f64], f64) = match message {
-                Message::Orientation => (&imu.orientation, self.plan.quaternion_lsb),
-                Message::AngularVelocity => (&imu.angular_velocity, RATE_LSB),
-                Message::Acceleration => (&imu.proper_acceleration, ACCELERATION_LSB),
-                Message::MagneticField => (&imu.magnetic_field, self.plan.field_lsb),
+                MtiMessage::Orientation => (&imu.orientation, self.plan.quaternion_lsb),
+                MtiMessage::AngularVelocity => (&imu.angular_velocity, RATE_LSB),
+                MtiMessage::Acceleration => (&imu.proper_acceleration, ACCELERATION_LSB),
+                MtiMessage::MagneticField => (&imu.magnetic_field, self.plan.field_lsb),
                 _ => (&[], 1.0),
             };
             board::finite(values)?;
@@ -77,9 +77,9 @@ impl Board for MtiBoard {
                 *count = bytes::quantise_i16(*value, lsb).to_be_bytes();
             }
             let frame = match message {
-                Message::SampleTime => Frame::new(id, &ticks.to_be_bytes()),
-                Message::GroupCounter => Frame::new(id, &self.counter.to_be_bytes()),
-                Message::Status => Frame::new(id, &Self::status(quality).to_be_bytes()),
+                MtiMessage::SampleTime => Frame::new(id, &ticks.to_be_bytes()),
+                MtiMessage::GroupCounter => Frame::new(id, &self.counter.to_be_bytes()),
+                MtiMessage::Status => Frame::new(id, &Self::status(quality).to_be_bytes()),
                 _ => Frame::new(
                     id,
                     counts.as_flattened().get(..message.length()).unwrap_or(&[]),
