@@ -29,8 +29,6 @@ mod kind {
 
 /// Bits of `Actuator::faults`.
 pub mod fault {
-    /// An illegal command was received.
-    pub const CAN_INVALID_PROTOCOL: u32 = 1;
     /// Impossible order of Hall sensor states.
     pub const HALL_SEQUENCE: u32 = 1 << 1;
     /// Checksum of the absolute encoder.
@@ -39,24 +37,14 @@ pub mod fault {
     pub const HALL_VALUE: u32 = 1 << 3;
     /// Current above its limit.
     pub const OVER_CURRENT: u32 = 1 << 4;
-    /// Supply above its limit.
-    pub const OVER_VOLTAGE: u32 = 1 << 5;
-    /// Supply below its limit.
-    pub const UNDER_VOLTAGE: u32 = 1 << 6;
     /// Emergency button pressed.
     pub const EXTERNAL: u32 = 1 << 7;
-    /// Temperature above its limit.
-    pub const OVER_HEATING: u32 = 1 << 9;
-    /// No command in time.
-    pub const SETPOINT_EXPIRED: u32 = 1 << 14;
     /// Calculation of the absolute encoder.
     pub const ENCODER_CALCULATION: u32 = 1 << 17;
     /// Timing of the SPI bus to the encoder.
     pub const SPI_TIMING: u32 = 1 << 18;
     /// Position encoder fault.
     pub const ENCODER: u32 = 1 << 19;
-    /// Mean current above its limit.
-    pub const I2T: u32 = 1 << 22;
     /// Bits that make a position doubtful.
     pub const POSITION: u32 =
         HALL_SEQUENCE | ENCODER_CHECKSUM | HALL_VALUE | ENCODER_CALCULATION | SPI_TIMING | ENCODER;

@@ -43,8 +43,8 @@
 //! of the module) that implements [`Driver`], [`Simulate`] and [`Recognise`], a `Family` (see
 //! `family.rs`) and a `Board`, and add its line to the list in `registry.rs`. Families share
 //! `bringup.rs` (starting a board), `configure.rs` (confirming its configuration), `pairing.rs` and
-//! `group.rs` (combining two frames, or more), `held.rs` (values of other instants), `bytes.rs` (the
-//! numbers of a payload), `wrench.rs` and [`calibration`] (force/torque sensors), `keys.rs`
+//! `group.rs` (combining two frames, or more), `held.rs` (values of other instants), `bytes.rs`
+//! (the numbers of a payload), `wrench.rs` and [`calibration`] (force/torque sensors), `keys.rs`
 //! (addresses, identifiers), `board.rs` (what a board can encode) and [`mod@recognise`] (the
 //! evidence for a device in the traffic of a bus).
 #![no_std]

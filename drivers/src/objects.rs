@@ -49,8 +49,8 @@ impl Objects {
         found.map(|(_, problem)| problem.as_str())
     }
 
-    /// The value of an object that this very device has ([`ObjectEntry::own`]); `None` for 0, by which
-    /// makers mean that it is not stated.
+    /// The value of an object that this very device has ([`ObjectEntry::own`]); `None` for 0, by
+    /// which makers mean that it is not stated.
     #[must_use]
     pub fn own(&self, index: u16, sub: u8) -> Option<u32> {
         let entry = self.entries.get(&(index, sub))?;

@@ -239,7 +239,7 @@ impl Exchange {
         match self.step {
             ExchangeStep::Idle => {}
             ExchangeStep::Commanding if self.under_way.is_none() => {
-                self.end(Err(CommandFailed::NotSent))
+                self.end(Err(CommandFailed::NotSent));
             }
             ExchangeStep::Commanding | ExchangeStep::Asking(_) => self.end(Err(why)),
         }
