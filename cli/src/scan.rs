@@ -3,7 +3,7 @@
 use crate::convert::StatedStamps;
 use anyhow::Context as _;
 use proprio_drivers::recognise::Stream;
-use proprio_drivers::{ASKED_BY_NAME, Finding, Traffic};
+use proprio_drivers::{Finding, Traffic};
 use proprio_gateway::clock::Monotonic;
 use proprio_gateway::config::Source;
 use proprio_gateway::link::adapter;
@@ -78,8 +78,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 }
 
 fn asked_by_name(text: &str) -> Result<String, String> {
-    let names = ASKED_BY_NAME.iter().filter(|(_, by_name)| *by_name);
-    let names: Vec<&str> = names.map(|(driver, _)| *driver).collect();
+    let names: Vec<&str> = proprio_drivers::asked_by_name().collect();
     match names.contains(&text) {
         true => Ok(text.to_owned()),
         false => Err(format!("must be {}", names.join(" or "))),

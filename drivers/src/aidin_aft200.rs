@@ -2,17 +2,21 @@
 //! What follows is its page of the book.
 #![doc = include_str!("../../docs/book/src/devices/aidin_aft200.md")]
 
+#[cfg(feature = "boards")]
+mod board;
+#[cfg(feature = "recognise")]
+mod recognise;
+
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Link, Supervised};
-use crate::pairing::{Limit, Order, Paired, Pairing};
-use crate::recognise::{Evidence, Finding, Key, Traffic};
+use crate::family::{Family, Supervised, Supervision};
+use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Format, Frame, Frames, Id, Mode, Output,
-    OutputInfo, Spec, SpecError, bytes, keys, wrench,
+    Claim, Decoded, Device, Driver, Frame, Id, Output, OutputInfo, Spec, SpecError, bytes, keys,
+    wrench,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Saturation, Wrench};
+use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Wrench};
 use serde::Deserialize;
 
 /// The identifier of all sensors' commands.
@@ -36,7 +40,7 @@ const FULL_SCALE: (f64, f64) = (200.0, 15.0);
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct AidinAft200Options {
     /// Period \[ms\], 1 to 65; default 10.
     pub period_ms: u32,
     /// Identifier of the force; default 1.
@@ -45,7 +49,7 @@ pub struct Options {
     pub id_torque: u16,
 }
 
-impl Default for Options {
+impl Default for AidinAft200Options {
     fn default() -> Self {
         Self {
             period_ms: 10,
@@ -55,7 +59,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl AidinAft200Options {
     fn period(&self) -> Result<Nanos, SpecError> {
         match self.period_ms {
             1..=65 => Ok(Nanos::from_millis(i64::from(self.period_ms))),
@@ -88,7 +92,7 @@ fn number(spec: &Spec) -> Result<u8, SpecError> {
     keys::address(spec, 1..=254).map(|number| number as u8)
 }
 
-impl Driver for Options {
+impl Driver for AidinAft200Options {
     const NAME: &'static str = "aidin_aft200";
     const ADDRESS: Option<u32> = Some(1);
 
@@ -97,51 +101,19 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Aft::device(spec, self)
-    }
-
-    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        Ok(Box::new(AftBoard::new(spec, self)?))
-    }
-
-    /// By the identifiers of delivery, with forces and torques that it can measure.
-    fn recognise(seen: &Traffic) -> Vec<Finding> {
-        let mut evidence = Evidence::new(seen, 1);
-        let keys = Self::default();
-        let half = |scale: (f64, f64), most: f64| {
-            move |frame: &Frame| match frame.data().first_chunk() {
-                Some(&half) => {
-                    let mut quality = Quality::GOOD;
-                    let values = axes(half, scale, 0, &mut quality);
-                    frame.len() <= 8 && values.iter().all(|value| value.abs() <= most)
-                }
-                None => false,
-            }
-        };
-        let force = evidence.sends(Id::standard(keys.id_force), half(NEWTON, FULL_SCALE.0));
-        let torque = evidence.sends(
-            Id::standard(keys.id_torque),
-            half(NEWTON_METRE, FULL_SCALE.1),
-        );
-        let (Some(force), Some(torque)) = (force, torque) else {
-            return Vec::new();
-        };
-        evidence.together(force, torque);
-        evidence.measures(force);
-        evidence.measures(torque);
-        evidence.sends(COMMAND, |frame| match *frame.data() {
-            [number, command, ..] => {
-                let known = (command::TRANSMIT..=command::PERIOD).contains(&command);
-                number > 0 && known && frame.len() == 8
-            }
-            _ => false,
-        });
-        let finding = evidence.finding(Self::NAME, 1, "AIDIN AFT200");
-        let period = Key::period_ms(force.period(), 1, 65);
-        (finding
-            .into_iter()
-            .map(|finding| finding.with_keys(period.clone())))
-        .collect()
+        let number = number(spec)?;
+        let (ids, period) = (self.ids()?, self.period()?);
+        let [force, _] = ids;
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // at most 65000
+        let [high, low] = ((period.0 / 1000) as u16).to_be_bytes();
+        let mut bringup = Bringup::new(spec, spec.mode, Timing::USUAL, force);
+        bringup.start_with(COMMAND, &[number, command::PERIOD, high, low, 0, 0, 0, 0]);
+        let start = [number, command::TRANSMIT, CONTINUOUSLY, 0, 0, 0, 0, 0];
+        bringup.start_with(COMMAND, &start);
+        let pairing = Pairing::new(Limit::of_period(period), HalfOrder::Usual);
+        let claims = ids.map(Claim::exclusive);
+        let this = Aft { ids, pairing };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 
@@ -150,24 +122,6 @@ impl Driver for Options {
 struct Aft {
     ids: [Id; 2],
     pairing: Pairing<[u8; 6]>,
-}
-
-impl Aft {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let number = number(spec)?;
-        let (ids, period) = (options.ids()?, options.period()?);
-        let [force, _] = ids;
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // at most 65000
-        let [high, low] = ((period.0 / 1000) as u16).to_be_bytes();
-        let mut bringup = Bringup::new(spec, spec.mode, Timing::USUAL, force);
-        bringup.start_with(COMMAND, &[number, command::PERIOD, high, low, 0, 0, 0, 0]);
-        let start = [number, command::TRANSMIT, CONTINUOUSLY, 0, 0, 0, 0, 0];
-        bringup.start_with(COMMAND, &start);
-        let pairing = Pairing::new(Limit::of_period(period), Order::Usual);
-        let claims = ids.map(Claim::exclusive);
-        let this = Self { ids, pairing };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
 }
 
 /// The values of one frame, and `quality` with the saturation of the axes `axis..axis + 3`.
@@ -184,7 +138,7 @@ fn axes(half: [u8; 6], scale: (f64, f64), axis: u32, quality: &mut Quality) -> [
 impl Family for Aft {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let [force, torque] = self.ids;
         let second = frame.id == torque;
         if !second && frame.id != force {
@@ -224,89 +178,5 @@ impl Family for Aft {
 
     fn reset(&mut self) {
         self.pairing.reset();
-    }
-}
-
-/// The sensor's own side.
-#[derive(Debug)]
-pub struct AftBoard {
-    number: u8,
-    ids: [Id; 2],
-    period: Nanos,
-    streaming: bool,
-}
-
-impl AftBoard {
-    /// A sensor after power-on; in [`Mode::Listen`] another program has already started it.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an identifier, a number or a period out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        Ok(Self {
-            number: number(spec)?,
-            ids: options.ids()?,
-            period: options.period()?,
-            streaming: spec.mode == Mode::Listen,
-        })
-    }
-}
-
-impl Board for AftBoard {
-    fn on_frame(&mut self, frame: &Frame, _out: &mut Frames) {
-        if frame.id != COMMAND || frame.format != Format::Classic {
-            return;
-        }
-        match *frame.data() {
-            [number, ..] if number != self.number => {}
-            [_, command::PERIOD, high, low, ..] if (high, low) != (0, 0) => {
-                self.period = Nanos::from_micros(i64::from(u16::from_be_bytes([high, low])));
-            }
-            [_, command::TRANSMIT, CONTINUOUSLY, ..] => self.streaming = true,
-            _ => {}
-        }
-    }
-
-    fn period(&self) -> Option<Nanos> {
-        self.streaming.then_some(self.period)
-    }
-
-    fn encode(
-        &mut self,
-        output: u8,
-        reading: &Reading,
-        quality: Quality,
-        out: &mut Frames,
-    ) -> Result<(), EncodeError> {
-        let Reading::Wrench(wrench) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
-        let [force, torque] = self.ids;
-        let halves = [
-            (force, wrench.force, NEWTON, 0),
-            (torque, wrench.torque, NEWTON_METRE, 3),
-        ];
-        let mut values = wrench.force.iter().chain(&wrench.torque);
-        if !values.all(|value| value.is_finite()) {
-            return Err(EncodeError::NotFinite);
-        }
-        for (id, values, (step, least), first) in halves {
-            let mut data = [0; 6];
-            for (axis, (to, value)) in (first..).zip(data.chunks_exact_mut(2).zip(values)) {
-                let count = match quality.saturation(axis) {
-                    Saturation::None => {
-                        let count = bytes::quantise(value - least, step, 0, u16::MAX.into());
-                        u16::try_from(count).unwrap_or(u16::MAX)
-                    }
-                    Saturation::Low => 0,
-                    Saturation::High => u16::MAX,
-                };
-                to.copy_from_slice(&count.to_be_bytes());
-            }
-            let _ = out.try_push(Frame::new(id, &data));
-        }
-        Ok(())
     }
 }

@@ -17,22 +17,26 @@
 //! object 1000 (device type) of all nodes, 1018 sub 1 to 4 (identity) of those that answer, and
 //! 1800 to 1803 sub 1 and 2 (identifier and transmission of each TPDO) of drives.
 
+#[cfg(feature = "boards")]
 mod node;
 mod pdo;
 mod protocol;
+#[cfg(feature = "recognise")]
 mod recognise;
 mod script;
 
-pub(crate) use node::Node;
+#[cfg(feature = "boards")]
+pub(crate) use node::SimulatedNode;
 pub(crate) use pdo::{Pdo, is_free};
 pub(crate) use protocol::{
     MAPPED_MOST, NMT, NO_RTR, Object, SYNC, TIMING, TPDO_OFF, nmt, object, sdo_from, sdo_to, tpdo,
 };
+#[cfg(feature = "recognise")]
 pub(crate) use recognise::{NO_PROFILE, Recognised, commands, questions, recognise};
-pub(crate) use script::{Plan, READ, Script, Step};
+pub(crate) use script::{READ, Script, ScriptStep, StartPlan};
 
 use crate::bytes::u16_le;
-use crate::family::Link;
+use crate::family::Supervision;
 use crate::objects::Objects;
 use crate::{Claim, Decoded, Frame, Spec, SpecError, bytes};
 use alloc::format;
@@ -234,11 +238,11 @@ pub(crate) struct NodeState {
 impl NodeState {
     /// Takes a frame of the node that is no PDO, if it is one. A node that has booted or left the
     /// operational state is started again.
-    pub(crate) fn on_frame<P: Plan>(
+    pub(crate) fn on_frame<P: StartPlan>(
         &mut self,
         node: u8,
         frame: &Frame,
-        link: &mut Link<Script<P>>,
+        link: &mut Supervision<Script<P>>,
         out: &mut Decoded,
     ) -> bool {
         let ids = [emcy(node), sdo_from(node), heartbeat(node), sdo_to(node)];

@@ -1,19 +1,21 @@
 //! The driver `canopen_encoder`: CANopen encoders. What follows is its page of the book.
 #![doc = include_str!("../../docs/book/src/devices/canopen_encoder.md")]
 
+#[cfg(feature = "boards")]
+mod board;
+#[cfg(feature = "recognise")]
+mod recognise;
+
 use crate::bringup::Bringup;
-use crate::bytes;
 use crate::canopen::{
-    self, Cycle, NMT, NO_RTR, Node, NodeState, Object, Pdo, Plan, Rates, Recognised, SYNC, Script,
-    Step, TPDO_OFF, is_free, nmt, node_of, object, tpdo,
+    self, Cycle, NMT, NodeState, Object, Pdo, Rates, SYNC, Script, ScriptStep, StartPlan, is_free,
+    nmt, node_of, object, tpdo,
 };
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::objects::Objects;
-use crate::recognise::{Finding, Key, Stream, Traffic};
 use crate::signal::Bits;
 use crate::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Id, Mode, Output,
-    OutputInfo, Spec, SpecError,
+    Claim, Decoded, Device, Driver, Frame, Id, Mode, Output, OutputInfo, Spec, SpecError, bytes,
 };
 use alloc::boxed::Box;
 use alloc::format;
@@ -21,7 +23,7 @@ use alloc::string::String;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
-use proprio_topics::{Counter, JointState, Kind, Nanos, Quality, Reading, Refusal};
+use proprio_topics::{Counter, JointState, Kind, Quality, Reading, Refusal};
 use serde::Deserialize;
 
 /// The profile of encoders.
@@ -40,7 +42,7 @@ const BY_EVENT: u8 = 254;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct CanopenEncoderOptions {
     /// Period \[ms\], 1 to 65535; default 10.
     pub period_ms: u32,
     /// Counts per turn; default the node's own.
@@ -56,7 +58,7 @@ pub struct Options {
     pub objects: Option<Objects>,
 }
 
-impl Default for Options {
+impl Default for CanopenEncoderOptions {
     fn default() -> Self {
         Self {
             period_ms: 10,
@@ -69,7 +71,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl CanopenEncoderOptions {
     fn check(&self) -> Result<(), SpecError> {
         let (key, value, expected) = if !(1..=65_535).contains(&self.period_ms) {
             ("period_ms", f64::from(self.period_ms), "1 to 65535")
@@ -101,17 +103,17 @@ impl Options {
 
 /// Where the position is: in which frame, and where in it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Place {
+struct PositionMapping {
     id: Id,
     bits: Bits,
     /// The node sends it after each n-th SYNC; 0: by itself.
     sync: u8,
 }
 
-impl Place {
+impl PositionMapping {
     /// As the driver maps it, or as the file says of a node that it does not map: those that a SYNC
     /// causes first, and of these the one that most SYNCs cause.
-    fn all(node: u8, options: &Options) -> Result<ArrayVec<Self, 4>, SpecError> {
+    fn all(node: u8, options: &CanopenEncoderOptions) -> Result<ArrayVec<Self, 4>, SpecError> {
         let name = options.eds.as_deref().unwrap_or_default();
         let mut places = ArrayVec::new();
         match &options.objects {
@@ -182,7 +184,7 @@ fn position_of(pdo: &Pdo) -> Option<Bits> {
     Bits::new(first, length, false)
 }
 
-impl Driver for Options {
+impl Driver for CanopenEncoderOptions {
     const NAME: &'static str = "canopen_encoder";
 
     fn outputs(&self) -> Vec<OutputInfo> {
@@ -198,50 +200,50 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Encoder::device(spec, self)
-    }
-
-    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        Ok(Box::new(EncoderBoard::new(spec, self)?))
-    }
-
-    fn recognise(seen: &Traffic) -> Vec<Finding> {
-        let find = |node: Recognised<'_>| {
-            let [first, others @ ..] = node.tpdos;
-            let mut evidence = node.evidence;
-            let what = match node.profile {
-                Some(406) => format!("CANopen encoder (CiA 406){}", node.identity),
-                Some(_) => return None,
-                None => {
-                    // Four bytes in one TPDO are rather a position than a drive's status.
-                    let is_position = first.is_some_and(|stream| stream.lengths == (4, 4));
-                    let alone = others.iter().all(Option::is_none);
-                    evidence.add(if is_position && alone { 2.0 } else { -2.0 });
-                    canopen::NO_PROFILE.into()
-                }
-            };
-            let finding = Finding {
-                guess: node.profile.is_none(),
-                ..evidence.finding(Self::NAME, node.node.into(), what)?
-            };
-            let period = Key::period_ms(first.and_then(Stream::period), 1, 65_535);
-            let commands = canopen::commands(node.node);
-            let finding = finding.with_keys(period).with_joints([0]);
-            Some(finding.with_commands(commands))
+        self.check()?;
+        let node = node_of(spec)?;
+        canopen::check_file(node, self.objects.as_ref())?;
+        let places = PositionMapping::all(node, self)?;
+        let listens = spec.mode == Mode::Listen;
+        if let (true, None, Some(file)) = (listens, self.counts_per_turn, &self.objects) {
+            let scales = [OPERATING, SCALED_PER_TURN, PER_TURN];
+            let is_scale = |index| scales.iter().any(|scale| scale.index == index);
+            let name = self.eds.as_deref().unwrap_or_default();
+            canopen::check_objects((name, file), is_scale, "set counts_per_turn")?;
+        }
+        let first = places.first().map_or(tpdo(node, 0), |place| place.id);
+        let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, first);
+        bringup.start_with(NMT, &[nmt::START, node]);
+        bringup.stop_with(NMT, &[nmt::PRE_OPERATIONAL, node]);
+        let start = EncoderStart {
+            node,
+            counts_per_turn: self.counts_per_turn,
+            of_file: self.counts_of_file().filter(|_| listens),
+            options: self.clone(),
+            scaled: false,
+            no_timer: false,
         };
-        canopen::recognise(seen).filter_map(find).collect()
-    }
-
-    fn questions(seen: &Traffic) -> Vec<Frame> {
-        canopen::questions(seen)
+        let claims = canopen::claims(node)
+            .chain(places.iter().map(|place| Claim::exclusive(place.id)))
+            .chain([Claim::shared(SYNC)])
+            .collect::<Vec<_>>();
+        let script = Script::new(node, spec.mode, start);
+        let this = Encoder {
+            node,
+            cycle: Cycle::new(places.first().map_or(0, |place| place.sync)),
+            places,
+            rates: Rates::default(),
+            state: NodeState::default(),
+        };
+        Ok(Supervised::boxed(claims, bringup, script, this))
     }
 }
 
 /// The start of an encoder.
 #[derive(Debug)]
-struct Start {
+struct EncoderStart {
     node: u8,
-    options: Options,
+    options: CanopenEncoderOptions,
     scaled: bool,
     counts_per_turn: Option<f64>,
     /// Those of the file, if the node is not asked.
@@ -255,9 +257,9 @@ const FIRST_SETUP: usize = 4;
 const CYCLE_STEP: usize = FIRST_SETUP + Pdo::SETUP - 1;
 const LAST_SETUP: usize = CYCLE_STEP + 1;
 
-impl Plan for Start {
-    fn step(&self, at: usize) -> Option<Step> {
-        let write = |object, value, bytes| Step::Write {
+impl StartPlan for EncoderStart {
+    fn step(&self, at: usize) -> Option<ScriptStep> {
+        let write = |object, value, bytes| ScriptStep::Write {
             object,
             value,
             bytes,
@@ -275,11 +277,11 @@ impl Plan for Start {
         };
         let setup = |at| pdo.setup(0, period, at).filter(|_| self.options.configure);
         let (step, needed) = match at {
-            0 => (Step::Nmt(nmt::PRE_OPERATIONAL), true),
-            1 => (Step::Read(object::DEVICE_TYPE), true),
-            2 => (Step::Read(OPERATING), asks),
-            3 if self.scaled => (Step::Read(SCALED_PER_TURN), asks),
-            3 => (Step::Read(PER_TURN), asks),
+            0 => (ScriptStep::Nmt(nmt::PRE_OPERATIONAL), true),
+            1 => (ScriptStep::Read(object::DEVICE_TYPE), true),
+            2 => (ScriptStep::Read(OPERATING), asks),
+            3 if self.scaled => (ScriptStep::Read(SCALED_PER_TURN), asks),
+            3 => (ScriptStep::Read(PER_TURN), asks),
             LAST_SETUP => return setup(Pdo::SETUP - 1),
             at if at < CYCLE_STEP => return setup(at - FIRST_SETUP),
             CYCLE_STEP => {
@@ -353,7 +355,7 @@ impl Plan for Start {
     }
 }
 
-impl Start {
+impl EncoderStart {
     /// The counts per turn: the node's own, else its file's.
     fn known(&self) -> Option<f64> {
         self.counts_per_turn.or(self.of_file)
@@ -365,58 +367,19 @@ impl Start {
 struct Encoder {
     node: u8,
     /// The best first.
-    places: ArrayVec<Place, 4>,
+    places: ArrayVec<PositionMapping, 4>,
     rates: Rates,
     cycle: Cycle,
     state: NodeState,
 }
 
 impl Encoder {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        options.check()?;
-        let node = node_of(spec)?;
-        canopen::check_file(node, options.objects.as_ref())?;
-        let places = Place::all(node, options)?;
-        let listens = spec.mode == Mode::Listen;
-        if let (true, None, Some(file)) = (listens, options.counts_per_turn, &options.objects) {
-            let scales = [OPERATING, SCALED_PER_TURN, PER_TURN];
-            let is_scale = |index| scales.iter().any(|scale| scale.index == index);
-            let name = options.eds.as_deref().unwrap_or_default();
-            canopen::check_objects((name, file), is_scale, "set counts_per_turn")?;
-        }
-        let first = places.first().map_or(tpdo(node, 0), |place| place.id);
-        let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, first);
-        bringup.start_with(NMT, &[nmt::START, node]);
-        bringup.stop_with(NMT, &[nmt::PRE_OPERATIONAL, node]);
-        let start = Start {
-            node,
-            counts_per_turn: options.counts_per_turn,
-            of_file: options.counts_of_file().filter(|_| listens),
-            options: options.clone(),
-            scaled: false,
-            no_timer: false,
-        };
-        let claims = canopen::claims(node)
-            .chain(places.iter().map(|place| Claim::exclusive(place.id)))
-            .chain([Claim::shared(SYNC)])
-            .collect::<Vec<_>>();
-        let script = Script::new(node, spec.mode, start);
-        let this = Self {
-            node,
-            cycle: Cycle::new(places.first().map_or(0, |place| place.sync)),
-            places,
-            rates: Rates::default(),
-            state: NodeState::default(),
-        };
-        Ok(Supervised::boxed(claims, bringup, script, this))
-    }
-
     fn position(
         &mut self,
         at: usize,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Script<Start>>,
+        link: &mut Supervision<Script<EncoderStart>>,
         out: &mut Decoded,
     ) {
         let Some(place) = self.places.get(at).copied() else {
@@ -461,9 +424,14 @@ impl Encoder {
 }
 
 impl Family for Encoder {
-    type Questions = Script<Start>;
+    type Questions = Script<EncoderStart>;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Script<Start>>, out: &mut Decoded) {
+    fn on_frame(
+        &mut self,
+        frame: &Frame,
+        link: &mut Supervision<Script<EncoderStart>>,
+        out: &mut Decoded,
+    ) {
         if self.state.on_frame(self.node, frame, link, out) {
             return;
         }
@@ -480,131 +448,5 @@ impl Family for Encoder {
     fn reset(&mut self) {
         self.cycle.reset();
         self.rates = Rates::default();
-    }
-}
-
-/// Counts per turn of a simulated encoder without the key, and its turns.
-const USUAL_PER_TURN: u32 = 8192;
-/// The error code of a simulated encoder with a fault: its hardware.
-const HARDWARE: u16 = 0x5000;
-
-/// The encoder's own side.
-#[derive(Debug)]
-pub struct EncoderBoard {
-    node: Node,
-    place: Place,
-    counts: u32,
-    quality: Quality,
-}
-
-impl EncoderBoard {
-    /// An encoder after power-on; in [`Mode::Listen`] another program has already started it.
-    ///
-    /// # Errors
-    /// [`SpecError`]: a node outside 1 to 127, a key out of range.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // casts saturate
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        options.check()?;
-        let id = node_of(spec)?;
-        canopen::check_file(id, options.objects.as_ref())?;
-        let places = Place::all(id, options)?;
-        let place = places.first().copied().ok_or(SpecError::Keys {
-            key: "eds",
-            expected: "a file in which a TPDO has the position (6004), if configure = false",
-        })?;
-        let per_turn = options.counts_per_turn.or(options.counts_of_file());
-        let per_turn = per_turn.map_or(USUAL_PER_TURN, |n| n as u32);
-        // As another program, or the maker's tool, has left it.
-        let set = spec.mode == Mode::Listen || !options.configure;
-        let (off, map) = if set {
-            (0, POSITION.mapped(32))
-        } else {
-            (TPDO_OFF, 0)
-        };
-        let transmission = match place.sync {
-            0 => BY_EVENT,
-            n => n,
-        };
-        let entries = [
-            (object::DEVICE_TYPE, 0x0002_0000 | PROFILE, 4),
-            (object::HEARTBEAT, 0, 2),
-            (object::tpdo_id(0), tpdo(id, 0).raw() | NO_RTR | off, 4),
-            (object::tpdo_transmission(0), u32::from(transmission), 1),
-            (object::tpdo_timer(0), options.period_ms, 2),
-            (object::tpdo_mapping(0, 0), u32::from(set), 1),
-            (object::tpdo_mapping(0, 1), map, 4),
-            (OPERATING, 0, 2),
-            (PER_TURN, per_turn, 4),
-        ];
-        Ok(Self {
-            node: Node::new(id, spec.mode == Mode::Listen, &entries),
-            place,
-            counts: 0,
-            quality: Quality::GOOD,
-        })
-    }
-
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // limited to 32 bits
-    fn set(&mut self, position: f64, quality: Quality) {
-        let counts_per_turn = f64::from(self.node.value(PER_TURN));
-        let counts = bytes::quantise(position * counts_per_turn, TAU, i64::MIN, i64::MAX);
-        // It begins anew at the end of its range.
-        self.counts = counts.rem_euclid(1 << 32) as u32;
-        self.quality = quality;
-    }
-
-    fn send(&mut self, out: &mut Frames) {
-        let fault = self.quality.contains(Quality::DEVICE_FAULT);
-        self.node.report(if fault { HARDWARE } else { 0 }, out);
-        let mut data = [0; 8];
-        self.place.bits.set(self.counts.into(), &mut data);
-        let data = data.get(..self.place.bits.reach()).unwrap_or_default();
-        let _ = out.try_push(Frame::new(self.place.id, data));
-    }
-}
-
-impl Board for EncoderBoard {
-    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        let is_due = self.node.on_frame(frame, out) & 1 != 0;
-        if is_due && self.node.value(object::tpdo_mapping(0, 1)) == POSITION.mapped(32) {
-            self.send(out);
-        }
-    }
-
-    fn period(&self) -> Option<Nanos> {
-        self.node.period(0)
-    }
-
-    fn measures_at(&self, frame: &Frame) -> bool {
-        frame.id == SYNC
-    }
-
-    fn present(&mut self, _output: u8, reading: &Reading, quality: Quality) {
-        if let Reading::Joint(joint) = reading
-            && joint.position.is_finite()
-        {
-            self.set(joint.position, quality);
-        }
-    }
-
-    fn encode(
-        &mut self,
-        output: u8,
-        reading: &Reading,
-        quality: Quality,
-        out: &mut Frames,
-    ) -> Result<(), EncodeError> {
-        let Reading::Joint(joint) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
-        if !joint.position.is_finite() {
-            return Err(EncodeError::NotFinite);
-        }
-        self.set(joint.position, quality);
-        self.send(out);
-        Ok(())
     }
 }

@@ -1,33 +1,34 @@
 //! The driver `canopen_sync`: The SYNC of a CANopen bus. What follows is its page of the book.
 #![doc = include_str!("../../docs/book/src/devices/canopen_sync.md")]
 
+#[cfg(feature = "boards")]
+mod board;
+
 use crate::bringup::{Bringup, NoInquiry};
 use crate::canopen::{self, SYNC};
-use crate::family::{Family, Link, Supervised, next_in_step};
-use crate::{
-    Board, Decoded, Device, Driver, EncodeError, Frame, Frames, OutputInfo, Spec, SpecError,
-};
+use crate::family::{Family, Supervised, Supervision, next_in_step};
+use crate::{Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use proprio_topics::{Nanos, Quality, Reading};
+use proprio_topics::Nanos;
 use serde::Deserialize;
 
 /// The keys of `driver = "canopen_sync"`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct CanopenSyncOptions {
     /// Period \[ms\], 0.5 to 1000; default 10.
     pub period_ms: f64,
 }
 
-impl Default for Options {
+impl Default for CanopenSyncOptions {
     fn default() -> Self {
         Self { period_ms: 10.0 }
     }
 }
 
-impl Options {
+impl CanopenSyncOptions {
     fn period(&self, spec: &Spec) -> Result<Nanos, SpecError> {
         let key = |expected| SpecError::Key {
             key: "period_ms",
@@ -45,7 +46,7 @@ impl Options {
     }
 }
 
-impl Driver for Options {
+impl Driver for CanopenSyncOptions {
     const NAME: &'static str = "canopen_sync";
     const ADDRESS: Option<u32> = Some(0);
 
@@ -61,10 +62,6 @@ impl Driver for Options {
         };
         Ok(Supervised::boxed([], bringup, NoInquiry, this))
     }
-
-    fn board(&self, _spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        Ok(Box::new(Nothing))
-    }
 }
 
 /// The host's side: all of it.
@@ -77,12 +74,13 @@ struct Producer {
 impl Family for Producer {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, _frame: &Frame, _link: &mut Link<NoInquiry>, _out: &mut Decoded) {}
+    fn on_frame(&mut self, _frame: &Frame, _link: &mut Supervision<NoInquiry>, _out: &mut Decoded) {
+    }
 
     fn request(
         &mut self,
         now: Nanos,
-        link: &mut Link<NoInquiry>,
+        link: &mut Supervision<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         if now < self.next {
@@ -99,24 +97,5 @@ impl Family for Producer {
     }
 }
 
-/// There is nothing at the other end.
-#[derive(Debug)]
-struct Nothing;
-
-impl Board for Nothing {
-    fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
-
-    fn period(&self) -> Option<Nanos> {
-        None
-    }
-
-    fn encode(
-        &mut self,
-        output: u8,
-        _reading: &Reading,
-        _quality: Quality,
-        _out: &mut Frames,
-    ) -> Result<(), EncodeError> {
-        Err(EncodeError::Output(output))
-    }
-}
+#[cfg(feature = "recognise")]
+impl crate::Recognise for CanopenSyncOptions {}

@@ -1,40 +1,12 @@
 //! The driver `cubemars`: CubeMars actuators. What follows is its page of the book.
 #![doc = include_str!("../../docs/book/src/devices/cubemars.md")]
 
+#[cfg(feature = "boards")]
 mod board;
 mod device;
 mod frames;
 mod options;
+#[cfg(feature = "recognise")]
 mod recognise;
 
-pub use board::CubemarsBoard;
-pub use options::{Angle, Effort, Mode, Model, Options};
-
-use crate::recognise::{Finding, Traffic};
-use crate::{Board, Device, Driver, OutputInfo, Spec, SpecError};
-use alloc::boxed::Box;
-use alloc::vec::Vec;
-use device::Motor;
-use frames::{DRIVE, JOINT};
-use proprio_topics::Kind;
-
-impl Driver for Options {
-    const NAME: &'static str = "cubemars";
-
-    fn outputs(&self) -> Vec<OutputInfo> {
-        let drive = OutputInfo::temperature(DRIVE, "drive");
-        [OutputInfo::new(JOINT, Kind::Joint), drive].to_vec()
-    }
-
-    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Motor::device(spec, self)
-    }
-
-    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        Ok(Box::new(CubemarsBoard::new(spec, self)?))
-    }
-
-    fn recognise(seen: &Traffic) -> Vec<Finding> {
-        recognise::motors(seen)
-    }
-}
+pub use options::{Angle, CubemarsMode, CubemarsModel, CubemarsOptions, Effort};

@@ -1,9 +1,8 @@
-//! The two sides of a device's protocol as sans-I/O state machines: [`Device`] on the host,
-//! [`Board`] on the device; and [`Driver`], which makes both from a device's keys.
+//! The host's side of a device's protocol as a sans-I/O state machine, [`Device`], and [`Driver`],
+//! which makes it from a device's keys.
 
 use crate::calibration::Calibration;
 use crate::objects::Objects;
-use crate::recognise::{Finding, Traffic};
 use crate::signal::Message;
 use crate::{Frame, Id};
 use alloc::borrow::Cow;
@@ -484,72 +483,7 @@ pub trait Device: Send {
 /// six questions gets over an answer lost to each; a calibration of 42 over a few in all.
 pub const COMMAND_TIME: Nanos = Nanos::from_millis(1000);
 
-/// Frames that a board sends at once: two for each of a skin board's 16 triangles.
-pub type Frames = ArrayVec<Frame, 32>;
-
-/// Why a board cannot encode a reading.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[non_exhaustive]
-pub enum EncodeError {
-    /// The family has no reading of this kind.
-    #[error("this device has no such reading")]
-    Kind,
-    /// The output number is not one of the board's.
-    #[error("this device has no output {0}")]
-    Output(u8),
-    /// A full scale is needed to encode, and the configuration has none.
-    #[error("full_scale_n and full_scale_nm are needed to encode")]
-    NoFullScale,
-    /// A value is not finite, and the protocol cannot mark it as absent.
-    #[error("a value is not finite")]
-    NotFinite,
-}
-
-/// The device's own side of its protocol: answers commands and encodes readings, as the hardware
-/// does. After power-on it waits for its start command; one whose [`Spec`] says [`Mode::Listen`]
-/// has been started by another program.
-///
-/// Boards differ in when they send. One that *streams* has a [`Board::period`], and its readings
-/// are encoded then. One that is *polled* has none: it answers a request in [`Board::on_frame`]
-/// with the reading that [`Board::present`] gave it last.
-pub trait Board: Send {
-    /// Takes a frame from the bus and adds the answers to `out`. Frames for other boards are
-    /// ignored.
-    fn on_frame(&mut self, frame: &Frame, out: &mut Frames);
-
-    /// The current streaming period of its main reading \[ns\]; `None` while it does not stream.
-    fn period(&self) -> Option<Nanos>;
-
-    /// Whether the board measures when this frame arrives, however late it answers.
-    fn measures_at(&self, frame: &Frame) -> bool {
-        let _ = frame;
-        false
-    }
-
-    /// The reading of output `output` at this instant, with which a polled board answers a request.
-    /// A board that streams does not need it.
-    fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {
-        let _ = (output, reading, quality);
-    }
-
-    /// Encodes a reading of output `output`, quantised and limited as the board does, and adds its
-    /// frames to `out`.
-    ///
-    /// `quality` sets the flags that the protocol can carry: saturation per axis, faults. Values
-    /// beyond the range are limited.
-    ///
-    /// # Errors
-    /// [`EncodeError`]: a reading, output or value that the protocol cannot carry.
-    fn encode(
-        &mut self,
-        output: u8,
-        reading: &Reading,
-        quality: Quality,
-        out: &mut Frames,
-    ) -> Result<(), EncodeError>;
-}
-
-/// A driver: implemented by its `Options`, which hold the keys of one device.
+/// A driver: implemented by the type of its keys, of which a value is one device.
 pub trait Driver {
     /// Its name in gateway.toml: that of its file.
     const NAME: &'static str;
@@ -596,30 +530,4 @@ pub trait Driver {
     /// # Errors
     /// [`SpecError`]: an address or value that is invalid for the family.
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError>;
-
-    /// The device's own side.
-    ///
-    /// # Errors
-    /// As [`Driver::device`].
-    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError>;
-
-    /// The devices that `seen` shows ([`crate::recognise`](mod@crate::recognise)).
-    #[must_use]
-    fn recognise(seen: &Traffic) -> Vec<Finding> {
-        let _ = seen;
-        Vec::new()
-    }
-
-    /// Questions that make devices tell what they are. They start, move, write and reconfigure
-    /// nothing. `seen` is what was heard so far, so that a device that has answered can be asked
-    /// for more.
-    #[must_use]
-    fn questions(seen: &Traffic) -> Vec<Frame> {
-        let _ = seen;
-        Vec::new()
-    }
-
-    /// Some other family takes these questions for commands: they are sent only on a bus of which a
-    /// person says that such devices are there.
-    const ASKED_BY_NAME: bool = false;
 }

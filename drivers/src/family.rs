@@ -20,7 +20,12 @@ pub(crate) trait Family: Send {
     type Questions: Inquiry + Send;
 
     /// As [`Device::on_frame`], until the board is stopped.
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Self::Questions>, out: &mut Decoded);
+    fn on_frame(
+        &mut self,
+        frame: &Frame,
+        link: &mut Supervision<Self::Questions>,
+        out: &mut Decoded,
+    );
 
     /// The board was silent, or may have been reset: an incomplete reading stays incomplete.
     fn reset(&mut self) {}
@@ -29,7 +34,7 @@ pub(crate) trait Family: Send {
     fn request(
         &mut self,
         now: Nanos,
-        link: &mut Link<Self::Questions>,
+        link: &mut Supervision<Self::Questions>,
         out: &mut Decoded,
     ) -> Option<Frame> {
         let _ = (now, link, out);
@@ -55,7 +60,7 @@ pub(crate) trait Family: Send {
     }
 
     /// As [`Device::full_scale`].
-    fn full_scale(&self, link: &Link<Self::Questions>) -> Option<[f64; 6]> {
+    fn full_scale(&self, link: &Supervision<Self::Questions>) -> Option<[f64; 6]> {
         let _ = link;
         None
     }
@@ -65,7 +70,7 @@ pub(crate) trait Family: Send {
         &mut self,
         command: Command,
         now: Nanos,
-        link: &Link<Self::Questions>,
+        link: &Supervision<Self::Questions>,
     ) -> Result<(), CommandRefused> {
         let _ = (command, now, link);
         Err(CommandRefused::Unsupported)
@@ -74,7 +79,7 @@ pub(crate) trait Family: Send {
     /// As [`Device::outcome`].
     fn outcome(
         &mut self,
-        link: &Link<Self::Questions>,
+        link: &Supervision<Self::Questions>,
     ) -> Option<Result<CommandOutcome, CommandFailed>> {
         let _ = link;
         None
@@ -137,12 +142,12 @@ pub(crate) fn temperature(output: u8, celsius: f64, frame: &Frame, out: &mut Dec
 
 /// The bring-up of a board, and what it has been asked.
 #[derive(Debug)]
-pub(crate) struct Link<Q> {
+pub(crate) struct Supervision<Q> {
     pub(crate) bringup: Bringup,
     pub(crate) questions: Q,
 }
 
-impl<Q: Inquiry> Link<Q> {
+impl<Q: Inquiry> Supervision<Q> {
     pub(crate) fn state(&self) -> State {
         self.bringup.state(&self.questions)
     }
@@ -190,7 +195,7 @@ impl<Q: Inquiry> Link<Q> {
 #[derive(Debug)]
 pub(crate) struct Supervised<F: Family> {
     claims: Vec<Claim>,
-    link: Link<F::Questions>,
+    link: Supervision<F::Questions>,
     family: F,
 }
 
@@ -206,7 +211,7 @@ impl<F: Family + 'static> Supervised<F> {
     {
         Box::new(Self {
             claims: claims.into_iter().collect(),
-            link: Link { bringup, questions },
+            link: Supervision { bringup, questions },
             family,
         })
     }
@@ -230,7 +235,7 @@ impl<F: Family> Device for Supervised<F> {
     }
 
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
-        let Link { bringup, questions } = &mut self.link;
+        let Supervision { bringup, questions } = &mut self.link;
         let was_silent = bringup.is_silent();
         let transmit = bringup.poll(now, questions, out);
         if bringup.is_silent() && !was_silent {
@@ -247,13 +252,13 @@ impl<F: Family> Device for Supervised<F> {
     }
 
     fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        let Link { bringup, questions } = &mut self.link;
+        let Supervision { bringup, questions } = &mut self.link;
         bringup.on_sent(frame, outcome, questions);
         self.family.on_sent(frame, outcome);
     }
 
     fn next_wake(&self) -> Option<Nanos> {
-        let Link { bringup, questions } = &self.link;
+        let Supervision { bringup, questions } = &self.link;
         let request = (self.family.request_at()).filter(|_| bringup.may_lend());
         let bringup = bringup.next_wake(questions);
         bringup.into_iter().chain(request).min()

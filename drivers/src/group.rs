@@ -4,7 +4,7 @@
 //! dropped if a frame has come once too often, which may be a late one of the reading before.
 
 use crate::Frame;
-use crate::pairing::{Limit, Order, Paired, Pairing};
+use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use arrayvec::ArrayVec;
 use proprio_topics::{Nanos, StampKind};
 
@@ -13,7 +13,7 @@ const LINKS: usize = 6;
 
 /// The frames of a reading that have come.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Part<T> {
+pub(crate) struct PartialReading<T> {
     /// The stamp of its first frame, and the source of that stamp.
     pub(crate) acquired: Nanos,
     pub(crate) stamp: StampKind,
@@ -22,9 +22,9 @@ pub(crate) struct Part<T> {
 
 /// Combines the frames of a reading (rules in the module documentation).
 #[derive(Debug)]
-pub(crate) struct Group<T> {
+pub(crate) struct FrameGroup<T> {
     /// One between each frame and the next.
-    links: ArrayVec<Pairing<Part<T>>, LINKS>,
+    links: ArrayVec<Pairing<PartialReading<T>>, LINKS>,
     /// No first frame was heard: what comes belongs to a reading that began before.
     joined: bool,
     /// A reading has begun and is not complete.
@@ -33,10 +33,10 @@ pub(crate) struct Group<T> {
     counted: bool,
 }
 
-impl<T: Copy> Group<T> {
+impl<T: Copy> FrameGroup<T> {
     /// Readings of `frames` frames, each of which follows the one before within `limit`.
     pub(crate) fn new(frames: usize, limit: Limit) -> Self {
-        let links = (1..frames).map(|_| Pairing::new(limit, Order::Strict));
+        let links = (1..frames).map(|_| Pairing::new(limit, HalfOrder::Strict));
         Self {
             links: links.take(LINKS).collect(),
             joined: true,
@@ -55,12 +55,12 @@ impl<T: Copy> Group<T> {
         empty: T,
         add: impl FnOnce(&mut T),
         dropped: &mut u32,
-    ) -> Option<Part<T>> {
+    ) -> Option<PartialReading<T>> {
         if position == 0 {
             *dropped += u32::from(self.open && !self.counted);
             (self.joined, self.open, self.counted) = (false, true, false);
         }
-        let mut part = Part {
+        let mut part = PartialReading {
             acquired: frame.t,
             stamp: frame.stamp,
             content: empty,

@@ -7,13 +7,13 @@ use proprio_topics::{Nanos, StampKind};
 
 /// A value that joins the readings after it, for a while.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Held {
+pub(crate) struct HeldValue {
     t: Nanos,
     stamp: StampKind,
     value: f64,
 }
 
-impl Held {
+impl HeldValue {
     /// No value.
     pub(crate) const ABSENT: Self = Self {
         t: Nanos::MIN,

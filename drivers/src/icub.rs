@@ -26,12 +26,18 @@
 //! robotology/icub-main at 24c1a003. Certain (document and independent code agree), unless stated
 //! otherwise.
 
+#[cfg(feature = "boards")]
+mod management;
+#[cfg(feature = "recognise")]
 mod recognise;
 
+#[cfg(feature = "boards")]
+pub(crate) use management::{answer_management, command_for};
+#[cfg(feature = "recognise")]
 pub(crate) use recognise::{questions, recognise};
 
 use crate::bringup::Timing;
-use crate::{Claim, Format, Frame, Frames, Id, Spec, SpecError};
+use crate::{Claim, Id, Spec, SpecError};
 use arrayvec::ArrayVec;
 use proprio_topics::Nanos;
 
@@ -269,56 +275,4 @@ pub(crate) fn claims<const N: usize>(class: u16, address: u8, kinds: &[u8]) -> A
         .map(|&kind| Claim::exclusive(stream(class, address, kind)))
         .take(N)
         .collect()
-}
-
-/// The bytes of a command of class `class` to board `address` in `frame`, starting with the command
-/// byte.
-pub(crate) fn command_for(frame: &Frame, class: u16, address: u8) -> Option<&[u8]> {
-    let broadcast = to_board(class, BROADCAST);
-    let ours = frame.id == to_board(class, address) || frame.id == broadcast;
-    (ours && frame.format == Format::Classic && !frame.is_empty()).then(|| frame.data())
-}
-
-/// The text in a simulated board.
-const INFO: &[u8; 32] = b"simulated board\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0";
-
-/// Answers the management requests: board type and firmware version (a plausible one: 2.0.8,
-/// protocol 2.0).
-pub(crate) fn answer_management(
-    frame: &Frame,
-    class: u16,
-    address: u8,
-    board: u8,
-    out: &mut Frames,
-) {
-    const FIRMWARE: [u8; 3] = [2, 0, 8];
-    let [major, minor, build] = FIRMWARE;
-    if let Some([command::DISCOVER]) = command_for(frame, class::MANAGEMENT, address) {
-        let id = to_host(class::MANAGEMENT, address);
-        let _ = out.try_push(Frame::new(
-            id,
-            &[command::DISCOVER, board, major, minor, build],
-        ));
-    }
-    if let Some([command::GET_ADDITIONAL_INFO]) = command_for(frame, class::MANAGEMENT, address) {
-        for (number, text) in (0..).zip(INFO.as_chunks::<4>().0) {
-            let [a, b, c, d] = *text;
-            let data = [command::GET_ADDITIONAL_INFO, number, a, b, c, d];
-            let _ = out.try_push(Frame::new(to_host(class::MANAGEMENT, address), &data));
-        }
-    }
-    let version = if class == class::POLLING_MOTOR {
-        command::MOTOR_GET_FIRMWARE_VERSION
-    } else {
-        command::GET_FIRMWARE_VERSION
-    };
-    if let Some(&[command, want_major, want_minor]) = command_for(frame, class, address)
-        && command == version
-    {
-        let fits = u8::from(want_major == 2 && want_minor == 0);
-        let _ = out.try_push(Frame::new(
-            to_host(class, address),
-            &[version, board, major, minor, build, 2, 0, fits],
-        ));
-    }
 }

@@ -1,16 +1,19 @@
 //! The driver `icub_mc4`: Older iCub motor boards. What follows is its page of the book.
 #![doc = include_str!("../../docs/book/src/devices/icub_mc4.md")]
 
+#[cfg(feature = "boards")]
+mod board;
+#[cfg(feature = "recognise")]
+mod recognise;
+
 use crate::bringup::{Bringup, NoInquiry};
-use crate::bytes;
-use crate::family::{Family, Link, Supervised};
-use crate::held::Held;
+use crate::family::{Family, Supervised, Supervision};
+use crate::held::HeldValue;
 use crate::icub::{self, class};
 use crate::icub_motor::mode;
-use crate::recognise::{Finding, Key, Stream, Traffic};
 use crate::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
-    Outputs, Spec, SpecError,
+    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Outputs, Spec, SpecError,
+    bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -54,7 +57,7 @@ const MODES: [u8; 8] = [0x00, 0x01, 0x02, 0x03, 0x50, 0x60, 0xA0, 0xB0];
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct IcubMc4Options {
     /// Ticks in a turn of each joint; default 65536.
     pub ticks_per_turn: [f64; JOINTS],
     /// How many bits a velocity is shifted, 0 to 15; default 5.
@@ -65,7 +68,7 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for IcubMc4Options {
     fn default() -> Self {
         Self {
             ticks_per_turn: [65536.0; JOINTS],
@@ -78,13 +81,13 @@ impl Default for Options {
 
 /// A step of a joint's position \[rad\] and velocity \[rad/s\].
 #[derive(Debug, Clone, Copy)]
-struct Scale {
+struct StepSizes {
     position: f64,
     velocity: f64,
 }
 
-impl Options {
-    fn scales(&self) -> Result<[Scale; JOINTS], SpecError> {
+impl IcubMc4Options {
+    fn scales(&self) -> Result<[StepSizes; JOINTS], SpecError> {
         let wrong = |key, value, expected| SpecError::Key {
             key,
             value,
@@ -108,12 +111,12 @@ impl Options {
         Ok([(ticks0, shift0), (ticks1, shift1)].map(|(ticks, shift)| {
             let position = TAU / ticks;
             let velocity = position * 1000.0 / f64::from(1_u32 << shift);
-            Scale { position, velocity }
+            StepSizes { position, velocity }
         }))
     }
 }
 
-impl Driver for Options {
+impl Driver for IcubMc4Options {
     const NAME: &'static str = "icub_mc4";
 
     fn outputs(&self) -> Vec<OutputInfo> {
@@ -123,35 +126,24 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Mc4::device(spec, self)
-    }
-
-    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        Ok(Box::new(Mc4Board::new(spec, self)?))
-    }
-
-    fn recognise(seen: &Traffic) -> Vec<Finding> {
-        let types = [icub::board::MC4, icub::board::BLL];
-        icub::recognise(seen, Self::NAME, &types, &[], |evidence, address, _| {
-            let id = |kind| icub::stream(class::PERIODIC_MOTOR, address, kind);
-            let positions = evidence.sends_length(id(kind::POSITION), FRAME);
-            // Newer boards have a status of the same identifier.
-            if let Some(positions) = positions {
-                if let Some(velocities) = evidence.sends_length(id(kind::VELOCITY), FRAME) {
-                    evidence.together(velocities, positions);
-                }
-                evidence.sends(id(kind::STATUS), |frame| match *frame.data() {
-                    [_, a, _, b, _, _, _, _] => MODES.contains(&a) && MODES.contains(&b),
-                    _ => false,
-                });
-            }
-            let keys = Key::period_ms(positions.and_then(Stream::period), 1, 255);
-            (keys.into_iter().collect(), Vec::from([0, 1]))
-        })
-    }
-
-    fn questions(seen: &Traffic) -> Vec<Frame> {
-        icub::questions(seen)
+        let address = icub::address(spec)?;
+        icub::period_ms("period_ms", self.period_ms)?;
+        let joints = self.scales()?.map(|scale| Mc4Joint {
+            scale,
+            velocity: HeldValue::ABSENT,
+            status: Quality::GOOD,
+        });
+        let kinds = [kind::POSITION, kind::STATUS, kind::VELOCITY];
+        let claims: ArrayVec<Claim, 3> = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
+        let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::POSITION);
+        let bringup = Bringup::new(spec, Mode::Listen, icub::TIMING, watched);
+        let this = Mc4 {
+            address,
+            outputs: spec.outputs.clone(),
+            hold: Nanos::from_millis(i64::from(self.hold_ms)),
+            joints,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 
@@ -172,9 +164,9 @@ fn quality_of(faults: u32, mode: u32) -> Quality {
 
 /// A joint of a board, as the host knows it.
 #[derive(Debug)]
-struct Joint {
-    scale: Scale,
-    velocity: Held,
+struct Mc4Joint {
+    scale: StepSizes,
+    velocity: HeldValue,
     /// The quality from the last status.
     status: Quality,
 }
@@ -185,32 +177,17 @@ struct Mc4 {
     address: u8,
     outputs: Outputs,
     hold: Nanos,
-    joints: [Joint; JOINTS],
+    joints: [Mc4Joint; JOINTS],
 }
 
 impl Mc4 {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let address = icub::address(spec)?;
-        icub::period_ms("period_ms", options.period_ms)?;
-        let joints = options.scales()?.map(|scale| Joint {
-            scale,
-            velocity: Held::ABSENT,
-            status: Quality::GOOD,
-        });
-        let kinds = [kind::POSITION, kind::STATUS, kind::VELOCITY];
-        let claims: ArrayVec<Claim, 3> = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
-        let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::POSITION);
-        let bringup = Bringup::new(spec, Mode::Listen, icub::TIMING, watched);
-        let this = Self {
-            address,
-            outputs: spec.outputs.clone(),
-            hold: Nanos::from_millis(i64::from(options.hold_ms)),
-            joints,
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
-    fn positions(&self, data: &[u8], frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn positions(
+        &self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Supervision<NoInquiry>,
+        out: &mut Decoded,
+    ) {
         let gap = link.bringup.reading(frame.t);
         for (joint, output) in self.joints.iter().zip(0_u8..) {
             if !self.outputs.0.contains(&output) {
@@ -262,7 +239,7 @@ impl Mc4 {
 impl Family for Mc4 {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_MOTOR, self.address);
         let Some(kind @ (kind::POSITION | kind::STATUS | kind::VELOCITY)) = stream else {
             return;
@@ -279,7 +256,7 @@ impl Family for Mc4 {
             _ => {
                 for (joint, at) in self.joints.iter_mut().zip([0, 2]) {
                     let steps = f64::from(bytes::i16_le(data, at));
-                    joint.velocity = Held::new(frame, steps * joint.scale.velocity);
+                    joint.velocity = HeldValue::new(frame, steps * joint.scale.velocity);
                 }
             }
         }
@@ -287,135 +264,7 @@ impl Family for Mc4 {
 
     fn reset(&mut self) {
         for joint in &mut self.joints {
-            (joint.velocity, joint.status) = (Held::ABSENT, Quality::GOOD);
+            (joint.velocity, joint.status) = (HeldValue::ABSENT, Quality::GOOD);
         }
-    }
-}
-
-/// A joint of a simulated board.
-#[derive(Debug)]
-struct Simulated {
-    scale: Scale,
-    ticks: i32,
-    /// None as long as no velocity is given.
-    steps: Option<i16>,
-    faults: u8,
-    mode: u8,
-}
-
-/// The board's own side: it streams without commands. It sends positions when all its joints in use
-/// are new.
-#[derive(Debug)]
-pub struct Mc4Board {
-    address: u8,
-    period: Nanos,
-    joints: [Simulated; JOINTS],
-    /// The joints in use, and those of them that are new, one bit each.
-    used: u8,
-    fresh: u8,
-}
-
-impl Mc4Board {
-    /// A board that streams at once.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        let period = icub::period_ms("period_ms", options.period_ms)?;
-        Ok(Self {
-            address: icub::address(spec)?,
-            period: Nanos::from_millis(i64::from(period)),
-            joints: options.scales()?.map(|scale| Simulated {
-                scale,
-                ticks: 0,
-                steps: None,
-                faults: 0,
-                mode: POSITION_CONTROL,
-            }),
-            used: spec.outputs.0.iter().fold(0, |all, joint| all | 1 << joint),
-            fresh: 0,
-        })
-    }
-
-    fn send(&self, kind: u8, data: [u8; FRAME], out: &mut Frames) {
-        let id = icub::stream(class::PERIODIC_MOTOR, self.address, kind);
-        let _ = out.try_push(Frame::new(id, &data));
-    }
-
-    fn send_status(&self, out: &mut Frames) {
-        let [a, b] = &self.joints;
-        let data = [a.faults, a.mode, b.faults, b.mode, 0, 0, 0, 0];
-        self.send(kind::STATUS, data, out);
-    }
-}
-
-impl Board for Mc4Board {
-    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        let (class, board) = (class::POLLING_MOTOR, icub::board::MC4);
-        icub::answer_management(frame, class, self.address, board, out);
-    }
-
-    fn period(&self) -> Option<Nanos> {
-        Some(self.period)
-    }
-
-    /// If a joint's faults differ from the last status, a status precedes its reading. Velocities
-    /// precede the positions, if all joints in use have one. The faults of the board's byte cannot
-    /// be simulated.
-    #[allow(clippy::cast_possible_truncation)] // limited to their ranges
-    fn encode(
-        &mut self,
-        output: u8,
-        reading: &Reading,
-        quality: Quality,
-        out: &mut Frames,
-    ) -> Result<(), EncodeError> {
-        let Some(joint) = self.joints.get_mut(usize::from(output)) else {
-            return Err(EncodeError::Output(output));
-        };
-        let state = match reading {
-            Reading::Joint(state) if state.position.is_finite() => state,
-            Reading::Joint(_) => return Err(EncodeError::NotFinite),
-            Reading::Actuator(actuator) => {
-                (joint.faults, joint.mode) = (actuator.faults as u8, actuator.mode as u8);
-                self.send_status(out);
-                return Ok(());
-            }
-            _ => return Err(EncodeError::Kind),
-        };
-        let (least, most) = (i64::from(i32::MIN), i64::from(i32::MAX));
-        joint.ticks = bytes::quantise(state.position, joint.scale.position, least, most) as i32;
-        let velocity = Some(state.velocity).filter(|velocity| velocity.is_finite());
-        joint.steps = velocity.map(|v| bytes::quantise_i16(v, joint.scale.velocity));
-        let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT | Quality::NOT_CALIBRATED;
-        let known = quality_of(u32::from(joint.faults), u32::from(joint.mode));
-        if known.0 != quality.0 & told.0 {
-            let set = |flag, bit: u32| if quality.contains(flag) { bit as u8 } else { 0 };
-            joint.faults = set(Quality::DEVICE_FAULT, fault::ABSOLUTE_ENCODER)
-                | set(Quality::DRIVE_FAULT, fault::EXTERNAL);
-            joint.mode = match quality.contains(Quality::NOT_CALIBRATED) {
-                true => CALIBRATION as u8,
-                false => POSITION_CONTROL,
-            };
-            self.send_status(out);
-        }
-        self.fresh |= 1 << output;
-        if self.fresh & self.used != self.used {
-            return Ok(());
-        }
-        self.fresh = 0;
-        let [a, b] = &self.joints;
-        let steps = [a, b].map(|joint| joint.steps.unwrap_or(0).to_le_bytes());
-        let [[v0, v1], [v2, v3]] = steps;
-        let ([p0, p1, p2, p3], [p4, p5, p6, p7]) = (a.ticks.to_le_bytes(), b.ticks.to_le_bytes());
-        let mut used = [a, b]
-            .into_iter()
-            .zip([1, 2])
-            .filter(|(_, bit)| self.used & bit != 0);
-        if used.all(|(joint, _)| joint.steps.is_some()) {
-            self.send(kind::VELOCITY, [v0, v1, v2, v3, 0, 0, 0, 0], out);
-        }
-        self.send(kind::POSITION, [p0, p1, p2, p3, p4, p5, p6, p7], out);
-        Ok(())
     }
 }

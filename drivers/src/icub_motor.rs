@@ -1,20 +1,22 @@
 //! The driver `icub_motor`: iCub 2FOC motor boards. What follows is its page of the book.
 #![doc = include_str!("../../docs/book/src/devices/icub_motor.md")]
 
+#[cfg(feature = "boards")]
+mod board;
+#[cfg(feature = "recognise")]
+mod recognise;
+
 use crate::bringup::{Bringup, NoInquiry};
-use crate::bytes;
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class};
-use crate::recognise::{Finding, Key, Stream, Traffic};
 use crate::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
-    Spec, SpecError,
+    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
-use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
+use proprio_topics::{Actuator, Counter, JointState, Kind, Quality, Reading};
 use serde::Deserialize;
 
 /// Types of the streams.
@@ -27,8 +29,6 @@ mod kind {
 
 /// Bits of `Actuator::faults`.
 pub mod fault {
-    /// An illegal command was received.
-    pub const CAN_INVALID_PROTOCOL: u32 = 1;
     /// Impossible order of Hall sensor states.
     pub const HALL_SEQUENCE: u32 = 1 << 1;
     /// Checksum of the absolute encoder.
@@ -37,24 +37,14 @@ pub mod fault {
     pub const HALL_VALUE: u32 = 1 << 3;
     /// Current above its limit.
     pub const OVER_CURRENT: u32 = 1 << 4;
-    /// Supply above its limit.
-    pub const OVER_VOLTAGE: u32 = 1 << 5;
-    /// Supply below its limit.
-    pub const UNDER_VOLTAGE: u32 = 1 << 6;
     /// Emergency button pressed.
     pub const EXTERNAL: u32 = 1 << 7;
-    /// Temperature above its limit.
-    pub const OVER_HEATING: u32 = 1 << 9;
-    /// No command in time.
-    pub const SETPOINT_EXPIRED: u32 = 1 << 14;
     /// Calculation of the absolute encoder.
     pub const ENCODER_CALCULATION: u32 = 1 << 17;
     /// Timing of the SPI bus to the encoder.
     pub const SPI_TIMING: u32 = 1 << 18;
     /// Position encoder fault.
     pub const ENCODER: u32 = 1 << 19;
-    /// Mean current above its limit.
-    pub const I2T: u32 = 1 << 22;
     /// Bits that make a position doubtful.
     pub const POSITION: u32 =
         HALL_SEQUENCE | ENCODER_CHECKSUM | HALL_VALUE | ENCODER_CALCULATION | SPI_TIMING | ENCODER;
@@ -97,14 +87,14 @@ const DUTY_PER_LSB: f64 = 1.0 / 32000.0;
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct IcubMotorOptions {
     /// Period of its commander's requests \[ms\], 1 to 255; default 1.
     pub period_ms: u32,
     /// Whether readings contain the board's velocity; default true.
     pub velocity: bool,
 }
 
-impl Default for Options {
+impl Default for IcubMotorOptions {
     fn default() -> Self {
         Self {
             period_ms: 1,
@@ -113,7 +103,7 @@ impl Default for Options {
     }
 }
 
-impl Driver for Options {
+impl Driver for IcubMotorOptions {
     const NAME: &'static str = "icub_motor";
 
     fn outputs(&self) -> Vec<OutputInfo> {
@@ -121,43 +111,23 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Motor::device(spec, self)
-    }
-
-    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        Ok(Box::new(MotorBoard::new(spec, self)?))
-    }
-
-    fn recognise(seen: &Traffic) -> Vec<Finding> {
-        let types = [
-            icub::board::TWO_FOC,
-            icub::board::AMCBLDC,
-            icub::board::AMC2C,
-            icub::board::AMCFOC2C,
+        let address = icub::address(spec)?;
+        icub::period_ms("period_ms", self.period_ms)?;
+        let kinds = [
+            kind::TWO_FOC,
+            kind::STATUS,
+            kind::ADDITIONAL_STATUS,
+            kind::OVERFLOW,
         ];
-        icub::recognise(seen, Self::NAME, &types, &[], |evidence, address, _| {
-            let id = |kind| icub::stream(class::PERIODIC_MOTOR, address, kind);
-            let motion = evidence.sends_length(id(kind::TWO_FOC), 8);
-            let is_status = |frame: &Frame| match *frame.data() {
-                [mode, encoder, _, _, _, _, _, _] => {
-                    mode::ALL.contains(&u32::from(mode)) && encoder < 32
-                }
-                _ => false,
-            };
-            // Older boards have a status of the same identifier.
-            if let Some(motion) = motion {
-                if let Some(status) = evidence.sends(id(kind::STATUS), is_status) {
-                    evidence.together(motion, status);
-                }
-                evidence.sends_length(id(kind::ADDITIONAL_STATUS), 4);
-            }
-            let keys = Key::period_ms(motion.and_then(Stream::period), 1, 255);
-            (keys.into_iter().collect(), Vec::from([0]))
-        })
-    }
-
-    fn questions(seen: &Traffic) -> Vec<Frame> {
-        icub::questions(seen)
+        let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::TWO_FOC);
+        let claims: ArrayVec<Claim, 4> = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
+        let bringup = Bringup::new(spec, Mode::Listen, icub::TIMING, watched);
+        let this = TwoFoc {
+            address,
+            velocity: self.velocity,
+            status: Quality::GOOD,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 
@@ -178,35 +148,21 @@ fn quality_of(actuator: &Actuator) -> Quality {
 
 /// The host's side of a motor board.
 #[derive(Debug)]
-struct Motor {
+struct TwoFoc {
     address: u8,
     velocity: bool,
     /// The quality from the last status.
     status: Quality,
 }
 
-impl Motor {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let address = icub::address(spec)?;
-        icub::period_ms("period_ms", options.period_ms)?;
-        let kinds = [
-            kind::TWO_FOC,
-            kind::STATUS,
-            kind::ADDITIONAL_STATUS,
-            kind::OVERFLOW,
-        ];
-        let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::TWO_FOC);
-        let claims: ArrayVec<Claim, 4> = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
-        let bringup = Bringup::new(spec, Mode::Listen, icub::TIMING, watched);
-        let this = Self {
-            address,
-            velocity: options.velocity,
-            status: Quality::GOOD,
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
-    fn motion(&self, data: &[u8], frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+impl TwoFoc {
+    fn motion(
+        &self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Supervision<NoInquiry>,
+        out: &mut Decoded,
+    ) {
         let mut quality = self.status;
         if quality.contains(Quality::DEVICE_FAULT) {
             out.fault(Counter::DeviceFault, 1, frame.id);
@@ -243,10 +199,10 @@ impl Motor {
     }
 }
 
-impl Family for Motor {
+impl Family for TwoFoc {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let Some(stream) = icub::stream_type(frame.id, class::PERIODIC_MOTOR, self.address) else {
             return;
         };
@@ -270,125 +226,5 @@ impl Family for Motor {
 
     fn reset(&mut self) {
         self.status = Quality::GOOD;
-    }
-}
-
-/// The board's own side: it streams without commands, as if it were commanded once a period.
-#[derive(Debug)]
-pub struct MotorBoard {
-    address: u8,
-    period: Nanos,
-    velocity: bool,
-    /// The quality in its last status.
-    status: Quality,
-}
-
-impl MotorBoard {
-    /// A board that streams at once.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, a period out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        let period =
-            Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
-        Ok(Self {
-            address: icub::address(spec)?,
-            period,
-            velocity: options.velocity,
-            status: Quality::GOOD,
-        })
-    }
-
-    fn send_status(&mut self, actuator: &Actuator, out: &mut Frames) -> Result<(), EncodeError> {
-        if !actuator.duty.is_finite() {
-            return Err(EncodeError::NotFinite);
-        }
-        #[allow(clippy::cast_possible_truncation)] // both are bytes on the wire
-        let (mode, encoder) = (actuator.mode as u8, actuator.encoder as u8);
-        #[allow(clippy::cast_possible_truncation)] // limited to 16 bits
-        let [d0, d1] =
-            (bytes::quantise(actuator.duty, DUTY_PER_LSB, -32000, 32000) as i16).to_le_bytes();
-        let [f0, f1, f2, f3] = actuator.faults.to_le_bytes();
-        let id = icub::stream(class::PERIODIC_MOTOR, self.address, kind::STATUS);
-        let _ = out.try_push(Frame::new(id, &[mode, encoder, d0, d1, f0, f1, f2, f3]));
-        self.status = quality_of(actuator);
-        Ok(())
-    }
-}
-
-impl Board for MotorBoard {
-    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        icub::answer_management(
-            frame,
-            class::POLLING_MOTOR,
-            self.address,
-            icub::board::TWO_FOC,
-            out,
-        );
-    }
-
-    fn period(&self) -> Option<Nanos> {
-        Some(self.period)
-    }
-
-    /// If the faults differ from the last status, a status frame precedes the joint reading. The
-    /// frame has no field for torque and acceleration; an absent current is sent as 0.
-    fn encode(
-        &mut self,
-        output: u8,
-        reading: &Reading,
-        quality: Quality,
-        out: &mut Frames,
-    ) -> Result<(), EncodeError> {
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
-        match reading {
-            Reading::Joint(joint) => {
-                let velocity = if self.velocity { joint.velocity } else { 0.0 };
-                if !joint.position.is_finite() || !velocity.is_finite() {
-                    return Err(EncodeError::NotFinite);
-                }
-                let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT | Quality::NOT_CALIBRATED;
-                if self.status.0 & told.0 != quality.0 & told.0 {
-                    let mut actuator = Actuator {
-                        duty: 0.0,
-                        mode: 6,
-                        encoder: 0,
-                        faults: 0,
-                    };
-                    if quality.contains(Quality::DEVICE_FAULT) {
-                        actuator.faults |= fault::ENCODER;
-                    }
-                    if quality.contains(Quality::DRIVE_FAULT) {
-                        actuator.faults |= fault::EXTERNAL;
-                    }
-                    if quality.contains(Quality::NOT_CALIBRATED) {
-                        actuator.encoder = encoder::NOT_CALIBRATED;
-                    }
-                    self.send_status(&actuator, out)?;
-                }
-                let current = if joint.current.is_finite() {
-                    joint.current
-                } else {
-                    0.0
-                };
-                let [c0, c1] = bytes::quantise_i16(current, AMPERE_PER_LSB).to_le_bytes();
-                let [v0, v1] = bytes::quantise_i16(velocity, RAD_PER_S_PER_LSB).to_le_bytes();
-                let position = bytes::quantise(
-                    joint.position,
-                    RAD_PER_LSB,
-                    i64::from(i32::MIN),
-                    i64::from(i32::MAX),
-                );
-                #[allow(clippy::cast_possible_truncation)] // limited to 32 bits
-                let [p0, p1, p2, p3] = (position as i32).to_le_bytes();
-                let id = icub::stream(class::PERIODIC_MOTOR, self.address, kind::TWO_FOC);
-                let _ = out.try_push(Frame::new(id, &[c0, c1, v0, v1, p0, p1, p2, p3]));
-                Ok(())
-            }
-            Reading::Actuator(actuator) => self.send_status(actuator, out),
-            _ => Err(EncodeError::Kind),
-        }
     }
 }

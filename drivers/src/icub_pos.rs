@@ -1,21 +1,23 @@
 //! The driver `icub_pos`: iCub POS encoders. What follows is its page of the book.
 #![doc = include_str!("../../docs/book/src/devices/icub_pos.md")]
 
+#[cfg(feature = "boards")]
+mod board;
+#[cfg(feature = "recognise")]
+mod recognise;
+
 use crate::bringup::Bringup;
-use crate::bytes;
 use crate::configure::{Configure, Setting};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
-use crate::recognise::{Finding, Key, Traffic};
 use crate::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Mode, Output, OutputInfo,
-    Outputs, Spec, SpecError,
+    Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Outputs, Spec, SpecError, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
-use proprio_topics::{Counter, JointState, Kind, Nanos, Quality, Reading};
+use proprio_topics::{Counter, JointState, Kind, Quality, Reading};
 use serde::Deserialize;
 
 /// Type of the stream.
@@ -33,7 +35,7 @@ const METRE_PER_LSB: f64 = 1e-4;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum Quantity {
+pub enum PosQuantity {
     /// Angles \[rad\].
     #[default]
     Angle,
@@ -41,7 +43,7 @@ pub enum Quantity {
     Length,
 }
 
-impl Quantity {
+impl PosQuantity {
     /// Its number in a frame, and one step \[rad or m\].
     const fn code_and_lsb(self) -> (u8, f64) {
         match self {
@@ -55,7 +57,7 @@ impl Quantity {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Sensor {
+pub struct PosSensor {
     /// Its label, which is the joint's channel.
     pub label: u8,
     /// Negate its value; default false.
@@ -66,7 +68,7 @@ pub struct Sensor {
     pub zero_deg: f64,
 }
 
-impl Sensor {
+impl PosSensor {
     /// Its three bytes in POS_CONFIG_SET.
     fn bytes(&self) -> Result<[u8; 3], SpecError> {
         let rotation = match self.rotation_deg {
@@ -110,29 +112,29 @@ impl Sensor {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct IcubPosOptions {
     /// Period \[ms\], 1 to 255; default 10.
     pub period_ms: u32,
     /// The quantity that the board sends; default angles.
-    pub quantity: Quantity,
+    pub quantity: PosQuantity,
     /// Silence kept after power-on \[ms\]; default 0.
     pub power_on_silence_ms: u32,
     /// Configuration of its sensors, at most two; default: keep the board's own.
-    pub sensors: Option<Vec<Sensor>>,
+    pub sensors: Option<Vec<PosSensor>>,
 }
 
-impl Default for Options {
+impl Default for IcubPosOptions {
     fn default() -> Self {
         Self {
             period_ms: 10,
-            quantity: Quantity::Angle,
+            quantity: PosQuantity::Angle,
             power_on_silence_ms: 0,
             sensors: None,
         }
     }
 }
 
-impl Options {
+impl IcubPosOptions {
     /// The bytes of POS_CONFIG_SET, if the sensors are to be configured.
     fn configuration(&self) -> Result<Option<[u8; 8]>, SpecError> {
         let Some(sensors) = &self.sensors else {
@@ -163,7 +165,7 @@ impl Options {
     }
 }
 
-impl Driver for Options {
+impl Driver for IcubPosOptions {
     const NAME: &'static str = "icub_pos";
 
     fn outputs(&self) -> Vec<OutputInfo> {
@@ -173,86 +175,16 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Pos::device(spec, self)
-    }
-
-    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        Ok(Box::new(PosBoard::new(spec, self)?))
-    }
-
-    fn recognise(seen: &Traffic) -> Vec<Finding> {
-        let types = [icub::board::PSC, icub::board::MTB4];
-        let maybe = [icub::board::MTB4];
-        icub::recognise(seen, Self::NAME, &types, &maybe, |evidence, address, _| {
-            let id = icub::stream(class::PERIODIC_ANALOG, address, POS);
-            let stream = evidence.sends(id, |frame| match *frame.data() {
-                [quantity, values, ref bytes @ ..] if frame.len() == 8 => {
-                    let count = values & 0xF;
-                    let (values, _) = bytes.as_chunks();
-                    let mut own = values.iter().take(count.into());
-                    // A length may be any.
-                    let is_angle = |value| i16::from_le_bytes(value).unsigned_abs() <= 3600;
-                    quantity < 2
-                        && (1..=VALUES).contains(&count)
-                        && own.all(|value| quantity == 1 || is_angle(*value))
-                }
-                _ => false,
-            });
-            let Some(stream) = stream else {
-                return (Vec::new(), Vec::from([0, 1]));
-            };
-            let mut keys: Vec<Key> = Vec::new();
-            let mut joints: Vec<u8> = Vec::new();
-            for frame in stream.kept() {
-                let &[quantity, values, ..] = frame.data() else {
-                    continue;
-                };
-                let (label, count) = (values >> 4, values & 0xF);
-                joints.extend(label..(label + count).min(LABEL_MOST + 1));
-                if quantity == 1 && keys.is_empty() {
-                    keys.push(Key::new("quantity", "\"length\""));
-                }
-            }
-            joints.sort_unstable();
-            joints.dedup();
-            let first = |frame: &Frame| {
-                let label = frame.data().get(1).map(|values| values >> 4);
-                label == joints.first().copied()
-            };
-            keys.extend(Key::period_ms(stream.period_of(first), 1, 255));
-            (keys, joints)
-        })
-    }
-
-    fn questions(seen: &Traffic) -> Vec<Frame> {
-        icub::questions(seen)
-    }
-}
-
-/// The host's side of a POS board.
-#[derive(Debug)]
-struct Pos {
-    address: u8,
-    quantity: Quantity,
-    outputs: Outputs,
-    /// Labels whose next reading follows a gap, one bit each.
-    gap: u16,
-    /// Labels that have been read, one bit each.
-    seen: u16,
-}
-
-impl Pos {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
         let address = icub::address(spec)?;
-        let period = icub::period_ms("period_ms", options.period_ms)?;
-        let timing = icub::timing(options.power_on_silence_ms)?;
+        let period = icub::period_ms("period_ms", self.period_ms)?;
+        let timing = icub::timing(self.power_on_silence_ms)?;
         let watched = icub::stream(class::PERIODIC_ANALOG, address, POS);
         let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
         let id = icub::to_board(class::POLLING_ANALOG, address);
-        let setting = options.configuration()?.map(|set| Setting {
+        let setting = self.configuration()?.map(|set| Setting {
             get: Frame::new(
                 id,
-                &[command::POS_CONFIG_GET, options.quantity.code_and_lsb().0],
+                &[command::POS_CONFIG_GET, self.quantity.code_and_lsb().0],
             ),
             set: Frame::new(id, &set),
             compared: 1..8,
@@ -264,9 +196,9 @@ impl Pos {
             claims.push(Claim::shared(icub::to_host(class::POLLING_ANALOG, address)));
         }
         let configure = Configure::new(spec, setting, icub::TIMING);
-        let this = Self {
+        let this = Pos {
             address,
-            quantity: options.quantity,
+            quantity: self.quantity,
             outputs: spec.outputs.clone(),
             gap: 0,
             seen: 0,
@@ -275,10 +207,22 @@ impl Pos {
     }
 }
 
+/// The host's side of a POS board.
+#[derive(Debug)]
+struct Pos {
+    address: u8,
+    quantity: PosQuantity,
+    outputs: Outputs,
+    /// Labels whose next reading follows a gap, one bit each.
+    gap: u16,
+    /// Labels that have been read, one bit each.
+    seen: u16,
+}
+
 impl Family for Pos {
     type Questions = Configure;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Configure>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<Configure>, out: &mut Decoded) {
         if frame.id == icub::to_host(class::POLLING_ANALOG, self.address) {
             // Answers to other questions are for other devices.
             if let Some(data) = bytes::payload(frame, out)
@@ -333,97 +277,5 @@ impl Family for Pos {
             let output = Output::new(output, frame, quality, reading);
             out.push(output, frame.id);
         }
-    }
-}
-
-/// The board's own side. It sends each value in a separate frame (n = 1), which the protocol
-/// allows.
-#[derive(Debug)]
-pub struct PosBoard {
-    address: u8,
-    period: Nanos,
-    streaming: bool,
-    quantity: Quantity,
-    /// The configuration received, in the form of POS_CONFIG_SET.
-    configuration: [u8; 8],
-}
-
-impl PosBoard {
-    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        options.configuration()?;
-        let period =
-            Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
-        Ok(Self {
-            address: icub::address(spec)?,
-            period,
-            streaming: spec.mode == Mode::Listen,
-            quantity: options.quantity,
-            configuration: [0; 8],
-        })
-    }
-}
-
-impl Board for PosBoard {
-    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        icub::answer_management(
-            frame,
-            class::POLLING_ANALOG,
-            self.address,
-            icub::board::PSC,
-            out,
-        );
-        match icub::command_for(frame, class::POLLING_ANALOG, self.address) {
-            Some(&[command::POS_CONFIG_SET, a, b, c, d, e, f, g]) => {
-                // As in the firmware, a new configuration stops the stream.
-                self.streaming = false;
-                self.configuration = [command::POS_CONFIG_SET, a, b, c, d, e, f, g];
-            }
-            Some(&[command::POS_CONFIG_GET, kind]) => {
-                let [_, _, sensors @ ..] = self.configuration;
-                let [b, c, d, e, f, g] = sensors;
-                let id = icub::to_host(class::POLLING_ANALOG, self.address);
-                let answer = [command::POS_CONFIG_GET, kind, b, c, d, e, f, g];
-                let _ = out.try_push(Frame::new(id, &answer));
-            }
-            Some(&[command::POS_TRANSMIT, ms]) => {
-                self.streaming = ms > 0;
-                self.period = Nanos::from_millis(i64::from(ms));
-            }
-            _ => {}
-        }
-    }
-
-    fn period(&self) -> Option<Nanos> {
-        self.streaming.then_some(self.period)
-    }
-
-    fn encode(
-        &mut self,
-        output: u8,
-        reading: &Reading,
-        _quality: Quality,
-        out: &mut Frames,
-    ) -> Result<(), EncodeError> {
-        let Reading::Joint(joint) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        if output > LABEL_MOST {
-            return Err(EncodeError::Output(output));
-        }
-        if !joint.position.is_finite() {
-            return Err(EncodeError::NotFinite);
-        }
-        let (code, lsb) = self.quantity.code_and_lsb();
-        let [low, high] = bytes::quantise_i16(joint.position, lsb).to_le_bytes();
-        let id = icub::stream(class::PERIODIC_ANALOG, self.address, POS);
-        let _ = out.try_push(Frame::new(
-            id,
-            &[code, output << 4 | 1, low, high, 0, 0, 0, 0],
-        ));
-        Ok(())
     }
 }

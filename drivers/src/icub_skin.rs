@@ -1,18 +1,17 @@
 //! The driver `icub_skin`: iCub skin. What follows is its page of the book.
 #![doc = include_str!("../../docs/book/src/devices/icub_skin.md")]
 
+#[cfg(feature = "boards")]
+mod board;
+#[cfg(feature = "recognise")]
+mod recognise;
+
 use crate::bringup::{Bringup, NoInquiry};
-use crate::bytes;
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
-use crate::pairing::{Limit, Order, Paired, Pairing};
-use crate::recognise::{Finding, Key, Traffic};
-use crate::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Frame, Frames, Id, Mode, Output,
-    OutputInfo, Spec, SpecError,
-};
+use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
+use crate::{Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Spec, SpecError, bytes};
 use alloc::boxed::Box;
-use alloc::format;
 use alloc::vec::Vec;
 use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Skin};
 use serde::Deserialize;
@@ -60,7 +59,7 @@ impl Compensation {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct IcubSkinOptions {
     /// Period \[ms\], 1 to 255; default 50.
     pub period_ms: u32,
     /// First and last triangle; default 0 and 15.
@@ -75,7 +74,7 @@ pub struct Options {
     pub power_on_silence_ms: u32,
 }
 
-impl Default for Options {
+impl Default for IcubSkinOptions {
     fn default() -> Self {
         Self {
             period_ms: 50,
@@ -88,7 +87,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl IcubSkinOptions {
     fn check(&self) -> Result<(), SpecError> {
         match self.triangles {
             [first, last] if first <= last && usize::from(last) < TRIANGLES => Ok(()),
@@ -100,7 +99,7 @@ impl Options {
     }
 }
 
-impl Driver for Options {
+impl Driver for IcubSkinOptions {
     const NAME: &'static str = "icub_skin";
 
     fn outputs(&self) -> Vec<OutputInfo> {
@@ -108,63 +107,10 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Patch::device(spec, self)
-    }
-
-    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        Ok(Box::new(SkinBoard::new(spec, self)?))
-    }
-
-    fn recognise(seen: &Traffic) -> Vec<Finding> {
-        // An mtb4 may be an IMU alone.
-        let maybe = [icub::board::MTB4, icub::board::MTB4W, icub::board::MTB4C];
-        let types = [&[icub::board::MTB][..], &maybe].concat();
-        icub::recognise(seen, Self::NAME, &types, &maybe, |evidence, address, _| {
-            let mut keys: Vec<Key> = Vec::new();
-            let mut triangles: Option<(u8, u8)> = None;
-            for triangle in 0..16 {
-                let id = icub::stream(class::PERIODIC_SKIN, address, triangle);
-                let stream = evidence.sends(id, |frame| {
-                    matches!(*frame.data(), [FIRST | SECOND, _, _, _, _, _, _, _])
-                });
-                let Some(stream) = stream else { continue };
-                let first = |frame: &Frame| frame.data().first() == Some(&FIRST);
-                if triangles.is_none() {
-                    keys.extend(Key::period_ms(stream.period_of(first), 1, 255));
-                }
-                triangles = Some((triangles.map_or(triangle, |(first, _)| first), triangle));
-            }
-            if let Some((first, last)) = triangles {
-                keys.push(Key::new("triangles", format!("[{first}, {last}]")));
-            }
-            (keys, Vec::new())
-        })
-    }
-
-    fn questions(seen: &Traffic) -> Vec<Frame> {
-        icub::questions(seen)
-    }
-}
-
-/// The host's side of a skin board.
-#[derive(Debug)]
-struct Patch {
-    address: u8,
-    no_load: u8,
-    triangles: [u8; 2],
-    pairing: [Pairing<[u8; 7]>; TRIANGLES],
-    /// Triangles whose next reading follows a gap, one bit each.
-    gap: u16,
-    /// Triangles that have been read, one bit each.
-    seen: u16,
-}
-
-impl Patch {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        options.check()?;
+        self.check()?;
         let address = icub::address(spec)?;
-        let period = icub::period_ms("period_ms", options.period_ms)?;
-        let limit = match options.pair_timeout_ms {
+        let period = icub::period_ms("period_ms", self.period_ms)?;
+        let limit = match self.pair_timeout_ms {
             None => Limit::of_period(Nanos::from_millis(i64::from(period))),
             Some(ms) if ms > 0.0 && ms <= 1000.0 => Limit::fixed(Nanos::from_seconds(ms * 1e-3)),
             Some(value) => {
@@ -175,15 +121,15 @@ impl Patch {
                 });
             }
         };
-        let timing = icub::timing(options.power_on_silence_ms)?;
-        let [first, last] = options.triangles;
+        let timing = icub::timing(self.power_on_silence_ms)?;
+        let [first, last] = self.triangles;
         let watched = icub::stream(class::PERIODIC_SKIN, address, first);
         let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
         let id = icub::to_board(class::POLLING_ANALOG, address);
-        let compensation = options.compensation.code();
+        let compensation = self.compensation.code();
         bringup.start_with(
             id,
-            &[command::SKIN_CONFIG, compensation, period, options.no_load],
+            &[command::SKIN_CONFIG, compensation, period, self.no_load],
         );
         let [low, high] = OFFSET.to_le_bytes();
         bringup.start_with(
@@ -196,17 +142,32 @@ impl Patch {
             mask: !0xF,
             ..Claim::exclusive(icub::stream(class::PERIODIC_SKIN, address, 0))
         };
-        let this = Self {
+        let this = SkinPatch {
             address,
-            no_load: options.no_load,
-            triangles: options.triangles,
-            pairing: core::array::from_fn(|_| Pairing::new(limit, Order::Usual)),
+            no_load: self.no_load,
+            triangles: self.triangles,
+            pairing: core::array::from_fn(|_| Pairing::new(limit, HalfOrder::Usual)),
             gap: 0,
             seen: 0,
         };
         Ok(Supervised::boxed([claim], bringup, NoInquiry, this))
     }
+}
 
+/// The host's side of a skin board.
+#[derive(Debug)]
+struct SkinPatch {
+    address: u8,
+    no_load: u8,
+    triangles: [u8; 2],
+    pairing: [Pairing<[u8; 7]>; TRIANGLES],
+    /// Triangles whose next reading follows a gap, one bit each.
+    gap: u16,
+    /// Triangles that have been read, one bit each.
+    seen: u16,
+}
+
+impl SkinPatch {
     /// The reading of both frames' bytes.
     fn skin(&self, triangle: u8, first: [u8; 7], second: [u8; 7]) -> (Skin, Quality) {
         let [p7, p8, p9, p10, p11, high, low] = second;
@@ -227,10 +188,10 @@ impl Patch {
     }
 }
 
-impl Family for Patch {
+impl Family for SkinPatch {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_SKIN, self.address);
         let Some(triangle) = stream else { return };
         let Some(data) = bytes::payload(frame, out) else {
@@ -281,100 +242,5 @@ impl Family for Patch {
 
     fn reset(&mut self) {
         self.pairing.iter_mut().for_each(Pairing::reset);
-    }
-}
-
-/// The board's own side. It sends the triangles that it is asked to encode.
-#[derive(Debug)]
-pub struct SkinBoard {
-    address: u8,
-    period: Nanos,
-    no_load: u8,
-    triangles: [u8; 2],
-    streaming: bool,
-}
-
-impl SkinBoard {
-    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 14, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        options.check()?;
-        let ms = icub::period_ms("period_ms", options.period_ms)?;
-        Ok(Self {
-            address: icub::address(spec)?,
-            period: Nanos::from_millis(i64::from(ms)),
-            no_load: options.no_load,
-            triangles: options.triangles,
-            streaming: spec.mode == Mode::Listen,
-        })
-    }
-
-    fn byte(&self, taxel: f64) -> u8 {
-        let raw = bytes::quantise(f64::from(self.no_load) - taxel, 1.0, 0, 255);
-        u8::try_from(raw).unwrap_or(u8::MAX)
-    }
-}
-
-impl Board for SkinBoard {
-    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        icub::answer_management(
-            frame,
-            class::POLLING_ANALOG,
-            self.address,
-            icub::board::MTB,
-            out,
-        );
-        match icub::command_for(frame, class::POLLING_ANALOG, self.address) {
-            Some(&[command::SKIN_CONFIG, _, ms, no_load]) if ms > 0 => {
-                self.period = Nanos::from_millis(i64::from(ms));
-                self.no_load = no_load;
-            }
-            Some(&[command::SKIN_TRIANGLES, first, last, ..]) => self.triangles = [first, last],
-            Some(&[command::SET_TXMODE, mode]) => self.streaming = mode == 0,
-            _ => {}
-        }
-    }
-
-    fn period(&self) -> Option<Nanos> {
-        self.streaming.then_some(self.period)
-    }
-
-    fn encode(
-        &mut self,
-        output: u8,
-        reading: &Reading,
-        quality: Quality,
-        out: &mut Frames,
-    ) -> Result<(), EncodeError> {
-        let Reading::Skin(skin) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        let [first, last] = self.triangles;
-        let triangle = u8::try_from(skin.triangle).unwrap_or(u8::MAX);
-        if output != 0 || !(first..=last).contains(&triangle) {
-            return Err(EncodeError::Output(output));
-        }
-        let mut out_of_range = 0_u16;
-        let mut bytes = [self.no_load; 12];
-        for (number, (byte, taxel)) in bytes.iter_mut().zip(skin.taxels).enumerate() {
-            if taxel.is_finite() {
-                *byte = self.byte(taxel);
-            } else if !THERMAL.contains(&number) {
-                out_of_range |= 1 << number;
-            }
-        }
-        let [p0, p1, p2, p3, p4, p5, p6, p7, p8, p9, p10, p11] = bytes;
-        let [high, low] = (out_of_range << 4).to_be_bytes();
-        let low = low | u8::from(quality.contains(Quality::DEVICE_FAULT));
-        let id: Id = icub::stream(class::PERIODIC_SKIN, self.address, triangle);
-        for data in [
-            [FIRST, p0, p1, p2, p3, p4, p5, p6],
-            [SECOND, p7, p8, p9, p10, p11, high, low],
-        ] {
-            let _ = out.try_push(Frame::new(id, &data));
-        }
-        Ok(())
     }
 }

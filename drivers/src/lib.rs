@@ -36,20 +36,31 @@
 //! [`recognise()`] tells which devices a bus has, and [`questions()`] what to ask them: each family
 //! knows its own.
 //!
-//! To add a family, write a module with a `Family` (see `family.rs`), a `Board`, and an `Options`
-//! type (its keys in gateway.toml, documented at the top of the module) that implements [`Driver`],
-//! and add its line to the list in `registry.rs`. Families share `bringup.rs` (starting a board),
-//! `configure.rs` (confirming its configuration), `pairing.rs` and `group.rs` (combining two
-//! frames, or more), `held.rs` (values of other instants), `bytes.rs` (the numbers of a payload),
-//! `wrench.rs` and [`calibration`] (force/torque sensors), `keys.rs` (addresses, identifiers) and
-//! [`mod@recognise`] (the evidence for a device in the traffic of a bus).
+//! Boards are behind the feature `boards`, recognition behind `recognise`. Both are on by default;
+//! a program that only decodes needs neither.
+//!
+//! To add a family, write a module with a type of its keys in gateway.toml (documented at the top
+//! of the module) that implements [`Driver`], [`Simulate`] and [`Recognise`], a `Family` (see
+//! `family.rs`) and a `Board`, and add its line to the list in `registry.rs`. Families share
+//! `bringup.rs` (starting a board), `configure.rs` (confirming its configuration), `pairing.rs` and
+//! `group.rs` (combining two frames, or more), `held.rs` (values of other instants), `bytes.rs`
+//! (the numbers of a payload), `wrench.rs` and [`calibration`] (force/torque sensors), `keys.rs`
+//! (addresses, identifiers), `board.rs` (what a board can encode) and [`mod@recognise`] (the
+//! evidence for a device in the traffic of a bus).
 #![no_std]
+// Without a feature, what only its modules use is not used.
+#![cfg_attr(
+    not(all(feature = "boards", feature = "recognise")),
+    allow(dead_code, unused_imports)
+)]
 extern crate alloc;
 #[cfg(test)]
 extern crate std;
 
 pub mod aidin_aft200;
 pub mod ati_netcanoem;
+#[cfg(feature = "boards")]
+pub mod board;
 mod bringup;
 mod bytes;
 pub mod calibration;
@@ -84,6 +95,7 @@ pub mod odrive;
 pub mod openimu;
 pub mod optoforce_daq;
 mod pairing;
+#[cfg(feature = "recognise")]
 pub mod recognise;
 mod registry;
 pub mod robotous_rft;
@@ -97,12 +109,16 @@ pub mod vesc;
 mod wrench;
 pub mod xsens_mti;
 
+#[cfg(feature = "boards")]
+pub use board::{Board, EncodeError, Frames, Simulate};
 pub use calibration::Calibration;
 pub use device::{
-    Board, COMMAND_TIME, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded,
-    Device, Driver, EncodeError, Fault, Frames, Mode, NotSent, Output, OutputInfo, Outputs, Spec,
-    SpecError, State, Transmit,
+    COMMAND_TIME, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
+    Driver, Fault, Mode, NotSent, Output, OutputInfo, Outputs, Spec, SpecError, State, Transmit,
 };
 pub use frame::{Format, Frame, Id};
-pub use recognise::{Certainty, Finding, Traffic};
-pub use registry::{ASKED_BY_NAME, DRIVERS, Options, OptionsError, questions, recognise};
+#[cfg(feature = "recognise")]
+pub use recognise::{Certainty, Finding, Recognise, Traffic};
+pub use registry::{DRIVERS, Options, OptionsError};
+#[cfg(feature = "recognise")]
+pub use registry::{asked_by_name, questions, recognise};

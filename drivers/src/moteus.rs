@@ -1,14 +1,18 @@
 //! The driver `moteus`: moteus controllers. What follows is its page of the book.
 #![doc = include_str!("../../docs/book/src/devices/moteus.md")]
 
+#[cfg(feature = "boards")]
+mod board;
+#[cfg(feature = "recognise")]
+mod recognise;
+
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes::{self, i16_le, u32_le};
-use crate::family::{Family, Link, Supervised, next_in_step};
+use crate::family::{Family, Supervised, Supervision, next_in_step};
 use crate::held::OnChange;
-use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
 use crate::{
-    Board, Claim, Decoded, Device, Driver, EncodeError, Format, Frame, Frames, Id, Mode, NotSent,
-    Output, OutputInfo, Spec, SpecError,
+    Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, NotSent, Output, OutputInfo, Spec,
+    SpecError,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -50,14 +54,14 @@ const TOO_HOT: f64 = 38.0;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct MoteusOptions {
     /// Period of the queries \[ms\], 1 to 1000; default 2.
     pub period_ms: u32,
     /// The host's own address; default 0.
     pub host: u8,
 }
 
-impl Default for Options {
+impl Default for MoteusOptions {
     fn default() -> Self {
         Self {
             period_ms: 2,
@@ -66,7 +70,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl MoteusOptions {
     /// The controller's address and the period.
     fn check(&self, spec: &Spec) -> Result<(u8, Nanos), SpecError> {
         let address = spec.address;
@@ -94,9 +98,10 @@ impl Options {
     }
 }
 
-impl Driver for Options {
+impl Driver for MoteusOptions {
     const NAME: &'static str = "moteus";
     const ADDRESS: Option<u32> = Some(1);
+
     fn needs_fd(&self) -> bool {
         true
     }
@@ -106,48 +111,26 @@ impl Driver for Options {
     }
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
-        Controller::device(spec, self)
-    }
-
-    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        Ok(Box::new(MoteusBoard::new(spec, self)?))
-    }
-
-    fn recognise(seen: &Traffic) -> Vec<Finding> {
-        let find = |stream: &Stream| {
-            let [host, node, 0, 0] = stream.id.raw().to_le_bytes() else {
-                return None;
-            };
-            if !(1..=127).contains(&node) || host > 127 || stream.id != id(node, host, 0) {
-                return None;
-            }
-            let first = stream.kept().next()?;
-            let bits = f64::from(Told::parse(first.data())?.structure);
-            // Of 127 controllers and 128 hosts.
-            let mut evidence = Evidence::with_fd(seen, 127 * 128);
-            evidence.sends_rarely(stream.id, bits, |frame| Told::parse(frame.data()).is_some());
-            let query = id(host, node, WANTED);
-            evidence.sends_rarely(query, f64::from(BITS), |frame| {
-                let opcode = frame.data().first();
-                opcode.is_some_and(|opcode| *opcode < REPLY)
-            });
-            let what = "moteus controller";
-            let finding = evidence.finding(Self::NAME, node.into(), what)?;
-            let host = (host != 0).then(|| Key::new("host", host));
-            let period = Key::period_ms(stream.period(), 1, 1000);
-            Some(
-                finding
-                    .with_keys(host.into_iter().chain(period))
-                    .with_joints([0]),
-            )
+        let (node, period) = self.check(spec)?;
+        let reply = id(node, self.host, 0);
+        let query = id(self.host, node, WANTED);
+        let bringup = Bringup::new(spec, spec.mode, Timing::POLLED, reply);
+        let Some(query) = fd(query, &QUERY) else {
+            return Err(SpecError::Joints("the query does not fit a frame"));
         };
-        seen.streams().filter_map(find).collect()
-    }
-
-    /// The driver's own query.
-    fn questions(_seen: &Traffic) -> Vec<Frame> {
-        let query = |node| fd(id(0, node, WANTED), &QUERY);
-        (1..=127).filter_map(query).collect()
+        let this = MoteusController {
+            query,
+            reply,
+            period,
+            next: Nanos::MIN,
+            asked: false,
+            mode: 0,
+            fault: 0,
+            actuator: OnChange::NOTHING,
+            temperature: OnChange::NOTHING,
+        };
+        let claims = [Claim::exclusive(reply)];
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 
@@ -283,7 +266,7 @@ impl<'d> Cursor<'d> {
 
 /// What a reply tells.
 #[derive(Debug, Clone, Copy, Default)]
-struct Told {
+struct Reply {
     mode: Option<f64>,
     position: Option<f64>,
     velocity: Option<f64>,
@@ -297,7 +280,7 @@ struct Told {
 /// Four bits of an opcode are fixed, and four of a register that is read here; all of a filler.
 const BITS: u32 = 4;
 
-impl Told {
+impl Reply {
     /// Reads a reply; `None` if it is none, or cut off.
     fn parse(data: &[u8]) -> Option<Self> {
         let (mut told, mut cursor) = (Self::default(), Cursor(data));
@@ -341,7 +324,7 @@ impl Told {
 
 /// The host's side of a controller.
 #[derive(Debug)]
-struct Controller {
+struct MoteusController {
     query: Frame,
     reply: Id,
     period: Nanos,
@@ -355,30 +338,7 @@ struct Controller {
     temperature: OnChange<()>,
 }
 
-impl Controller {
-    fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let (node, period) = options.check(spec)?;
-        let reply = id(node, options.host, 0);
-        let query = id(options.host, node, WANTED);
-        let bringup = Bringup::new(spec, spec.mode, Timing::POLLED, reply);
-        let Some(query) = fd(query, &QUERY) else {
-            return Err(SpecError::Joints("the query does not fit a frame"));
-        };
-        let this = Self {
-            query,
-            reply,
-            period,
-            next: Nanos::MIN,
-            asked: false,
-            mode: 0,
-            fault: 0,
-            actuator: OnChange::NOTHING,
-            temperature: OnChange::NOTHING,
-        };
-        let claims = [Claim::exclusive(reply)];
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
+impl MoteusController {
     fn quality(&self) -> Quality {
         let mut quality = Quality::GOOD;
         if f64::from(self.mode) == MODE_FAULT {
@@ -391,10 +351,10 @@ impl Controller {
     }
 }
 
-impl Family for Controller {
+impl Family for MoteusController {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         // Short frames are sent as classic ones by some programs.
         let Some(data) = bytes::fd_payload(frame, out) else {
             return;
@@ -402,7 +362,7 @@ impl Family for Controller {
         if frame.id != self.reply {
             return;
         }
-        let Some(told) = Told::parse(data) else {
+        let Some(told) = Reply::parse(data) else {
             return out.fault(Counter::Value, 1, frame.id);
         };
         // A reply to nobody is an old one, which a queue of an adapter has held back.
@@ -458,7 +418,7 @@ impl Family for Controller {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Link<NoInquiry>,
+        _link: &mut Supervision<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         if now < self.next {
@@ -479,162 +439,5 @@ impl Family for Controller {
 
     fn request_at(&self) -> Option<Nanos> {
         Some(self.next)
-    }
-}
-
-/// The controller's own side: answers queries with the joint's state.
-#[derive(Debug)]
-pub struct MoteusBoard {
-    node: u8,
-    /// The host to which readings are encoded that nobody has asked for.
-    host: u8,
-    joint: JointState,
-    celsius: f64,
-    quality: Quality,
-}
-
-/// The supply of a simulated controller \[V\].
-const SUPPLY: f64 = 24.0;
-
-impl MoteusBoard {
-    /// A controller after power-on.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 127, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        Ok(Self {
-            node: options.check(spec)?.0,
-            host: options.host,
-            joint: JointState::ABSENT,
-            celsius: 25.0,
-            quality: Quality::GOOD,
-        })
-    }
-
-    /// The value of a register in its unit.
-    fn value(&self, register: u32) -> f64 {
-        let (sensor, drive) = (
-            self.quality.contains(Quality::DEVICE_FAULT),
-            self.quality.contains(Quality::DRIVE_FAULT),
-        );
-        match register {
-            register::MODE if sensor || drive => MODE_FAULT,
-            register::POSITION => self.joint.position / TAU,
-            register::VELOCITY => self.joint.velocity / TAU,
-            register::TORQUE => self.joint.torque,
-            register::VOLTAGE => SUPPLY,
-            register::TEMPERATURE => self.celsius,
-            register::FAULT if sensor => ENCODER_FAULT,
-            register::FAULT if drive => TOO_HOT,
-            // Without a fault the mode is 0, stopped; and so is a register that it does not have.
-            _ => 0.0,
-        }
-    }
-
-    /// The reply to `query`; `None` if it is no query.
-    fn reply(&self, query: &[u8]) -> Option<ArrayVec<u8, 64>> {
-        let (mut reply, mut cursor) = (ArrayVec::new(), Cursor(query));
-        while let Some(opcode) = cursor.byte() {
-            if opcode == NOTHING {
-                continue;
-            }
-            if !(READ..REPLY).contains(&opcode) {
-                return None;
-            }
-            let (kind, count, first) = cursor.registers(opcode)?;
-            let low = u8::try_from(count).ok().filter(|count| *count <= 32)?;
-            reply
-                .try_push(REPLY | opcode & 0xC | if low > 3 { 0 } else { low })
-                .ok()?;
-            if low > 3 {
-                reply.try_push(low).ok()?;
-            }
-            reply
-                .try_push(u8::try_from(first).ok().filter(|first| *first < 0x80)?)
-                .ok()?;
-            for register in first..first + count {
-                let value = self.value(register);
-                reply
-                    .try_extend_from_slice(&number(kind, register, value))
-                    .ok()?;
-            }
-        }
-        (!reply.is_empty()).then_some(reply)
-    }
-}
-
-/// The bytes of `value`, in a register's unit.
-#[allow(clippy::cast_possible_truncation)] // quantised to the type
-fn number(kind: Type, register: u32, value: f64) -> ArrayVec<u8, 4> {
-    let step = kind.step(register);
-    let whole = |most: i64| match value {
-        value if value.is_finite() => bytes::quantise(value, step, -most, most),
-        _ => -most - 1,
-    };
-    let mut number = ArrayVec::new();
-    let _ = match kind {
-        Type::I8 => number.try_extend_from_slice(&(whole(127) as i8).to_le_bytes()),
-        Type::I16 => number.try_extend_from_slice(&(whole(32767) as i16).to_le_bytes()),
-        Type::I32 => {
-            number.try_extend_from_slice(&(whole(i64::from(i32::MAX)) as i32).to_le_bytes())
-        }
-        Type::F32 => number.try_extend_from_slice(&(value as f32).to_le_bytes()),
-    };
-    number
-}
-
-impl Board for MoteusBoard {
-    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        let Id::Extended(raw) = frame.id else { return };
-        let [node, source, 0, 0] = raw.to_le_bytes() else {
-            return;
-        };
-        if node != self.node || source & 0x80 == 0 || frame.format == Format::Remote {
-            return;
-        }
-        let reply = self.reply(frame.data());
-        let reply = reply.and_then(|data| fd(id(self.node, source & 0x7F, 0), &data));
-        out.extend(reply.into_iter().take(out.remaining_capacity()));
-    }
-
-    fn period(&self) -> Option<Nanos> {
-        None
-    }
-
-    fn present(&mut self, _output: u8, reading: &Reading, quality: Quality) {
-        match reading {
-            Reading::Joint(joint) => (self.joint, self.quality) = (*joint, quality),
-            Reading::Temperature(Temperature { celsius }) => self.celsius = *celsius,
-            _ => {}
-        }
-    }
-
-    fn encode(
-        &mut self,
-        output: u8,
-        reading: &Reading,
-        quality: Quality,
-        out: &mut Frames,
-    ) -> Result<(), EncodeError> {
-        let joint = match reading {
-            Reading::Joint(joint) => joint,
-            // They are sent with the joint's state.
-            Reading::Actuator(_) | Reading::Temperature(_) => {
-                self.present(output, reading, quality);
-                return Ok(());
-            }
-            _ => return Err(EncodeError::Kind),
-        };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
-        if !joint.position.is_finite() {
-            return Err(EncodeError::NotFinite);
-        }
-        (self.joint, self.quality) = (*joint, quality);
-        let reply = self.reply(&QUERY);
-        let reply = reply.and_then(|data| fd(id(self.node, self.host, 0), &data));
-        out.extend(reply.into_iter().take(out.remaining_capacity()));
-        Ok(())
     }
 }

@@ -14,14 +14,14 @@ pub struct Objects {
     /// The maker's number (as object 1018 sub 1).
     pub vendor: Option<u32>,
     /// The integers of up to 32 bits, by index and sub-index.
-    pub entries: BTreeMap<(u16, u8), Entry>,
+    pub entries: BTreeMap<(u16, u8), ObjectEntry>,
     /// Why others can not be read: told only to somebody who needs them.
     pub unreadable: BTreeMap<(u16, u8), String>,
 }
 
 /// The value of an object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Entry {
+pub struct ObjectEntry {
     /// The number; a negative one in two's complement.
     pub number: u32,
     /// The number of the node is added to it.
@@ -49,8 +49,8 @@ impl Objects {
         found.map(|(_, problem)| problem.as_str())
     }
 
-    /// The value of an object that this very device has ([`Entry::own`]); `None` for 0, by which
-    /// makers mean that it is not stated.
+    /// The value of an object that this very device has ([`ObjectEntry::own`]); `None` for 0, by
+    /// which makers mean that it is not stated.
     #[must_use]
     pub fn own(&self, index: u16, sub: u8) -> Option<u32> {
         let entry = self.entries.get(&(index, sub))?;

@@ -119,7 +119,7 @@ impl Limit {
 
 /// In which order the halves of a reading come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Order {
+pub(crate) enum HalfOrder {
     /// Either half may come first, and waits for the other.
     Any,
     /// The first half comes first, unless an adapter exchanges them.
@@ -132,7 +132,7 @@ pub(crate) enum Order {
 #[derive(Debug)]
 pub(crate) struct Pairing<T> {
     limit: Limit,
-    order: Order,
+    order: HalfOrder,
     /// Nothing but the waiting half was heard: its other half may have been sent before.
     joined: bool,
     pending: Option<(bool, Nanos, StampKind, T)>,
@@ -152,7 +152,7 @@ pub(crate) struct Pairing<T> {
 const USUAL_SLACK: Nanos = Nanos::from_micros(125);
 
 impl<T: Copy> Pairing<T> {
-    pub(crate) const fn new(limit: Limit, order: Order) -> Self {
+    pub(crate) const fn new(limit: Limit, order: HalfOrder) -> Self {
         Self {
             limit,
             order,
@@ -174,7 +174,7 @@ impl<T: Copy> Pairing<T> {
         half: T,
         unpaired: &mut u32,
     ) -> Paired<T> {
-        let is_ordered = self.order != Order::Any;
+        let is_ordered = self.order != HalfOrder::Any;
         let waiting = (second, frame.t, frame.stamp, half);
         let has_stamp = frame.stamp != StampKind::None;
         if let Some((t, stamp, other)) = self.ahead.take() {
@@ -190,7 +190,7 @@ impl<T: Copy> Pairing<T> {
                 // Its first half was lost, or comes next; or it is the missing second half.
                 let is_late = core::mem::take(&mut self.owed) | core::mem::take(&mut self.doubt);
                 let joined = core::mem::take(&mut self.joined);
-                if self.order == Order::Usual && !joined && !is_late && has_stamp {
+                if self.order == HalfOrder::Usual && !joined && !is_late && has_stamp {
                     self.ahead = Some((frame.t, frame.stamp, half));
                     return Paired::Waiting;
                 }

@@ -37,7 +37,7 @@ mod traffic;
 pub(crate) use explain::explain as together;
 pub use traffic::{Stream, Traffic};
 
-use crate::{Format, Frame, Id};
+use crate::{Driver, Format, Frame, Id};
 use alloc::string::{String, ToString};
 use alloc::vec::Vec;
 pub(crate) use background::log2;
@@ -123,7 +123,7 @@ impl Key {
 
 /// How a device has an identifier.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Part {
+pub enum IdUse {
     /// It alone sends its frames, or answers to them. With a number, only those frames of it that
     /// have this number: other devices of its family send the others.
     Sends(Option<u8>),
@@ -139,7 +139,7 @@ pub struct Explained {
     /// The identifier.
     pub id: Id,
     /// How the device has it.
-    pub part: Part,
+    pub part: IdUse,
     /// What the form of its frames counts \[bits\].
     bits: f64,
     /// Other identifiers whose frames have that form.
@@ -154,7 +154,7 @@ pub struct Finding {
     /// The device's address, as the driver defines it.
     pub address: u32,
     /// The odds that it is there, as a logarithm to base 2; of a driver's own
-    /// [`crate::Driver::recognise`] without what its identifiers count.
+    /// [`Recognise::recognise`] without what its identifiers count.
     pub bits: f64,
     /// What it is, in words: type, firmware, serial number, as far as it is known.
     pub what: String,
@@ -269,13 +269,13 @@ impl<'t> Evidence<'t> {
     /// a rule about several bytes together, such as a checksum, counts by [`Evidence::add`].
     /// Returns what was heard on it, if anything was.
     pub(crate) fn sends(&mut self, id: Id, rule: impl Fn(&Frame) -> bool) -> Option<&'t Stream> {
-        self.sends_as(Part::Sends(None), id, rule)
+        self.sends_as(IdUse::Sends(None), id, rule)
     }
 
     /// As [`Evidence::sends`], for an identifier that several devices of the family may share.
     pub(crate) fn sends_as(
         &mut self,
-        part: Part,
+        part: IdUse,
         id: Id,
         rule: impl Fn(&Frame) -> bool,
     ) -> Option<&'t Stream> {
@@ -298,7 +298,7 @@ impl<'t> Evidence<'t> {
         rule: impl Fn(&Frame) -> bool,
     ) -> Option<&'t Stream> {
         let stream = self.heard(id, &rule)?;
-        self.explain(id, Part::Sends(None), bits, &rule);
+        self.explain(id, IdUse::Sends(None), bits, &rule);
         Some(stream)
     }
 
@@ -323,15 +323,15 @@ impl<'t> Evidence<'t> {
             return self.add(-3.0);
         };
         if follows(commands, replies, &is_own) {
-            self.explain(id, Part::Sends(None), 4.0, &|_| false);
+            self.explain(id, IdUse::Sends(None), 4.0, &|_| false);
         } else {
             self.belongs(id);
         }
     }
 
-    fn explain(&mut self, id: Id, part: Part, bits: f64, rule: &dyn Fn(&Frame) -> bool) {
+    fn explain(&mut self, id: Id, part: IdUse, bits: f64, rule: &dyn Fn(&Frame) -> bool) {
         let mut known = self.explains.iter_mut().filter(|known| known.id == id);
-        if let Some(known) = known.find(|known| known.part != Part::Takes) {
+        if let Some(known) = known.find(|known| known.part != IdUse::Takes) {
             return known.bits += bits;
         }
         self.explains.retain(|known| known.id != id);
@@ -346,19 +346,19 @@ impl<'t> Evidence<'t> {
 
     /// `id` counts, and `bits` more: on it the board tells what it is.
     pub(crate) fn tells(&mut self, id: Id, bits: f64) {
-        self.explain(id, Part::Tells, bits, &|_| false);
+        self.explain(id, IdUse::Tells, bits, &|_| false);
     }
 
     /// `id` counts, and `bits` more.
     pub(crate) fn explains(&mut self, id: Id, bits: f64) {
-        self.explain(id, Part::Sends(None), bits, &|_| false);
+        self.explain(id, IdUse::Sends(None), bits, &|_| false);
     }
 
     /// `id` is the device's too, which counts nothing.
     pub(crate) fn belongs(&mut self, id: Id) {
         let is_new = self.explains.iter().all(|known| known.id != id);
         if is_new && self.traffic.stream(id).is_some() {
-            self.explain(id, Part::Takes, 0.0, &|_| false);
+            self.explain(id, IdUse::Takes, 0.0, &|_| false);
         }
     }
 
@@ -426,12 +426,12 @@ impl<'t> Evidence<'t> {
 
     /// Whether something speaks for the device and nothing refutes it.
     pub(crate) fn holds(&self) -> bool {
-        !self.refuted && self.explains.iter().any(|known| known.part != Part::Takes)
+        !self.refuted && self.explains.iter().any(|known| known.part != IdUse::Takes)
     }
 
     /// Whether it sends something, beside telling what it is.
     pub(crate) fn is_sending(&self) -> bool {
-        let is_sent = |known: &Explained| matches!(known.part, Part::Sends(_));
+        let is_sent = |known: &Explained| matches!(known.part, IdUse::Sends(_));
         self.explains.iter().any(is_sent)
     }
 
@@ -501,4 +501,28 @@ impl Finding {
         self.joints.extend(joints);
         self
     }
+}
+
+/// A driver whose devices can be recognised in the traffic of a bus. What it has by default is that
+/// of one that recognises none.
+pub trait Recognise: Driver {
+    /// The devices that `seen` shows.
+    #[must_use]
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let _ = seen;
+        Vec::new()
+    }
+
+    /// Questions that make devices tell what they are. They start, move, write and reconfigure
+    /// nothing. `seen` is what was heard so far, so that a device that has answered can be asked
+    /// for more.
+    #[must_use]
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        let _ = seen;
+        Vec::new()
+    }
+
+    /// Some other family takes these questions for commands: they are sent only on a bus of which a
+    /// person says that such devices are there.
+    const ASKED_BY_NAME: bool = false;
 }

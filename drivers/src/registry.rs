@@ -1,13 +1,18 @@
 //! The drivers: one list from which their names, their keys and their devices follow.
 
+#[cfg(feature = "recognise")]
+use crate::Frame;
 use crate::objects::Objects;
-use crate::recognise::{self, Finding, Traffic};
+#[cfg(feature = "recognise")]
+use crate::recognise::{self, Finding, Recognise, Traffic};
 use crate::signal::Message;
+#[cfg(feature = "boards")]
+use crate::{Board, Simulate};
 use crate::{
-    Board, Device, Driver, Frame, OutputInfo, Spec, SpecError, aidin_aft200, ati_netcanoem,
-    canopen_drive, canopen_encoder, canopen_sync, cubemars, damiao, dbc, icub_imu, icub_mais,
-    icub_mc4, icub_motor, icub_pos, icub_skin, icub_strain, jr3_can, moteus, myactuator, odrive,
-    openimu, optoforce_daq, robotous_rft, robstride, vesc, xsens_mti,
+    Device, Driver, OutputInfo, Spec, SpecError, aidin_aft200, ati_netcanoem, canopen_drive,
+    canopen_encoder, canopen_sync, cubemars, damiao, dbc, icub_imu, icub_mais, icub_mc4,
+    icub_motor, icub_pos, icub_skin, icub_strain, jr3_can, moteus, myactuator, odrive, openimu,
+    optoforce_daq, robotous_rft, robstride, vesc, xsens_mti,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -24,71 +29,25 @@ pub enum OptionsError<E> {
 }
 
 macro_rules! drivers {
-    ($($(#[$doc:meta])* $variant:ident: $module:ident,)+) => {
+    ($($(#[$doc:meta])* $variant:ident: $module:ident::$options:ident,)+) => {
         /// The names of all drivers, as gateway.toml writes them.
-        pub const DRIVERS: &[&str] = &[$(<$module::Options as Driver>::NAME),+];
+        pub const DRIVERS: &[&str] = &[$(<$module::$options as Driver>::NAME),+];
 
-        /// Each driver, and whether its questions are sent only if it is named
-        /// ([`Driver::ASKED_BY_NAME`]).
-        pub const ASKED_BY_NAME: &[(&str, bool)] = &[
-            $((<$module::Options as Driver>::NAME, <$module::Options as Driver>::ASKED_BY_NAME),)+
-        ];
-
-        /// What nothing in `seen` refutes, however little speaks for it; the most probable first.
-        fn suspect(seen: &Traffic) -> Vec<Finding> {
-            let mut all = Vec::new();
-            $(all.extend(<$module::Options as Driver>::recognise(seen));)+
-            recognise::together(seen, all)
-        }
-
-        /// The devices that `seen` shows, judged together: the surest first, of those that are
-        /// equally sure the most probable.
-        #[must_use]
-        pub fn recognise(seen: &Traffic) -> Vec<Finding> {
-            let mut all = suspect(seen);
-            all.retain(|finding| finding.certainty().is_some());
-            all.sort_by_key(|finding| core::cmp::Reverse(finding.certainty()));
-            all
-        }
-
-        /// The questions of all drivers ([`Driver::questions`]), each once; of those that are asked
-        /// by name only, the drivers in `named`. None is on an identifier on which a device of
-        /// another driver takes commands, however little speaks for that device, unless all that
-        /// does is explained by one for which more speaks.
-        #[must_use]
-        pub fn questions(seen: &Traffic, named: &[&str]) -> Vec<Frame> {
-            let mut all: Vec<Frame> = Vec::new();
-            let suspects = suspect(seen);
-            let mut there: Vec<&Finding> = Vec::new();
-            for finding in &suspects {
-                let mut own = finding.explains.iter().map(|explained| explained.id);
-                if !own.all(|id| there.iter().any(|better| better.has(id))) {
-                    there.push(finding);
-                }
-            }
-            let is_command = |driver: &str, question: &Frame| {
-                let mut others = there.iter().filter(|finding| finding.driver != driver);
-                others.any(|other| other.commands.iter().any(|c| c.contains(&question.id)))
-            };
-            $(if !<$module::Options as Driver>::ASKED_BY_NAME
-                || named.contains(&<$module::Options as Driver>::NAME)
-            {
-                let driver = <$module::Options as Driver>::NAME;
-                for question in <$module::Options as Driver>::questions(seen) {
-                    if !all.contains(&question) && !is_command(driver, &question) {
-                        all.push(question);
-                    }
-                }
-            })+
-            all
-        }
+        /// What each driver has for recognising its devices.
+        #[cfg(feature = "recognise")]
+        const RECOGNISERS: &[Recogniser] = &[$(Recogniser {
+            driver: <$module::$options as Driver>::NAME,
+            recognise: <$module::$options as Recognise>::recognise,
+            questions: <$module::$options as Recognise>::questions,
+            asked_by_name: <$module::$options as Recognise>::ASKED_BY_NAME,
+        }),+];
 
         /// Each driver's keys, as a schema.
         #[cfg(test)]
         fn schemas() -> Vec<(&'static str, serde_json::Value)> {
             [$((
-                <$module::Options as Driver>::NAME,
-                crate::schema::of::<$module::Options>(),
+                <$module::$options as Driver>::NAME,
+                crate::schema::of::<$module::$options>(),
             )),+].into()
         }
 
@@ -96,7 +55,7 @@ macro_rules! drivers {
         #[derive(Debug, Clone, PartialEq)]
         #[non_exhaustive]
         pub enum Options {
-            $($(#[$doc])* $variant($module::Options),)+
+            $($(#[$doc])* $variant($module::$options),)+
         }
 
         impl Options {
@@ -109,8 +68,8 @@ macro_rules! drivers {
                 driver: &str,
                 keys: D,
             ) -> Result<Self, OptionsError<D::Error>> {
-                $(if driver == <$module::Options as Driver>::NAME {
-                    return $module::Options::deserialize(keys)
+                $(if driver == <$module::$options as Driver>::NAME {
+                    return <$module::$options>::deserialize(keys)
                         .map(Self::$variant)
                         .map_err(OptionsError::Keys);
                 })+
@@ -121,7 +80,7 @@ macro_rules! drivers {
             #[must_use]
             pub const fn default_address(&self) -> Option<u32> {
                 match self {
-                    $(Self::$variant(_) => <$module::Options as Driver>::ADDRESS,)+
+                    $(Self::$variant(_) => <$module::$options as Driver>::ADDRESS,)+
                 }
             }
 
@@ -194,6 +153,7 @@ macro_rules! drivers {
             ///
             /// # Errors
             /// As [`Options::device`].
+            #[cfg(feature = "boards")]
             pub fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
                 check_joints(spec, &self.outputs())?;
                 match self {
@@ -206,55 +166,122 @@ macro_rules! drivers {
 
 drivers! {
     /// iCub F/T boards.
-    IcubStrain: icub_strain,
+    IcubStrain: icub_strain::IcubStrainOptions,
     /// iCub IMUs.
-    IcubImu: icub_imu,
+    IcubImu: icub_imu::IcubImuOptions,
     /// iCub 2FOC motor boards.
-    IcubMotor: icub_motor,
+    IcubMotor: icub_motor::IcubMotorOptions,
     /// Older iCub motor boards.
-    IcubMc4: icub_mc4,
+    IcubMc4: icub_mc4::IcubMc4Options,
     /// iCub POS encoders.
-    IcubPos: icub_pos,
+    IcubPos: icub_pos::IcubPosOptions,
     /// iCub skin.
-    IcubSkin: icub_skin,
+    IcubSkin: icub_skin::IcubSkinOptions,
     /// iCub Hall sensors.
-    IcubMais: icub_mais,
+    IcubMais: icub_mais::IcubMaisOptions,
     /// ATI F/T sensors.
-    AtiNetcanoem: ati_netcanoem,
+    AtiNetcanoem: ati_netcanoem::AtiNetcanoemOptions,
     /// CANopen drives.
-    CanopenDrive: canopen_drive,
+    CanopenDrive: canopen_drive::CanopenDriveOptions,
     /// CANopen encoders.
-    CanopenEncoder: canopen_encoder,
+    CanopenEncoder: canopen_encoder::CanopenEncoderOptions,
     /// The SYNC of a CANopen bus.
-    CanopenSync: canopen_sync,
+    CanopenSync: canopen_sync::CanopenSyncOptions,
     /// moteus controllers.
-    Moteus: moteus,
+    Moteus: moteus::MoteusOptions,
     /// ODrive motor controllers.
-    Odrive: odrive,
+    Odrive: odrive::OdriveOptions,
     /// CubeMars actuators.
-    Cubemars: cubemars,
+    Cubemars: cubemars::CubemarsOptions,
     /// Damiao actuators.
-    Damiao: damiao,
+    Damiao: damiao::DamiaoOptions,
     /// MyActuator RMD actuators.
-    Myactuator: myactuator,
+    Myactuator: myactuator::MyactuatorOptions,
     /// RobStride actuators and CyberGear.
-    Robstride: robstride,
+    Robstride: robstride::RobstrideOptions,
     /// VESC motor controllers.
-    Vesc: vesc,
+    Vesc: vesc::VescOptions,
     /// Xsens MTi.
-    XsensMti: xsens_mti,
+    XsensMti: xsens_mti::XsensMtiOptions,
     /// Aceinna OpenIMU and MTLT.
-    OpenImu: openimu,
+    OpenImu: openimu::OpenImuOptions,
     /// Robotous RFT force/torque sensors.
-    RobotousRft: robotous_rft,
+    RobotousRft: robotous_rft::RobotousRftOptions,
     /// AIDIN AFT200 force/torque sensors.
-    AidinAft200: aidin_aft200,
+    AidinAft200: aidin_aft200::AidinAft200Options,
     /// JR3 force/torque sensors.
-    Jr3Can: jr3_can,
+    Jr3Can: jr3_can::Jr3CanOptions,
     /// OptoForce force sensors.
-    OptoforceDaq: optoforce_daq,
+    OptoforceDaq: optoforce_daq::OptoforceDaqOptions,
     /// Devices that a .dbc file describes.
-    Dbc: dbc,
+    Dbc: dbc::DbcOptions,
+}
+
+/// What a driver has for recognising its devices: the items of [`Recognise`].
+#[cfg(feature = "recognise")]
+struct Recogniser {
+    driver: &'static str,
+    recognise: fn(&Traffic) -> Vec<Finding>,
+    questions: fn(&Traffic) -> Vec<Frame>,
+    asked_by_name: bool,
+}
+
+/// The drivers whose questions are sent only if they are named ([`Recognise::ASKED_BY_NAME`]).
+#[cfg(feature = "recognise")]
+pub fn asked_by_name() -> impl Iterator<Item = &'static str> {
+    let asked = RECOGNISERS.iter().filter(|known| known.asked_by_name);
+    asked.map(|known| known.driver)
+}
+
+/// What nothing in `seen` refutes, however little speaks for it; the most probable first.
+#[cfg(feature = "recognise")]
+fn suspect(seen: &Traffic) -> Vec<Finding> {
+    let all = RECOGNISERS.iter().flat_map(|known| (known.recognise)(seen));
+    recognise::together(seen, all.collect())
+}
+
+/// The devices that `seen` shows, judged together: the surest first, of those that are equally sure
+/// the most probable.
+#[cfg(feature = "recognise")]
+#[must_use]
+pub fn recognise(seen: &Traffic) -> Vec<Finding> {
+    let mut all = suspect(seen);
+    all.retain(|finding| finding.certainty().is_some());
+    all.sort_by_key(|finding| core::cmp::Reverse(finding.certainty()));
+    all
+}
+
+/// The questions of all drivers ([`Recognise::questions`]), each once; of those that are asked by
+/// name only, the drivers in `named`. None is on an identifier on which a device of another driver
+/// takes commands, however little speaks for that device, unless all that does is explained by one
+/// for which more speaks.
+#[cfg(feature = "recognise")]
+#[must_use]
+pub fn questions(seen: &Traffic, named: &[&str]) -> Vec<Frame> {
+    let suspects = suspect(seen);
+    let mut there: Vec<&Finding> = Vec::new();
+    for finding in &suspects {
+        let mut own = finding.explains.iter().map(|explained| explained.id);
+        if !own.all(|id| there.iter().any(|better| better.has(id))) {
+            there.push(finding);
+        }
+    }
+    let is_command = |driver: &str, question: &Frame| {
+        let mut others = there.iter().filter(|finding| finding.driver != driver);
+        others.any(|other| other.commands.iter().any(|c| c.contains(&question.id)))
+    };
+    let mut all: Vec<Frame> = Vec::new();
+    for known in RECOGNISERS {
+        if known.asked_by_name && !named.contains(&known.driver) {
+            continue;
+        }
+        for question in (known.questions)(seen) {
+            if !all.contains(&question) && !is_command(known.driver, &question) {
+                all.push(question);
+            }
+        }
+    }
+    all
 }
 
 /// Checks that the joints of `spec` are outputs of the driver, and that one that measures joints

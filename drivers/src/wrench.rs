@@ -111,7 +111,7 @@ impl NewZero {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-enum Step {
+enum TareStep {
     #[default]
     Idle,
     /// To be sent before this.
@@ -124,29 +124,29 @@ enum Step {
 /// A tare of one frame, of a sensor that can not be asked what it has taken as its zero.
 #[derive(Debug, Default)]
 pub(crate) struct TareCommand {
-    step: Step,
+    step: TareStep,
     outcome: Option<Result<CommandOutcome, CommandFailed>>,
 }
 
 impl TareCommand {
     /// Whether one has begun and its outcome has not been taken.
     pub(crate) fn is_open(&self) -> bool {
-        self.step != Step::Idle || self.outcome.is_some()
+        self.step != TareStep::Idle || self.outcome.is_some()
     }
 
     pub(crate) fn begin(&mut self, now: Nanos) {
-        self.step = Step::Due(now + COMMAND_TIME);
+        self.step = TareStep::Due(now + COMMAND_TIME);
     }
 
     /// Whether the frame is to be sent at `now`.
     pub(crate) fn poll(&mut self, now: Nanos) -> bool {
         match self.step {
-            Step::Due(until) if now <= until => {
-                self.step = Step::UnderWay;
+            TareStep::Due(until) if now <= until => {
+                self.step = TareStep::UnderWay;
                 return true;
             }
-            Step::Due(_) => self.end(Err(CommandFailed::NotSent)),
-            Step::Sent(until) if now > until => self.end(Err(CommandFailed::NoAnswer)),
+            TareStep::Due(_) => self.end(Err(CommandFailed::NotSent)),
+            TareStep::Sent(until) if now > until => self.end(Err(CommandFailed::NoAnswer)),
             _ => {}
         }
         false
@@ -156,9 +156,9 @@ impl TareCommand {
     /// at all.
     pub(crate) fn sent(&mut self, outcome: Result<Nanos, NotSent>, confirmed: Option<Nanos>) {
         match (self.step, outcome, confirmed) {
-            (Step::UnderWay, Ok(t), Some(within)) => self.step = Step::Sent(t + within),
-            (Step::UnderWay, Ok(_), None) => self.end(Ok(CommandOutcome::Tared(None))),
-            (Step::UnderWay, Err(_), _) => self.end(Err(CommandFailed::NotSent)),
+            (TareStep::UnderWay, Ok(t), Some(within)) => self.step = TareStep::Sent(t + within),
+            (TareStep::UnderWay, Ok(_), None) => self.end(Ok(CommandOutcome::Tared(None))),
+            (TareStep::UnderWay, Err(_), _) => self.end(Err(CommandFailed::NotSent)),
             _ => {}
         }
     }
@@ -166,7 +166,7 @@ impl TareCommand {
     /// The sensor has confirmed a command.
     pub(crate) fn confirm(&mut self) {
         // Its answer may come before the interface tells that the frame was sent.
-        if matches!(self.step, Step::UnderWay | Step::Sent(_)) {
+        if matches!(self.step, TareStep::UnderWay | TareStep::Sent(_)) {
             self.end(Ok(CommandOutcome::Tared(None)));
         }
     }
@@ -174,14 +174,14 @@ impl TareCommand {
     /// The device is started again or stopped.
     pub(crate) fn interrupt(&mut self) {
         match self.step {
-            Step::Idle => {}
-            Step::Due(_) => self.end(Err(CommandFailed::NotSent)),
-            Step::UnderWay | Step::Sent(_) => self.end(Err(CommandFailed::Interrupted)),
+            TareStep::Idle => {}
+            TareStep::Due(_) => self.end(Err(CommandFailed::NotSent)),
+            TareStep::UnderWay | TareStep::Sent(_) => self.end(Err(CommandFailed::Interrupted)),
         }
     }
 
     fn end(&mut self, outcome: Result<CommandOutcome, CommandFailed>) {
-        self.step = Step::Idle;
+        self.step = TareStep::Idle;
         self.outcome = Some(outcome);
     }
 
@@ -192,9 +192,9 @@ impl TareCommand {
     /// Time of the next poll.
     pub(crate) fn wake(&self) -> Option<Nanos> {
         match self.step {
-            Step::Idle | Step::UnderWay => None,
-            Step::Due(_) => Some(Nanos::MIN),
-            Step::Sent(until) => Some(until + Nanos(1)),
+            TareStep::Idle | TareStep::UnderWay => None,
+            TareStep::Due(_) => Some(Nanos::MIN),
+            TareStep::Sent(until) => Some(until + Nanos(1)),
         }
     }
 }

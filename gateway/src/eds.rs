@@ -12,7 +12,7 @@
 //!   wrong elsewhere does no harm.
 
 use configparser::ini::{Ini, IniDefault};
-use proprio_drivers::objects::{Entry, Objects};
+use proprio_drivers::objects::{ObjectEntry, Objects};
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
@@ -102,7 +102,7 @@ fn parse(text: &str) -> Result<Objects, String> {
                     let (Ok(sub), Some(value)) = (key.parse::<u8>(), value) else {
                         continue;
                     };
-                    let found = parse_number(value).map(|(number, plus_node)| Entry {
+                    let found = parse_number(value).map(|(number, plus_node)| ObjectEntry {
                         number,
                         plus_node,
                         own: true,
@@ -127,7 +127,7 @@ fn parse(text: &str) -> Result<Objects, String> {
         for at in 0..count {
             #[allow(clippy::cast_possible_truncation)] // below 4
             let index = 0x1800 + at as u16;
-            let id = Entry {
+            let id = ObjectEntry {
                 plus_node: true,
                 ..plain(0x180 + 0x100 * at)
             };
@@ -144,7 +144,7 @@ fn parse(text: &str) -> Result<Objects, String> {
 }
 
 /// Puts what a file has of an object to the others.
-fn put(objects: &mut Objects, at: (u16, u8), found: Result<Option<Entry>, String>) {
+fn put(objects: &mut Objects, at: (u16, u8), found: Result<Option<ObjectEntry>, String>) {
     match found {
         Ok(entry) => objects.entries.extend(entry.map(|entry| (at, entry))),
         Err(problem) => {
@@ -154,8 +154,8 @@ fn put(objects: &mut Objects, at: (u16, u8), found: Result<Option<Entry>, String
 }
 
 /// A default.
-const fn plain(number: u32) -> Entry {
-    Entry {
+const fn plain(number: u32) -> ObjectEntry {
+    ObjectEntry {
         number,
         plus_node: false,
         own: false,
@@ -164,7 +164,7 @@ const fn plain(number: u32) -> Entry {
 
 /// The value of an object's section `name`; `None` if it has none, or is no integer of up to 32
 /// bits.
-fn entry(name: &str, section: &Section) -> Result<Option<Entry>, String> {
+fn entry(name: &str, section: &Section) -> Result<Option<ObjectEntry>, String> {
     // Boolean, integers of 8, 16, 32, 24 bits, and their unsigned ones.
     const INTEGERS: [u32; 9] = [1, 2, 3, 4, 5, 6, 7, 0x10, 0x16];
     let is_integer = match number(section, "datatype") {
@@ -189,7 +189,7 @@ fn entry(name: &str, section: &Section) -> Result<Option<Entry>, String> {
         };
         let access = section.get("accesstype").and_then(Option::as_ref);
         let is_constant = access.is_some_and(|access| access.trim().eq_ignore_ascii_case("const"));
-        return Ok(Some(Entry {
+        return Ok(Some(ObjectEntry {
             number,
             plus_node,
             own: key == "parametervalue" || is_constant,

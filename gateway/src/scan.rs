@@ -68,7 +68,7 @@ pub fn hear(link: &mut dyn Link, clock: &impl Clock, time: Nanos) -> Result<Traf
 }
 
 /// Asks the devices on `link` what they are: all that can be asked safely, and the families in
-/// `named` ([`proprio_drivers::ASKED_BY_NAME`]). Adds what is heard to `heard`, and returns how
+/// `named` ([`proprio_drivers::asked_by_name()`]). Adds what is heard to `heard`, and returns how
 /// many questions were sent. Without `fd`, questions in CAN FD are not sent.
 ///
 /// # Errors

@@ -1,9 +1,10 @@
 //! The board's own side: tells its calibration, and answers requests with the gauges of its load.
 
 use super::frames::{STATUS_ANY, id, opcode, opcode_of};
-use super::options::Options;
+use super::options::AtiNetcanoemOptions;
 use crate::calibration::inverse;
-use crate::{Board, EncodeError, Format, Frame, Frames, Spec, SpecError, bytes};
+use crate::{Board, EncodeError, Format, Frame, Frames, Simulate, Spec, SpecError, board, bytes};
+use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading, Wrench};
 
 /// The calibration of a simulated sensor without keys: about 450 N and 23 Nm at full scale; each
@@ -26,7 +27,7 @@ const FAULT: u16 = 1 << 6 | STATUS_ANY;
 
 /// The board's own side.
 #[derive(Debug)]
-pub struct NetcanoemBoard {
+struct NetcanoemBoard {
     base: u8,
     matrix: [[f64; 6]; 6],
     counts: [f64; 2],
@@ -38,46 +39,6 @@ pub struct NetcanoemBoard {
 }
 
 impl NetcanoemBoard {
-    /// A board after power-on.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address above 127, a key out of range, a matrix that is singular.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        let (base, _) = options.check(spec)?;
-        let matrix = options.matrix.as_deref().copied().unwrap_or(MATRIX);
-        let counts = options.counts().unwrap_or(COUNTS);
-        let units = match (options.force_unit, options.torque_unit) {
-            (Some(force), Some(torque)) => [force as u8, torque as u8],
-            _ => UNITS,
-        };
-        let [newton, newton_metre] = options.units().unwrap_or([1.0; 2]);
-        let mut per_count = matrix;
-        for (axis, row) in per_count.iter_mut().enumerate() {
-            let [force, torque] = counts;
-            let unit = if axis < 3 {
-                newton / force
-            } else {
-                newton_metre / torque
-            };
-            *row = row.map(|x| x * unit);
-        }
-        Ok(Self {
-            base,
-            matrix,
-            counts,
-            units,
-            gauges: inverse(per_count).ok_or(SpecError::Keys {
-                key: "matrix",
-                expected: "invertible",
-            })?,
-            load: Wrench {
-                force: [0.0; 3],
-                torque: [0.0; 3],
-            },
-            quality: Quality::GOOD,
-        })
-    }
-
     fn reply(&self, opcode: u8, data: &[u8], out: &mut Frames) {
         let _ = out.try_push(Frame::new(id(self.base, opcode), data));
     }
@@ -100,6 +61,45 @@ impl NetcanoemBoard {
         let first = [status.to_be_bytes(), g0, g2, g4].concat();
         self.reply(opcode::GAUGES, &first, out);
         self.reply(opcode::GAUGES_SECOND, &[g1, g3, g5].concat(), out);
+    }
+}
+
+impl Simulate for AtiNetcanoemOptions {
+    /// A board after power-on.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        let (base, _) = self.check(spec)?;
+        let matrix = self.matrix.as_deref().copied().unwrap_or(MATRIX);
+        let counts = self.counts().unwrap_or(COUNTS);
+        let units = match (self.force_unit, self.torque_unit) {
+            (Some(force), Some(torque)) => [force as u8, torque as u8],
+            _ => UNITS,
+        };
+        let [newton, newton_metre] = self.units().unwrap_or([1.0; 2]);
+        let mut per_count = matrix;
+        for (axis, row) in per_count.iter_mut().enumerate() {
+            let [force, torque] = counts;
+            let unit = if axis < 3 {
+                newton / force
+            } else {
+                newton_metre / torque
+            };
+            *row = row.map(|x| x * unit);
+        }
+        Ok(Box::new(NetcanoemBoard {
+            base,
+            matrix,
+            counts,
+            units,
+            gauges: inverse(per_count).ok_or(SpecError::Keys {
+                key: "matrix",
+                expected: "invertible",
+            })?,
+            load: Wrench {
+                force: [0.0; 3],
+                torque: [0.0; 3],
+            },
+            quality: Quality::GOOD,
+        }))
     }
 }
 
@@ -148,16 +148,8 @@ impl Board for NetcanoemBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        let Reading::Wrench(wrench) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
-        let mut values = wrench.force.iter().chain(&wrench.torque);
-        if !values.all(|value| value.is_finite()) {
-            return Err(EncodeError::NotFinite);
-        }
+        let wrench = board::only_wrench(output, reading)?;
+        board::axes(wrench)?;
         self.readings(wrench, quality, out);
         Ok(())
     }

@@ -2,7 +2,7 @@
 //! answers, or from its answers to another program.
 
 use super::frames::{ForceUnit, TorqueUnit, id, opcode};
-use super::options::{Options, is_row};
+use super::options::{AtiNetcanoemOptions, is_row};
 use crate::bringup::{Ask, Attempts, Inquiry, Timing};
 use crate::bytes::u32_be;
 use crate::{Decoded, Frame, Mode, NotSent};
@@ -32,7 +32,7 @@ type Rows = ArrayVec<u8, 8>;
 
 /// Matrix, counts and units.
 #[derive(Debug)]
-pub(super) struct Calibration {
+pub(super) struct CalibrationQuery {
     base: u8,
     mode: Mode,
     select: Option<u8>,
@@ -58,8 +58,8 @@ pub(super) struct Calibration {
     attempts: Attempts,
 }
 
-impl Calibration {
-    pub(super) fn new(base: u8, mode: Mode, options: &Options) -> Self {
+impl CalibrationQuery {
+    pub(super) fn new(base: u8, mode: Mode, options: &AtiNetcanoemOptions) -> Self {
         let (counts, units) = (options.counts(), options.units());
         let configured = [counts.is_some(), units.is_some(), options.matrix.is_some()];
         let mut this = Self {
@@ -311,7 +311,7 @@ impl Calibration {
     }
 }
 
-impl Inquiry for Calibration {
+impl Inquiry for CalibrationQuery {
     fn begin(&mut self) {
         self.differing = None;
         self.question = 0;

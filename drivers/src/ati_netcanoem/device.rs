@@ -1,19 +1,20 @@
 //! The host's side: asks for the readings, and combines the two halves of each.
 
-use super::calibration::{Calibration, TIMING};
+use super::calibration::{CalibrationQuery, TIMING};
 use super::frames::{STATUS_ANY, STATUS_BUS, STATUS_FAULTS, id, opcode, opcode_of};
-use super::options::Options;
+use super::options::AtiNetcanoemOptions;
 use crate::bringup::Bringup;
 use crate::bytes::{self, i16_be, u16_be};
-use crate::family::{Family, Link, Supervised, next_in_step};
+use crate::family::{Family, Supervised, Supervision, next_in_step};
 use crate::pairing::within;
 use crate::{
-    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
-    NotSent, Output, Spec, SpecError,
+    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Driver, Frame,
+    Mode, NotSent, Output, OutputInfo, Spec, SpecError,
 };
 use alloc::boxed::Box;
+use alloc::vec::Vec;
 use arrayvec::ArrayVec;
-use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind, Wrench};
+use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, StampKind, Wrench};
 
 /// So many readings wait for second halves before a half counts as lost.
 const DEPTH: usize = 4;
@@ -60,32 +61,13 @@ pub(super) struct Netcanoem {
 }
 
 impl Netcanoem {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let (base, period) = options.check(spec)?;
-        let bringup = Bringup::new(spec, spec.mode, TIMING, id(base, opcode::GAUGES));
-        let claim = Claim {
-            mask: !0xF,
-            ..Claim::exclusive(id(base, 0))
-        };
-        let calibration = Calibration::new(base, spec.mode, options);
-        let this = Self {
-            base,
-            mode: spec.mode,
-            period,
-            firsts: ArrayVec::new(),
-            seconds: ArrayVec::new(),
-            joined: true,
-            asked: None,
-            untrusted: Nanos::MIN,
-            open: None,
-            next: Nanos::MIN,
-            outcome: None,
-        };
-        Ok(Supervised::boxed([claim], bringup, calibration, this))
-    }
-
     /// Drops the halves that wait.
-    fn drop_all(&mut self, link: &mut Link<Calibration>, frame: &Frame, out: &mut Decoded) {
+    fn drop_all(
+        &mut self,
+        link: &mut Supervision<CalibrationQuery>,
+        frame: &Frame,
+        out: &mut Decoded,
+    ) {
         let halves = self.firsts.len() + self.seconds.len();
         if halves > 0 {
             link.bringup.lost();
@@ -103,7 +85,7 @@ impl Netcanoem {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Calibration>,
+        link: &mut Supervision<CalibrationQuery>,
         out: &mut Decoded,
     ) {
         self.joined = false;
@@ -136,7 +118,7 @@ impl Netcanoem {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Calibration>,
+        link: &mut Supervision<CalibrationQuery>,
         out: &mut Decoded,
     ) {
         let in_time = self
@@ -169,7 +151,7 @@ fn give(
     second: [i16; 3],
     is_trusted: bool,
     frame: &Frame,
-    link: &mut Link<Calibration>,
+    link: &mut Supervision<CalibrationQuery>,
     out: &mut Decoded,
 ) {
     let Some(per_count) = link.questions.per_count() else {
@@ -207,10 +189,48 @@ fn give(
     out.push(output, frame.id);
 }
 
-impl Family for Netcanoem {
-    type Questions = Calibration;
+impl Driver for AtiNetcanoemOptions {
+    const NAME: &'static str = "ati_netcanoem";
+    const ADDRESS: Option<u32> = Some(0x20);
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Calibration>, out: &mut Decoded) {
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Wrench)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let (base, period) = self.check(spec)?;
+        let bringup = Bringup::new(spec, spec.mode, TIMING, id(base, opcode::GAUGES));
+        let claim = Claim {
+            mask: !0xF,
+            ..Claim::exclusive(id(base, 0))
+        };
+        let calibration = CalibrationQuery::new(base, spec.mode, self);
+        let this = Netcanoem {
+            base,
+            mode: spec.mode,
+            period,
+            firsts: ArrayVec::new(),
+            seconds: ArrayVec::new(),
+            joined: true,
+            asked: None,
+            untrusted: Nanos::MIN,
+            open: None,
+            next: Nanos::MIN,
+            outcome: None,
+        };
+        Ok(Supervised::boxed([claim], bringup, calibration, this))
+    }
+}
+
+impl Family for Netcanoem {
+    type Questions = CalibrationQuery;
+
+    fn on_frame(
+        &mut self,
+        frame: &Frame,
+        link: &mut Supervision<CalibrationQuery>,
+        out: &mut Decoded,
+    ) {
         let Some(opcode) = opcode_of(frame.id, self.base) else {
             return;
         };
@@ -244,7 +264,7 @@ impl Family for Netcanoem {
     fn request(
         &mut self,
         now: Nanos,
-        link: &mut Link<Calibration>,
+        link: &mut Supervision<CalibrationQuery>,
         out: &mut Decoded,
     ) -> Option<Frame> {
         if now < self.request_at()? {
@@ -285,7 +305,7 @@ impl Family for Netcanoem {
         &mut self,
         command: Command,
         _now: Nanos,
-        link: &Link<Calibration>,
+        link: &Supervision<CalibrationQuery>,
     ) -> Result<(), CommandRefused> {
         if command != Command::Calibration {
             return Err(CommandRefused::Unsupported);
@@ -298,7 +318,7 @@ impl Family for Netcanoem {
 
     fn outcome(
         &mut self,
-        _link: &Link<Calibration>,
+        _link: &Supervision<CalibrationQuery>,
     ) -> Option<Result<CommandOutcome, CommandFailed>> {
         self.outcome.take().map(Ok)
     }

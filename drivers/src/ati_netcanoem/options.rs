@@ -10,7 +10,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct AtiNetcanoemOptions {
     /// Period of the requests \[ms\], 1 to 1000; default 2.
     pub period_ms: u32,
     /// The calibration to select at start; default: the one in use.
@@ -27,7 +27,7 @@ pub struct Options {
     pub matrix: Option<Box<[[f64; 6]; 6]>>,
 }
 
-impl Default for Options {
+impl Default for AtiNetcanoemOptions {
     fn default() -> Self {
         Self {
             period_ms: 2,
@@ -41,7 +41,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl AtiNetcanoemOptions {
     /// Base and period.
     pub(super) fn check(&self, spec: &Spec) -> Result<(u8, Nanos), SpecError> {
         let address = spec.address;

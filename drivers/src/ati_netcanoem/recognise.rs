@@ -1,8 +1,9 @@
 //! Recognising boards: by what they answer, to this host or to another program.
 
+use super::AtiNetcanoemOptions;
 use super::frames::{BASE_MOST, ForceUnit, TorqueUnit, id, opcode};
-use crate::Frame;
 use crate::recognise::{Evidence, Finding, Key, Traffic};
+use crate::{Driver, Frame, Recognise};
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
@@ -28,7 +29,7 @@ fn is_text(frame: &Frame) -> bool {
 }
 
 /// The board at `base`, if `seen` shows it. A request and its answer have one identifier.
-pub(super) fn sensor(seen: &Traffic, driver: &'static str, base: u8) -> Option<Finding> {
+fn sensor(seen: &Traffic, driver: &'static str, base: u8) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, usize::from(BASE_MOST) + 1);
     let id = |opcode| id(base, opcode);
     let has_length = |lengths: [usize; 2]| move |frame: &Frame| lengths.contains(&frame.len());
@@ -65,17 +66,27 @@ pub(super) fn sensor(seen: &Traffic, driver: &'static str, base: u8) -> Option<F
     Some(finding.with_commands([id(0)..=id(0xF)]))
 }
 
-/// All bases are asked for their units; those that have answered for their serial number and
-/// counts.
-pub(super) fn questions(seen: &Traffic) -> Vec<Frame> {
-    let mut questions = Vec::new();
-    for base in 0..=BASE_MOST {
-        questions.push(Frame::new(id(base, opcode::UNITS), &[]));
-        let heard = seen.stream(id(base, opcode::UNITS));
-        if heard.is_some_and(|stream| stream.kept().any(is_units)) {
-            questions.push(Frame::new(id(base, opcode::SERIAL), &[]));
-            questions.push(Frame::new(id(base, opcode::COUNTS), &[]));
-        }
+impl Recognise for AtiNetcanoemOptions {
+    const ASKED_BY_NAME: bool = true;
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        (0..=BASE_MOST)
+            .filter_map(|base| sensor(seen, Self::NAME, base))
+            .collect()
     }
-    questions
+
+    /// All bases are asked for their units; those that have answered for their serial number and
+    /// counts.
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        let mut questions = Vec::new();
+        for base in 0..=BASE_MOST {
+            questions.push(Frame::new(id(base, opcode::UNITS), &[]));
+            let heard = seen.stream(id(base, opcode::UNITS));
+            if heard.is_some_and(|stream| stream.kept().any(is_units)) {
+                questions.push(Frame::new(id(base, opcode::SERIAL), &[]));
+                questions.push(Frame::new(id(base, opcode::COUNTS), &[]));
+            }
+        }
+        questions
+    }
 }

@@ -13,7 +13,7 @@ type Entry = (u32, u8);
 
 /// A simulated node.
 #[derive(Debug)]
-pub(crate) struct Node {
+pub(crate) struct SimulatedNode {
     id: u8,
     operational: bool,
     /// The entries after power-on.
@@ -30,7 +30,7 @@ const NO_OBJECT: u32 = 0x0602_0000;
 const LENGTH: u32 = 0x0607_0010;
 const COMMAND: u32 = 0x0504_0001;
 
-impl Node {
+impl SimulatedNode {
     /// A node with these entries; `operational`: another program has started it.
     pub(crate) fn new(id: u8, operational: bool, entries: &[(Object, u32, u8)]) -> Self {
         // The identity of a simulated node: no vendor; its number is its serial number.

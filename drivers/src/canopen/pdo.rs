@@ -2,7 +2,7 @@
 //! and 1A00, as the node or a file tells them.
 
 use super::protocol::{MAPPED_MOST, NO_RTR, Object, TPDO_OFF, object};
-use super::script::Step;
+use super::script::ScriptStep;
 use crate::Id;
 use crate::objects::Objects;
 
@@ -81,7 +81,7 @@ impl Pdo {
     /// Step `at` of those that set TPDO `number` of a pre-operational node to this: it is off while
     /// its mapping changes. What no SYNC causes is sent each `timer_ms`. `None`: the step is not
     /// needed.
-    pub(crate) fn setup(&self, number: u8, timer_ms: u32, at: usize) -> Option<Step> {
+    pub(crate) fn setup(&self, number: u8, timer_ms: u32, at: usize) -> Option<ScriptStep> {
         const ID: usize = Pdo::SETUP - 1;
         const TIMER: usize = Pdo::SETUP - 2;
         const TRANSMISSION: usize = Pdo::SETUP - 3;
@@ -105,7 +105,7 @@ impl Pdo {
                 (object::tpdo_mapping(number, at as u8 - 1), entry, 4)
             }
         };
-        Some(Step::Write {
+        Some(ScriptStep::Write {
             object,
             value,
             bytes,

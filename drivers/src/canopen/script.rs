@@ -8,7 +8,7 @@ use proprio_topics::{Counter, Nanos, Refusal};
 
 /// One step.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Step {
+pub(crate) enum ScriptStep {
     /// An NMT command, which is not answered.
     Nmt(u8),
     /// Read an entry.
@@ -22,9 +22,9 @@ pub(crate) enum Step {
 }
 
 /// What a family does at the start of a node.
-pub(crate) trait Plan: Send {
+pub(crate) trait StartPlan: Send {
     /// The step number `at`; `None`: it is not needed.
-    fn step(&self, at: usize) -> Option<Step>;
+    fn step(&self, at: usize) -> Option<ScriptStep>;
 
     /// The number of steps.
     fn steps(&self) -> usize;
@@ -47,7 +47,7 @@ pub(crate) trait Plan: Send {
     fn begin(&mut self);
 }
 
-/// An [`Inquiry`] that follows a [`Plan`].
+/// An [`Inquiry`] that follows a [`StartPlan`].
 #[derive(Debug)]
 pub(crate) struct Script<P> {
     node: u8,
@@ -71,7 +71,7 @@ const UPLOAD: u8 = 0x43;
 /// The number of unused bytes.
 const UNUSED: u8 = 0b1100;
 
-impl<P: Plan> Script<P> {
+impl<P: StartPlan> Script<P> {
     pub(crate) fn new(node: u8, mode: Mode, plan: P) -> Self {
         Self {
             node,
@@ -85,7 +85,7 @@ impl<P: Plan> Script<P> {
         }
     }
 
-    /// A reading came, and what it needs was not overheard ([`Plan::ready`]).
+    /// A reading came, and what it needs was not overheard ([`StartPlan::ready`]).
     pub(crate) fn missed(&mut self) {
         if self.mode == Mode::Listen
             && let Err(refusal) = self.plan.ready()
@@ -114,7 +114,7 @@ impl<P: Plan> Script<P> {
         }
     }
 
-    fn current(&self) -> Option<Step> {
+    fn current(&self) -> Option<ScriptStep> {
         self.plan.step(self.at)
     }
 
@@ -147,8 +147,8 @@ impl<P: Plan> Script<P> {
         };
         if self.mode == Mode::Supervise {
             let mine = match self.current() {
-                Some(Step::Read(asked)) => asked == object && answer != Ok(None),
-                Some(Step::Write { object: asked, .. }) => {
+                Some(ScriptStep::Read(asked)) => asked == object && answer != Ok(None),
+                Some(ScriptStep::Write { object: asked, .. }) => {
                     asked == object && !matches!(answer, Ok(Some(_)))
                 }
                 _ => false,
@@ -180,7 +180,7 @@ impl<P: Plan> Script<P> {
     }
 }
 
-impl<P: Plan> Inquiry for Script<P> {
+impl<P: StartPlan> Inquiry for Script<P> {
     fn begin(&mut self) {
         self.at = 0;
         self.told = false;
@@ -217,12 +217,12 @@ impl<P: Plan> Inquiry for Script<P> {
             Ask::Send(Frame::new(sdo_to(self.node), &data))
         };
         match step {
-            Step::Nmt(command) => {
+            ScriptStep::Nmt(command) => {
                 self.told = true;
                 Ask::Send(Frame::new(NMT, &[command, self.node]))
             }
-            Step::Read(object) => command(READ, object, 0),
-            Step::Write {
+            ScriptStep::Read(object) => command(READ, object, 0),
+            ScriptStep::Write {
                 object,
                 value,
                 bytes,

@@ -1,10 +1,13 @@
 //! A drive's own side: a node with mapped process data.
 
-use super::layout::{Field, Layout, Quantity, fields};
-use super::options::{CurrentUnit, Options, TorqueUnit, VelocityUnit};
-use super::start::{COUNTS, PROFILE, RATED_CURRENT, RATED_TORQUE, TURNS, Told};
-use crate::canopen::{NO_RTR, Node, Pdo, SYNC, TPDO_OFF, check_file, node_of, object, tpdo};
-use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
+use super::layout::{DriveQuantity, MappedObject, PdoMapping, fields};
+use super::options::{CanopenDriveOptions, CurrentUnit, RatedTorqueUnit, VelocityUnit};
+use super::start::{COUNTS, PROFILE, RATED_CURRENT, RATED_TORQUE, ScaleObjects, TURNS};
+use crate::canopen::{
+    NO_RTR, Pdo, SYNC, SimulatedNode, TPDO_OFF, check_file, node_of, object, tpdo,
+};
+use crate::{Board, EncodeError, Frame, Frames, Mode, Simulate, Spec, SpecError, board};
+use alloc::boxed::Box;
 use alloc::vec::Vec;
 use core::f64::consts::TAU;
 use proprio_topics::{JointState, Nanos, Quality, Reading};
@@ -25,94 +28,25 @@ const OVERCURRENT: u16 = 0x2310;
 
 /// The drive's own side.
 #[derive(Debug)]
-pub struct DriveBoard {
-    node: Node,
+struct DriveBoard {
+    node: SimulatedNode,
     /// SI units per step of position, velocity, torque and current.
-    per_step: [f64; Quantity::JOINT],
+    per_step: [f64; DriveQuantity::JOINT],
     state: JointState,
     quality: Quality,
 }
 
 impl DriveBoard {
-    /// A drive after power-on; in [`Mode::Listen`] another program has already started it.
-    ///
-    /// # Errors
-    /// [`SpecError`]: a node outside 1 to 127, a key out of range.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // casts saturate
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        options.check()?;
-        let id = node_of(spec)?;
-        check_file(id, options.objects.as_ref())?;
-        let pdos = options.pdos();
-        let of_file = options.objects.as_ref().filter(|_| pdos.is_empty());
-        let of_file = of_file.map(|file| Layout::of_file(id, file));
-        let layout = match of_file.filter(|file| file.position().is_some()) {
-            Some(layout) => layout,
-            // As its maker delivers it: nothing is mapped.
-            None if options.configure && spec.mode == Mode::Supervise => Layout::default(),
-            None if pdos.is_empty() => Layout::of_keys(id, &options.usual_pdos())?,
-            None => Layout::of_keys(id, &pdos)?,
-        };
-        let file = Told::of_file(options.objects.as_ref());
-        let counts_per_turn = options.counts_per_turn.or(file.counts_per_turn());
-        let counts_per_turn = counts_per_turn.unwrap_or(COUNTS_PER_TURN);
-        let torque_unit = options.rated_torque_unit.unwrap_or(TorqueUnit::Milli);
-        let of_file = file.rated_torque(options.rated_torque_unit);
-        let torque = options.rated_torque.or(of_file).unwrap_or(TORQUE);
-        let current = options.rated_current.or(file.rated_current());
-        let current = current.unwrap_or(CURRENT);
-        let velocity = options.velocity_unit.unwrap_or(VelocityUnit::Counts);
-        let mut entries = Vec::from([
-            (object::DEVICE_TYPE, 0x0002_0000 | PROFILE, 4),
-            (COUNTS, counts_per_turn as u32, 4),
-            (TURNS, 1, 4),
-            (
-                RATED_TORQUE,
-                libm::round(torque / torque_unit.newton_metres()) as u32,
-                4,
-            ),
-            (RATED_CURRENT, (current * 1e3) as u32, 4),
-        ]);
-        for (number, pdo) in (0_u8..).zip(&layout.pdos) {
-            let id = pdo.id.unwrap_or(tpdo(id, number).raw() | TPDO_OFF);
-            entries.push((object::tpdo_id(number), id | NO_RTR, 4));
-            entries.push((
-                object::tpdo_transmission(number),
-                pdo.transmission.into(),
-                1,
-            ));
-            entries.push((object::tpdo_timer(number), options.period_ms, 2));
-            entries.push((object::tpdo_mapping(number, 0), pdo.count.into(), 1));
-            for (sub, entry) in (1..).zip(&pdo.mapping) {
-                entries.push((object::tpdo_mapping(number, sub), *entry, 4));
-            }
-        }
-        Ok(Self {
-            node: Node::new(id, spec.mode == Mode::Listen, &entries),
-            per_step: [
-                TAU / counts_per_turn,
-                velocity.unit().radians(TAU / counts_per_turn),
-                torque * 1e-3,
-                match options.current_unit {
-                    CurrentUnit::Milliampere => 1e-3,
-                    CurrentUnit::PerMille => current * 1e-3,
-                },
-            ],
-            state: JointState::ABSENT,
-            quality: Quality::GOOD,
-        })
-    }
-
     /// Its mapping, as it is set now.
-    fn layout(&self) -> Layout {
+    fn layout(&self) -> PdoMapping {
         let of_node = |number| Pdo::of_node(number, |object| self.node.value(object));
-        Layout {
+        PdoMapping {
             pdos: [0, 1, 2, 3].map(of_node),
         }
     }
 
     /// The raw number of a field; 0 for a value that the joint does not have.
-    fn raw(&self, field: &Field) -> f64 {
+    fn raw(&self, field: &MappedObject) -> f64 {
         let JointState {
             position,
             velocity,
@@ -124,13 +58,13 @@ impl DriveBoard {
             .quality
             .intersects(Quality::DRIVE_FAULT | Quality::DEVICE_FAULT);
         let value = match field.quantity {
-            Quantity::Position => position,
-            Quantity::Velocity => velocity,
-            Quantity::Torque => torque,
-            Quantity::Current => current,
-            Quantity::Status => return if has_fault { FAULTY } else { ENABLED },
-            Quantity::Mode => return CST,
-            Quantity::Error => return f64::from(self.error()),
+            DriveQuantity::Position => position,
+            DriveQuantity::Velocity => velocity,
+            DriveQuantity::Torque => torque,
+            DriveQuantity::Current => current,
+            DriveQuantity::Status => return if has_fault { FAULTY } else { ENABLED },
+            DriveQuantity::Mode => return CST,
+            DriveQuantity::Error => return f64::from(self.error()),
         };
         let per_step = self.per_step.get(field.quantity as usize);
         let steps = value / per_step.copied().unwrap_or(1.0);
@@ -163,6 +97,74 @@ impl DriveBoard {
             let data = data.get(..bytes).unwrap_or_default();
             let _ = out.try_push(Frame::new(self.node.tpdo_id(number), data));
         }
+    }
+}
+
+impl Simulate for CanopenDriveOptions {
+    /// A drive after power-on; in [`Mode::Listen`] another program has already started it.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // casts saturate
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        self.check()?;
+        let id = node_of(spec)?;
+        check_file(id, self.objects.as_ref())?;
+        let pdos = self.pdos();
+        let of_file = self.objects.as_ref().filter(|_| pdos.is_empty());
+        let of_file = of_file.map(|file| PdoMapping::of_file(id, file));
+        let layout = match of_file.filter(|file| file.position().is_some()) {
+            Some(layout) => layout,
+            // As its maker delivers it: nothing is mapped.
+            None if self.configure && spec.mode == Mode::Supervise => PdoMapping::default(),
+            None if pdos.is_empty() => PdoMapping::of_keys(id, &self.usual_pdos())?,
+            None => PdoMapping::of_keys(id, &pdos)?,
+        };
+        let file = ScaleObjects::of_file(self.objects.as_ref());
+        let counts_per_turn = self.counts_per_turn.or(file.counts_per_turn());
+        let counts_per_turn = counts_per_turn.unwrap_or(COUNTS_PER_TURN);
+        let torque_unit = self.rated_torque_unit.unwrap_or(RatedTorqueUnit::Milli);
+        let of_file = file.rated_torque(self.rated_torque_unit);
+        let torque = self.rated_torque.or(of_file).unwrap_or(TORQUE);
+        let current = self.rated_current.or(file.rated_current());
+        let current = current.unwrap_or(CURRENT);
+        let velocity = self.velocity_unit.unwrap_or(VelocityUnit::Counts);
+        let mut entries = Vec::from([
+            (object::DEVICE_TYPE, 0x0002_0000 | PROFILE, 4),
+            (COUNTS, counts_per_turn as u32, 4),
+            (TURNS, 1, 4),
+            (
+                RATED_TORQUE,
+                libm::round(torque / torque_unit.newton_metres()) as u32,
+                4,
+            ),
+            (RATED_CURRENT, (current * 1e3) as u32, 4),
+        ]);
+        for (number, pdo) in (0_u8..).zip(&layout.pdos) {
+            let id = pdo.id.unwrap_or(tpdo(id, number).raw() | TPDO_OFF);
+            entries.push((object::tpdo_id(number), id | NO_RTR, 4));
+            entries.push((
+                object::tpdo_transmission(number),
+                pdo.transmission.into(),
+                1,
+            ));
+            entries.push((object::tpdo_timer(number), self.period_ms, 2));
+            entries.push((object::tpdo_mapping(number, 0), pdo.count.into(), 1));
+            for (sub, entry) in (1..).zip(&pdo.mapping) {
+                entries.push((object::tpdo_mapping(number, sub), *entry, 4));
+            }
+        }
+        Ok(Box::new(DriveBoard {
+            node: SimulatedNode::new(id, spec.mode == Mode::Listen, &entries),
+            per_step: [
+                TAU / counts_per_turn,
+                velocity.unit().radians(TAU / counts_per_turn),
+                torque * 1e-3,
+                match self.current_unit {
+                    CurrentUnit::Milliampere => 1e-3,
+                    CurrentUnit::PerMille => current * 1e-3,
+                },
+            ],
+            state: JointState::ABSENT,
+            quality: Quality::GOOD,
+        }))
     }
 }
 
@@ -202,12 +204,8 @@ impl Board for DriveBoard {
             Reading::Actuator(_) => return Ok(()),
             _ => return Err(EncodeError::Kind),
         };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
-        if !joint.position.is_finite() {
-            return Err(EncodeError::NotFinite);
-        }
+        board::only_output(output)?;
+        board::finite(&[joint.position])?;
         (self.state, self.quality) = (*joint, quality);
         self.send(0b1111, out);
         Ok(())

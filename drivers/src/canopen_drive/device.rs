@@ -1,19 +1,23 @@
 //! The host's side of a drive: puts the values of its TPDOs together.
 
-use super::layout::{Quantity, fields, values};
-use super::options::Options;
-use super::start::{Scales, Start};
+use super::layout::{DriveQuantity, fields, values};
+use super::options::CanopenDriveOptions;
+use super::start::{DriveStart, Scales};
 use crate::bringup::Bringup;
-use crate::bytes;
 use crate::canopen::{
-    self, Cycle, NMT, NodeState, Plan, Rates, SYNC, Script, nmt, node_of, sdo_from, tpdo,
+    self, Cycle, NMT, NodeState, Rates, SYNC, Script, StartPlan, nmt, node_of, sdo_from, tpdo,
 };
-use crate::family::{Family, Link, Supervised};
-use crate::{Claim, Decoded, Device, Frame, Id, Output, Spec, SpecError};
+use crate::family::{Family, Supervised, Supervision};
+use crate::objects::Objects;
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Id, Output, OutputInfo, Spec, SpecError, bytes,
+};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Refusal, StampKind};
+use proprio_topics::{
+    Actuator, Counter, JointState, Kind, Nanos, Quality, Reading, Refusal, StampKind,
+};
 
 /// The fault bit of the status word.
 const FAULT: u32 = 1 << 3;
@@ -25,13 +29,13 @@ struct Used {
     /// Its bit in the group.
     bit: u8,
     rank: Rank,
-    fields: ArrayVec<super::layout::Field, 8>,
+    fields: ArrayVec<super::layout::MappedObject, 8>,
     bytes: usize,
 }
 
 /// How its frames are read: made from the mapping once the drive is ready.
 #[derive(Debug)]
-struct Table {
+struct MappingTable {
     scales: Scales,
     used: ArrayVec<Used, 4>,
     /// The TPDOs of one reading that a SYNC causes.
@@ -41,8 +45,8 @@ struct Table {
     lacks: Option<Refusal>,
 }
 
-impl Table {
-    fn new(plan: &Start, scales: Scales) -> (Self, u8) {
+impl MappingTable {
+    fn new(plan: &DriveStart, scales: Scales) -> (Self, u8) {
         let (layout, mut used) = (&plan.layout, ArrayVec::new());
         for (at, pdo) in (0_u8..).zip(&layout.pdos) {
             let Some(id) = pdo.used_id() else {
@@ -83,10 +87,10 @@ impl Rank {
 
 /// The host's side of a drive.
 #[derive(Debug)]
-pub(super) struct Drive {
+pub(super) struct CanopenDrive {
     node: u8,
     hold: Nanos,
-    table: Option<Table>,
+    table: Option<MappingTable>,
     cycle: Cycle,
     /// The last SYNC, and what each TPDO of the group has sent since.
     sync: Option<Nanos>,
@@ -103,7 +107,7 @@ pub(super) struct Drive {
     /// Which of the TPDOs makes readings alone.
     rates: Rates,
     /// The last values in SI units, and when they came.
-    values: [Option<(Nanos, f64)>; Quantity::JOINT],
+    values: [Option<(Nanos, f64)>; DriveQuantity::JOINT],
     status: u32,
     mode: u32,
     /// The error code, if it is mapped.
@@ -111,53 +115,18 @@ pub(super) struct Drive {
     state: NodeState,
 }
 
-impl Drive {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        options.check()?;
-        let node = node_of(spec)?;
-        canopen::check_file(node, options.objects.as_ref())?;
-        let start = Start::new(node, spec.mode, options)?;
-        let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, tpdo(node, 0));
-        bringup.start_with(NMT, &[nmt::START, node]);
-        let pdos = start.ids.iter().map(|id| Claim::exclusive(*id));
-        let claims: Vec<Claim> = canopen::claims(node)
-            .chain(pdos)
-            .chain([Claim::shared(SYNC)])
-            .collect();
-        let script = Script::new(node, spec.mode, start);
-        let this = Self {
-            node,
-            hold: Nanos::from_seconds(options.hold_ms * 1e-3),
-            table: None,
-            cycle: Cycle::new(0),
-            sync: None,
-            since_sync: [const { None }; 4],
-            measured: None,
-            have: 0,
-            began: Nanos::MIN,
-            suspect: false,
-            synced: None,
-            rates: Rates::default(),
-            values: [None; Quantity::JOINT],
-            status: 0,
-            mode: 0,
-            error: None,
-            state: NodeState::default(),
-        };
-        Ok(Supervised::boxed(claims, bringup, script, this))
-    }
-
+impl CanopenDrive {
     /// Makes the table, if all that it needs is known.
-    fn prepare(&mut self, plan: &Start) {
+    fn prepare(&mut self, plan: &DriveStart) {
         if let (Ok(()), Ok(scales)) = (plan.ready(), plan.scales()) {
-            let (table, every) = Table::new(plan, scales);
+            let (table, every) = MappingTable::new(plan, scales);
             self.table = Some(table);
             self.cycle.set_every(every);
         }
     }
 
     /// A reading ends without some of its values.
-    fn abandon(&mut self, id: Id, link: &mut Link<Script<Start>>, out: &mut Decoded) {
+    fn abandon(&mut self, id: Id, link: &mut Supervision<Script<DriveStart>>, out: &mut Decoded) {
         if core::mem::take(&mut self.have) != 0 {
             out.fault(Counter::Unpaired, 1, id);
             link.bringup.lost();
@@ -170,7 +139,7 @@ impl Drive {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Script<Start>>,
+        link: &mut Supervision<Script<DriveStart>>,
         out: &mut Decoded,
     ) {
         if self.table.is_none() {
@@ -214,8 +183,8 @@ impl Drive {
             } else {
                 tells_status = true;
                 match field.quantity {
-                    Quantity::Status => self.status = word,
-                    Quantity::Mode => self.mode = word,
+                    DriveQuantity::Status => self.status = word,
+                    DriveQuantity::Mode => self.mode = word,
                     _ => self.error = Some(word),
                 }
             }
@@ -288,7 +257,7 @@ impl Drive {
         &mut self,
         measured: Option<(Nanos, StampKind)>,
         frame: &Frame,
-        link: &mut Link<Script<Start>>,
+        link: &mut Supervision<Script<DriveStart>>,
         out: &mut Decoded,
     ) {
         let values = self.values.map(|value| match value {
@@ -323,10 +292,66 @@ impl Drive {
     }
 }
 
-impl Family for Drive {
-    type Questions = Script<Start>;
+impl Driver for CanopenDriveOptions {
+    const NAME: &'static str = "canopen_drive";
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Script<Start>>, out: &mut Decoded) {
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Joint)].to_vec()
+    }
+
+    fn eds(&self) -> Option<&str> {
+        self.eds.as_deref()
+    }
+
+    fn describe_objects(&mut self, objects: Objects) {
+        self.objects = Some(objects);
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        self.check()?;
+        let node = node_of(spec)?;
+        canopen::check_file(node, self.objects.as_ref())?;
+        let start = DriveStart::new(node, spec.mode, self)?;
+        let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, tpdo(node, 0));
+        bringup.start_with(NMT, &[nmt::START, node]);
+        let pdos = start.ids.iter().map(|id| Claim::exclusive(*id));
+        let claims: Vec<Claim> = canopen::claims(node)
+            .chain(pdos)
+            .chain([Claim::shared(SYNC)])
+            .collect();
+        let script = Script::new(node, spec.mode, start);
+        let this = CanopenDrive {
+            node,
+            hold: Nanos::from_seconds(self.hold_ms * 1e-3),
+            table: None,
+            cycle: Cycle::new(0),
+            sync: None,
+            since_sync: [const { None }; 4],
+            measured: None,
+            have: 0,
+            began: Nanos::MIN,
+            suspect: false,
+            synced: None,
+            rates: Rates::default(),
+            values: [None; DriveQuantity::JOINT],
+            status: 0,
+            mode: 0,
+            error: None,
+            state: NodeState::default(),
+        };
+        Ok(Supervised::boxed(claims, bringup, script, this))
+    }
+}
+
+impl Family for CanopenDrive {
+    type Questions = Script<DriveStart>;
+
+    fn on_frame(
+        &mut self,
+        frame: &Frame,
+        link: &mut Supervision<Script<DriveStart>>,
+        out: &mut Decoded,
+    ) {
         if self.state.on_frame(self.node, frame, link, out) {
             // An answer may have changed the mapping.
             if frame.id == sdo_from(self.node) {
@@ -361,7 +386,7 @@ impl Family for Drive {
         self.suspect = false;
         self.synced = None;
         self.rates = Rates::default();
-        self.values = [None; Quantity::JOINT];
+        self.values = [None; DriveQuantity::JOINT];
         self.table = None;
     }
 }

@@ -13,7 +13,7 @@ const BY_EVENT: u8 = 255;
 
 /// What a drive sends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Quantity {
+pub(super) enum DriveQuantity {
     Position,
     Velocity,
     Torque,
@@ -23,7 +23,7 @@ pub(super) enum Quantity {
     Error,
 }
 
-impl Quantity {
+impl DriveQuantity {
     /// The quantities that make a joint reading.
     pub(super) const JOINT: usize = 4;
 
@@ -54,23 +54,23 @@ impl Quantity {
 
 /// One number in a TPDO.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Field {
-    pub(super) quantity: Quantity,
+pub(super) struct MappedObject {
+    pub(super) quantity: DriveQuantity,
     pub(super) bits: Bits,
     pub(super) raw: Raw,
 }
 
 /// The quantities of `pdo` that are used, and the length of its frames \[bytes\]. An object of
 /// another length than the profile's is not used.
-pub(super) fn fields(pdo: &Pdo) -> (ArrayVec<Field, 8>, usize) {
+pub(super) fn fields(pdo: &Pdo) -> (ArrayVec<MappedObject, 8>, usize) {
     let (mut fields, mut end) = (ArrayVec::new(), 0);
     for (object, at, length) in pdo.objects() {
-        if let Some((quantity, expected)) = Quantity::of(object)
+        if let Some((quantity, expected)) = DriveQuantity::of(object)
             && length == u64::from(expected)
             && let Some(bits) = Bits::new(at, length, false)
         {
             let raw = quantity.raw();
-            let _ = fields.try_push(Field {
+            let _ = fields.try_push(MappedObject {
                 quantity,
                 bits,
                 raw,
@@ -84,17 +84,17 @@ pub(super) fn fields(pdo: &Pdo) -> (ArrayVec<Field, 8>, usize) {
     )
 }
 
-fn has(pdo: &Pdo, wanted: Quantity) -> bool {
+fn has(pdo: &Pdo, wanted: DriveQuantity) -> bool {
     pdo.is_on() && fields(pdo).0.iter().any(|field| field.quantity == wanted)
 }
 
 /// All TPDOs of a drive.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(super) struct Layout {
+pub(super) struct PdoMapping {
     pub(super) pdos: [Pdo; 4],
 }
 
-impl Layout {
+impl PdoMapping {
     /// As the keys state it, with the identifiers that CiA 301 gives a node.
     pub(super) fn of_keys(node: u8, pdos: &[PdoKeys]) -> Result<Self, SpecError> {
         let mut this = Self::default();
@@ -115,7 +115,7 @@ impl Layout {
             let mut bits = 0;
             for index in &keys.objects {
                 let object = Object::new(*index, 0);
-                let Some((_, length)) = Quantity::of(object) else {
+                let Some((_, length)) = DriveQuantity::of(object) else {
                     return Err(wrong(
                         "of objects 0x6041, 0x6061, 0x6063, 0x6064, 0x606C, 0x6077, 0x6078, 0x603F",
                     ));
@@ -172,7 +172,7 @@ impl Layout {
     pub(super) fn off(&self) -> Option<u8> {
         let has_position = |pdo: &Pdo| {
             let (fields, _) = fields(pdo);
-            fields.iter().any(|f| f.quantity == Quantity::Position)
+            fields.iter().any(|f| f.quantity == DriveQuantity::Position)
         };
         let mut pdos = (0..).zip(&self.pdos);
         let found = pdos.find(|(_, pdo)| pdo.is_off() && has_position(pdo));
@@ -183,11 +183,11 @@ impl Layout {
     pub(super) fn position(&self) -> Option<usize> {
         self.pdos
             .iter()
-            .position(|pdo| has(pdo, Quantity::Position))
+            .position(|pdo| has(pdo, DriveQuantity::Position))
     }
 
     /// Whether some TPDO has `wanted`.
-    pub(super) fn has(&self, wanted: Quantity) -> bool {
+    pub(super) fn has(&self, wanted: DriveQuantity) -> bool {
         self.pdos.iter().any(|pdo| has(pdo, wanted))
     }
 
@@ -200,7 +200,7 @@ impl Layout {
     /// The TPDOs that make one reading with a position, one bit each, if a SYNC causes them; and
     /// after how many.
     pub(super) fn group(&self) -> Option<(u8, u8)> {
-        let has_position = |pdo: &&Pdo| pdo.by_sync() && has(pdo, Quantity::Position);
+        let has_position = |pdo: &&Pdo| pdo.by_sync() && has(pdo, DriveQuantity::Position);
         let every = self.pdos.iter().find(has_position)?.transmission;
         let belongs = |pdo: &Pdo| pdo.transmission == every && pdo.is_on() && values(pdo) > 0;
         Some((self.bits(belongs), every))
@@ -209,7 +209,7 @@ impl Layout {
     /// The TPDOs of which each makes a reading, one bit each: those with a position that no SYNC
     /// causes.
     pub(super) fn alone(&self) -> u8 {
-        self.bits(|pdo| !pdo.by_sync() && has(pdo, Quantity::Position))
+        self.bits(|pdo| !pdo.by_sync() && has(pdo, DriveQuantity::Position))
     }
 
     fn bits(&self, which: impl Fn(&Pdo) -> bool) -> u8 {
@@ -221,6 +221,6 @@ impl Layout {
 /// How many values of a joint a TPDO has.
 pub(super) fn values(pdo: &Pdo) -> usize {
     let (fields, _) = fields(pdo);
-    let is_joint = |field: &&Field| (field.quantity as usize) < Quantity::JOINT;
+    let is_joint = |field: &&MappedObject| (field.quantity as usize) < DriveQuantity::JOINT;
     fields.iter().filter(is_joint).count()
 }

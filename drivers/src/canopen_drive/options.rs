@@ -26,26 +26,26 @@ pub enum VelocityUnit {
 }
 
 impl VelocityUnit {
-    pub(super) const fn unit(self) -> Unit {
+    pub(super) const fn unit(self) -> StepUnit {
         match self {
-            Self::Counts => Unit::Positions(1.0),
-            Self::TenthCounts => Unit::Positions(0.1),
-            Self::TurnsPerMinute => Unit::Radians(TAU / 60.0),
-            Self::TenthTurnsPerMinute => Unit::Radians(0.1 * TAU / 60.0),
+            Self::Counts => StepUnit::Positions(1.0),
+            Self::TenthCounts => StepUnit::Positions(0.1),
+            Self::TurnsPerMinute => StepUnit::Radians(TAU / 60.0),
+            Self::TenthTurnsPerMinute => StepUnit::Radians(0.1 * TAU / 60.0),
         }
     }
 }
 
 /// A unit of positions, or of velocities per second.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Unit {
+pub(super) enum StepUnit {
     /// So many steps of the position (of a position: counts).
     Positions(f64),
     /// So many radians.
     Radians(f64),
 }
 
-impl Unit {
+impl StepUnit {
     /// The unit that objects 60A8 (position) and 60A9 (velocity) code: a power of ten, a unit, and
     /// the time that it is divided by (CiA 303-2). `None`: not an angle, or unknown.
     pub(super) fn of_code(code: u32) -> Option<Self> {
@@ -77,7 +77,7 @@ impl Unit {
 /// The unit of object 6076.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
-pub enum TorqueUnit {
+pub enum RatedTorqueUnit {
     /// Of CiA 402: a thousandth of a newton metre.
     #[serde(rename = "mNm")]
     Milli,
@@ -86,7 +86,7 @@ pub enum TorqueUnit {
     Micro,
 }
 
-impl TorqueUnit {
+impl RatedTorqueUnit {
     /// That of a maker. maxon's EPOS4 has millionths: of its file, 512871 is the product of 4.760 A
     /// (object 3001 sub 1) and 107746 uNm/A (sub 5).
     pub(super) const fn of_vendor(vendor: Option<u32>) -> Self {
@@ -139,7 +139,7 @@ pub struct PdoKeys {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct CanopenDriveOptions {
     /// Counts per turn of the motor; default the drive's own.
     pub counts_per_turn: Option<f64>,
     /// Unit of the velocity; default the drive's own, else counts per second.
@@ -147,7 +147,7 @@ pub struct Options {
     /// Rated torque \[Nm\]; default the drive's own.
     pub rated_torque: Option<f64>,
     /// Unit of the drive's own; default its maker's.
-    pub rated_torque_unit: Option<TorqueUnit>,
+    pub rated_torque_unit: Option<RatedTorqueUnit>,
     /// Rated current \[A\]; default the drive's own.
     pub rated_current: Option<f64>,
     /// Unit of the current; default a thousandth of the rated one.
@@ -169,7 +169,7 @@ pub struct Options {
     pub sync: u8,
 }
 
-impl Default for Options {
+impl Default for CanopenDriveOptions {
     fn default() -> Self {
         Self {
             counts_per_turn: None,
@@ -189,7 +189,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl CanopenDriveOptions {
     /// The process data that the keys state: none if the drive is to be asked.
     pub(super) fn pdos(&self) -> Vec<PdoKeys> {
         match self.configure && self.pdos.is_empty() {

@@ -1,8 +1,10 @@
 //! What a drive is asked at its start: its profile, its mapping, and its scales.
 
-use super::layout::{Layout, Quantity, fields};
-use super::options::{CurrentUnit, Options, TorqueUnit, Unit};
-use crate::canopen::{self, MAPPED_MOST, Object, Pdo, Plan, Step, is_free, nmt, object, tpdo};
+use super::layout::{DriveQuantity, PdoMapping, fields};
+use super::options::{CanopenDriveOptions, CurrentUnit, RatedTorqueUnit, StepUnit};
+use crate::canopen::{
+    self, MAPPED_MOST, Object, Pdo, ScriptStep, StartPlan, is_free, nmt, object, tpdo,
+};
 use crate::objects::Objects;
 use crate::{Id, Mode, SpecError};
 use alloc::format;
@@ -18,7 +20,7 @@ pub(super) const TURNS: Object = Object::new(0x608F, 2);
 pub(super) const RATED_TORQUE: Object = Object::new(0x6076, 0);
 /// \[mA\]
 pub(super) const RATED_CURRENT: Object = Object::new(0x6075, 0);
-/// Units as [`Unit::of_code`] reads them.
+/// Units as [`StepUnit::of_code`] reads them.
 const POSITION_UNIT: Object = Object::new(0x60A8, 0);
 const VELOCITY_UNIT: Object = Object::new(0x60A9, 0);
 /// \[rpm\]
@@ -56,9 +58,9 @@ const FIRST_SCALE: usize = SETUP + 4 * Pdo::SETUP;
 /// What a drive, or its file, tells of its scales: the values of [`SCALES`]; none is 0, by which
 /// makers mean that it is not stated.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Told([Option<u32>; SCALES.len()]);
+pub(super) struct ScaleObjects([Option<u32>; SCALES.len()]);
 
-impl Told {
+impl ScaleObjects {
     /// What `file` tells of this very drive. (The scales of an EDS are those of some motor; its
     /// units and its maker are those of all drives of the kind.)
     pub(super) fn of_file(file: Option<&Objects>) -> Self {
@@ -102,8 +104,8 @@ impl Told {
     }
 
     /// \[Nm\], in the unit of the keys, else in that of its maker.
-    pub(super) fn rated_torque(&self, unit: Option<TorqueUnit>) -> Option<f64> {
-        let unit = unit.unwrap_or(TorqueUnit::of_vendor(self.value(VENDOR)));
+    pub(super) fn rated_torque(&self, unit: Option<RatedTorqueUnit>) -> Option<f64> {
+        let unit = unit.unwrap_or(RatedTorqueUnit::of_vendor(self.value(VENDOR)));
         Some(f64::from(self.value(RATED_TORQUE)?) * unit.newton_metres())
     }
 
@@ -125,37 +127,41 @@ impl Told {
 /// Mapping and scales of a drive: those of the keys, else what the drive says, else what its file
 /// says.
 #[derive(Debug)]
-pub(super) struct Start {
-    options: Options,
+pub(super) struct DriveStart {
+    options: CanopenDriveOptions,
     /// The mapping is that of the keys.
     configured: bool,
     /// The drive is set to it.
     sets: bool,
     /// What is used until the drive says it: nothing, if it is asked.
-    initial: (Layout, Told),
-    pub(super) layout: Layout,
+    initial: (PdoMapping, ScaleObjects),
+    pub(super) layout: PdoMapping,
     /// The identifiers of TPDOs that are received.
     pub(super) ids: ArrayVec<Id, 4>,
-    file: Told,
-    told: Told,
+    file: ScaleObjects,
+    told: ScaleObjects,
 }
 
 /// SI units per step of what a drive sends.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Scales {
-    /// In the order of [`Quantity`]: position, velocity, torque, current.
-    pub(super) per_step: [f64; Quantity::JOINT],
+    /// In the order of [`DriveQuantity`]: position, velocity, torque, current.
+    pub(super) per_step: [f64; DriveQuantity::JOINT],
 }
 
-impl Start {
-    pub(super) fn new(node: u8, mode: Mode, options: &Options) -> Result<Self, SpecError> {
+impl DriveStart {
+    pub(super) fn new(
+        node: u8,
+        mode: Mode,
+        options: &CanopenDriveOptions,
+    ) -> Result<Self, SpecError> {
         let file = options.objects.as_ref();
-        let of_keys = Layout::of_keys(node, &options.pdos())?;
+        let of_keys = PdoMapping::of_keys(node, &options.pdos())?;
         let configured = of_keys.position().is_some();
         let listens = mode == Mode::Listen;
         let name = options.eds.as_deref().unwrap_or_default();
         let stated = match file {
-            Some(file) if !configured => Layout::of_file(node, file),
+            Some(file) if !configured => PdoMapping::of_file(node, file),
             _ => of_keys,
         };
         // One that is asked need not have them in its file.
@@ -181,12 +187,12 @@ impl Start {
                 (
                     RATED_TORQUE,
                     "rated_torque",
-                    options.rated_torque.is_none() && asked(Quantity::Torque),
+                    options.rated_torque.is_none() && asked(DriveQuantity::Torque),
                 ),
                 (
                     RATED_CURRENT,
                     "rated_current",
-                    options.rated_current.is_none() && per_mille && asked(Quantity::Current),
+                    options.rated_current.is_none() && per_mille && asked(DriveQuantity::Current),
                 ),
             ] {
                 let is_wanted = |index| wanted && index == object.index;
@@ -201,14 +207,18 @@ impl Start {
                 let _ = ids.try_push(id);
             }
         }
-        let file = Told::of_file(file);
+        let file = ScaleObjects::of_file(file);
         let initial = (
             if configured || listens {
                 stated
             } else {
-                Layout::default()
+                PdoMapping::default()
             },
-            if listens { file } else { Told::default() },
+            if listens {
+                file
+            } else {
+                ScaleObjects::default()
+            },
         );
         Ok(Self {
             configured,
@@ -217,13 +227,13 @@ impl Start {
             initial,
             ids,
             file,
-            told: Told::default(),
+            told: ScaleObjects::default(),
             options: options.clone(),
         })
     }
 
     /// What is known.
-    fn known(&self) -> Told {
+    fn known(&self) -> ScaleObjects {
         self.told.or(self.initial.1)
     }
 
@@ -234,19 +244,19 @@ impl Start {
         }
         let known = self.known();
         let unit = known.value(POSITION_UNIT);
-        match unit.map_or(Some(Unit::Positions(1.0)), Unit::of_code)? {
-            Unit::Radians(radians) => Some(radians),
-            Unit::Positions(counts) => Some(counts * TAU / known.counts_per_turn()?),
+        match unit.map_or(Some(StepUnit::Positions(1.0)), StepUnit::of_code)? {
+            StepUnit::Radians(radians) => Some(radians),
+            StepUnit::Positions(counts) => Some(counts * TAU / known.counts_per_turn()?),
         }
     }
 
     /// The unit of the velocity; `None`: one that is not known.
-    fn velocity(&self) -> Option<Unit> {
+    fn velocity(&self) -> Option<StepUnit> {
         if let Some(unit) = self.options.velocity_unit {
             return Some(unit.unit());
         }
         let told = self.known().value(VELOCITY_UNIT);
-        told.map_or(Some(Unit::Positions(1.0)), Unit::of_code)
+        told.map_or(Some(StepUnit::Positions(1.0)), StepUnit::of_code)
     }
 
     fn rated_torque(&self) -> Option<f64> {
@@ -286,7 +296,7 @@ impl Start {
     /// What is sent, and left out because its scale is not known.
     pub(super) fn lacks(&self) -> Option<Refusal> {
         let is_lacking = |object: &Object| match *object {
-            RATED_TORQUE => self.layout.has(Quantity::Torque) && self.rated_torque().is_none(),
+            RATED_TORQUE => self.layout.has(DriveQuantity::Torque) && self.rated_torque().is_none(),
             _ => self.scales_current() && self.rated_current().is_none(),
         };
         let lacking = [RATED_TORQUE, RATED_CURRENT].into_iter().find(is_lacking)?;
@@ -297,7 +307,8 @@ impl Start {
 
     /// Whether the current is sent in thousandths of the rated one.
     fn scales_current(&self) -> bool {
-        self.options.current_unit == CurrentUnit::PerMille && self.layout.has(Quantity::Current)
+        self.options.current_unit == CurrentUnit::PerMille
+            && self.layout.has(DriveQuantity::Current)
     }
 
     /// Whether what is told of `object` counts: no key states it.
@@ -319,10 +330,13 @@ impl Start {
         // What the drive, or its file, maps is left out then; what the keys ask for is needed.
         let is_needed = match object {
             COUNTS | TURNS => {
-                let unit = self.known().value(POSITION_UNIT).and_then(Unit::of_code);
-                !matches!(unit, Some(Unit::Radians(_)))
+                let unit = self
+                    .known()
+                    .value(POSITION_UNIT)
+                    .and_then(StepUnit::of_code);
+                !matches!(unit, Some(StepUnit::Radians(_)))
             }
-            RATED_TORQUE => self.configured && self.layout.has(Quantity::Torque),
+            RATED_TORQUE => self.configured && self.layout.has(DriveQuantity::Torque),
             RATED_CURRENT => self.configured && self.scales_current(),
             _ => false,
         };
@@ -333,9 +347,9 @@ impl Start {
     fn asks(&self, object: Object) -> bool {
         let is_of_use = match object {
             POSITION_UNIT => true,
-            VELOCITY_UNIT => self.layout.has(Quantity::Velocity),
+            VELOCITY_UNIT => self.layout.has(DriveQuantity::Velocity),
             VENDOR | MOST_SPEED => self.checks_torque(),
-            RATED_TORQUE => self.layout.has(Quantity::Torque),
+            RATED_TORQUE => self.layout.has(DriveQuantity::Torque),
             RATED_CURRENT => self.scales_current() || self.checks_torque(),
             _ => self.needs(object),
         };
@@ -344,19 +358,19 @@ impl Start {
 
     /// Whether the rated torque is the drive's own, in a unit that no key states.
     fn checks_torque(&self) -> bool {
-        self.layout.has(Quantity::Torque) && self.counts(VENDOR)
+        self.layout.has(DriveQuantity::Torque) && self.counts(VENDOR)
     }
 
     /// The object whose value can not be, if there is one.
     fn implausible(&self) -> Option<u16> {
         let known = self.known();
         let (has_velocity, units) = (
-            self.layout.has(Quantity::Velocity),
+            self.layout.has(DriveQuantity::Velocity),
             [POSITION_UNIT, VELOCITY_UNIT],
         );
         let unknown = |unit: &Object| {
             let code = known.value(*unit);
-            code.is_some_and(|code| Unit::of_code(code).is_none())
+            code.is_some_and(|code| StepUnit::of_code(code).is_none())
                 && self.counts(*unit)
                 && (*unit == POSITION_UNIT || has_velocity)
         };
@@ -413,12 +427,12 @@ impl Start {
     }
 }
 
-impl Plan for Start {
-    fn step(&self, at: usize) -> Option<Step> {
+impl StartPlan for DriveStart {
+    fn step(&self, at: usize) -> Option<ScriptStep> {
         #[allow(clippy::cast_possible_truncation)] // at most 4
         let part = |at: usize, of: usize| ((at / of) as u8, at % of);
         let object = match at {
-            0 => return self.sets.then_some(Step::Nmt(nmt::PRE_OPERATIONAL)),
+            0 => return self.sets.then_some(ScriptStep::Nmt(nmt::PRE_OPERATIONAL)),
             1 => Some(object::DEVICE_TYPE),
             MAPPING..SETUP => {
                 let (number, entry) = part(at - MAPPING, PER_PDO);
@@ -449,7 +463,7 @@ impl Plan for Start {
                 scale.filter(|scale| self.asks(*scale))
             }
         };
-        object.map(Step::Read)
+        object.map(ScriptStep::Read)
     }
 
     fn steps(&self) -> usize {
@@ -479,7 +493,7 @@ impl Plan for Start {
                 self.take_pdo(object, None);
                 Ok(())
             }
-            _ if Told::at(object).is_some() => self.take_scale(object, answer),
+            _ if ScaleObjects::at(object).is_some() => self.take_scale(object, answer),
             _ => Ok(()),
         }
     }
@@ -504,6 +518,6 @@ impl Plan for Start {
     fn begin(&mut self) {
         // It may be another drive, or set up anew.
         self.layout = self.initial.0.clone();
-        self.told = Told::default();
+        self.told = ScaleObjects::default();
     }
 }

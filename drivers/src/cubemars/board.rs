@@ -1,8 +1,9 @@
 //! The device's own side: a motor that sends its state as if it were commanded once a period.
 
 use super::frames::{DRIVE, ENCODER_ERROR, JOINT, Stage, quality_of};
-use super::options::{Checked, Effort, Options};
-use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use super::options::{CubemarsKeys, CubemarsOptions, Effort};
+use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board};
+use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading};
 
 /// The error that stands for any fault of the drive.
@@ -10,24 +11,21 @@ const OVER_CURRENT: u8 = 2;
 
 /// A simulated motor. It streams without commands.
 #[derive(Debug)]
-pub struct CubemarsBoard {
-    keys: Checked,
+struct CubemarsBoard {
+    keys: CubemarsKeys,
     stage: Stage,
 }
 
-impl CubemarsBoard {
+impl Simulate for CubemarsOptions {
     /// A motor at 25 degrees Celsius.
-    ///
-    /// # Errors
-    /// [`SpecError`]: a number above 254, a key out of range, ranges that are not known.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        Ok(Self {
-            keys: Checked::new(spec, options)?,
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(CubemarsBoard {
+            keys: CubemarsKeys::new(spec, self)?,
             stage: Stage {
                 celsius: 25.0,
                 error: 0,
             },
-        })
+        }))
     }
 }
 
@@ -58,9 +56,7 @@ impl Board for CubemarsBoard {
                 };
                 let effort = if effort.is_nan() { 0.0 } else { effort };
                 let values = [joint.position, joint.velocity, effort];
-                if values.iter().any(|value| !value.is_finite()) {
-                    return Err(EncodeError::NotFinite);
-                }
+                board::finite(&values)?;
                 let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
                 if quality_of(self.stage.error).0 != quality.0 & told.0 {
                     self.stage.error = if quality.contains(Quality::DEVICE_FAULT) {

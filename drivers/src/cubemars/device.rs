@@ -1,37 +1,26 @@
 //! The host's side: takes the replies or uploads of one motor, and watches that they come.
 
-use super::frames::{DRIVE, ENCODER_ERROR, JOINT, Layout, Stage, quality_of};
-use super::options::{Checked, Effort, Options};
+use super::frames::{DRIVE, ENCODER_ERROR, JOINT, PayloadLayout, Stage, quality_of};
+use super::options::{CubemarsKeys, CubemarsOptions, Effort};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Link, Supervised, temperature};
+use crate::family::{Family, Supervised, Supervision, temperature};
 use crate::held::OnChange;
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, bytes, mit};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
+};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, Reading};
+use alloc::vec::Vec;
+use proprio_topics::{Actuator, Counter, Kind, Reading};
 
 /// The host's side of a motor.
 #[derive(Debug)]
-pub(super) struct Motor {
-    keys: Checked,
+pub(super) struct CubemarsMotor {
+    keys: CubemarsKeys,
     /// The error of the power stage.
     told: OnChange<u8>,
 }
 
-impl Motor {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, options)?;
-        let claim = match keys.layout {
-            Layout::Mit { .. } => Claim::shared(keys.id),
-            Layout::Servo => Claim::exclusive(keys.id),
-        };
-        let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, keys.id);
-        let this = Self {
-            keys,
-            told: OnChange::NOTHING,
-        };
-        Ok(Supervised::boxed([claim], bringup, NoInquiry, this))
-    }
-
+impl CubemarsMotor {
     /// Tells the state of the power stage if its error is new, and now and then.
     fn stage(&mut self, stage: Stage, frame: &Frame, out: &mut Decoded) {
         if !self.told.is_due(stage.error, frame) {
@@ -49,15 +38,38 @@ impl Motor {
     }
 }
 
-impl Family for Motor {
+impl Driver for CubemarsOptions {
+    const NAME: &'static str = "cubemars";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let drive = OutputInfo::temperature(DRIVE, "drive");
+        [OutputInfo::new(JOINT, Kind::Joint), drive].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let keys = CubemarsKeys::new(spec, self)?;
+        let claim = match keys.layout {
+            PayloadLayout::Mit { .. } => Claim::shared(keys.id),
+            PayloadLayout::Servo => Claim::exclusive(keys.id),
+        };
+        let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, keys.id);
+        let this = CubemarsMotor {
+            keys,
+            told: OnChange::NOTHING,
+        };
+        Ok(Supervised::boxed([claim], bringup, NoInquiry, this))
+    }
+}
+
+impl Family for CubemarsMotor {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         if frame.id != self.keys.id {
             return;
         }
         // Replies of other motors, and commands, are none of this motor's.
-        let others = matches!(self.keys.layout, Layout::Mit { .. })
+        let others = matches!(self.keys.layout, PayloadLayout::Mit { .. })
             && frame.data().first() != Some(&self.keys.number);
         if others {
             return;

@@ -30,7 +30,7 @@ pub(super) struct Stage {
 
 /// Where the values of a measurement are in a frame.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Layout {
+pub(super) enum PayloadLayout {
     Mit {
         /// The temperature that byte 0 means \[degrees Celsius\].
         celsius_at_zero: f64,
@@ -38,7 +38,7 @@ pub(super) enum Layout {
     Servo,
 }
 
-impl Layout {
+impl PayloadLayout {
     /// The raw values of a payload, and the state of the power stage if it is there; `None`: a
     /// wrong length.
     pub(super) fn unpack(self, data: &[u8]) -> Option<([i64; 3], Option<Stage>)> {

@@ -1,6 +1,6 @@
 //! The keys of a motor in gateway.toml, for both sides of the driver.
 
-use super::frames::{Layout, SERVO_STATUS};
+use super::frames::{PayloadLayout, SERVO_STATUS};
 use crate::keys::{above_zero, address, duration, known};
 use crate::mit::Scale;
 use crate::{Id, Spec, SpecError};
@@ -12,7 +12,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum Mode {
+pub enum CubemarsMode {
     /// MIT mode.
     #[default]
     Mit,
@@ -48,7 +48,7 @@ pub enum Angle {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[allow(missing_docs)] // the names say it
-pub enum Model {
+pub enum CubemarsModel {
     #[serde(rename = "AK10-9")]
     Ak10_9,
     #[serde(rename = "AK60-6")]
@@ -65,7 +65,7 @@ pub enum Model {
     Ak80_64,
 }
 
-impl Model {
+impl CubemarsModel {
     /// Ends of the ranges of velocity \[rad/s\] and torque \[Nm\], pole pairs, gear ratio.
     const fn numbers(self) -> (f64, f64, u32, f64) {
         match self {
@@ -84,11 +84,11 @@ impl Model {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct CubemarsOptions {
     /// The motor's mode; default MIT.
-    pub mode: Mode,
+    pub mode: CubemarsMode,
     /// Its model, for the defaults of other keys.
-    pub model: Option<Model>,
+    pub model: Option<CubemarsModel>,
     /// Identifier of the replies in MIT mode, 0 to 2047; default 0.
     pub host_id: u16,
     /// End of the range of positions in MIT mode \[rad\]; default 12.5.
@@ -113,10 +113,10 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for CubemarsOptions {
     fn default() -> Self {
         Self {
-            mode: Mode::Mit,
+            mode: CubemarsMode::Mit,
             model: None,
             host_id: 0,
             position_max: 12.5,
@@ -144,11 +144,11 @@ const AMPERE_PER_STEP: f64 = 0.01;
 
 /// The keys of a motor, checked.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Checked {
+pub(super) struct CubemarsKeys {
     pub(super) number: u8,
     /// Of the frames with its measurement.
     pub(super) id: Id,
-    pub(super) layout: Layout,
+    pub(super) layout: PayloadLayout,
     /// Position \[rad\], velocity \[rad/s\], effort \[Nm or A\].
     pub(super) scales: [Scale; 3],
     pub(super) effort: Effort,
@@ -156,8 +156,8 @@ pub(super) struct Checked {
     pub(super) period: Nanos,
 }
 
-impl Checked {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+impl CubemarsKeys {
+    pub(super) fn new(spec: &Spec, options: &CubemarsOptions) -> Result<Self, SpecError> {
         let number = address(spec, 0..=NUMBER_MOST)? as u8;
         let wrong = |key, value, expected| SpecError::Key {
             key,
@@ -175,9 +175,9 @@ impl Checked {
         let torque_constant = (options.torque_constant)
             .map(|constant| above_zero("torque_constant", constant))
             .transpose()?;
-        let model = options.model.map(Model::numbers);
+        let model = options.model.map(CubemarsModel::numbers);
         let (id, layout, scales, effort) = match options.mode {
-            Mode::Mit => {
+            CubemarsMode::Mit => {
                 let position = above_zero("position_max", options.position_max)?;
                 let of_model = model.map(|(velocity, ..)| velocity);
                 let velocity = known("velocity_max", options.velocity_max, of_model)?;
@@ -190,13 +190,13 @@ impl Checked {
                     Scale::range(velocity, 12),
                     Scale::range(effort, 12),
                 ];
-                let layout = Layout::Mit {
+                let layout = PayloadLayout::Mit {
                     celsius_at_zero: options.celsius_at_zero,
                 };
                 let id = Id::standard(options.host_id);
                 (id, layout, scales, options.effort)
             }
-            Mode::Servo => {
+            CubemarsMode::Servo => {
                 let of_model = model.map(|(_, _, pairs, _)| f64::from(pairs));
                 let pairs = known("pole_pairs", options.pole_pairs.map(f64::from), of_model)?;
                 let of_model = model.map(|(.., ratio)| ratio);
@@ -211,7 +211,7 @@ impl Checked {
                     Scale::steps(AMPERE_PER_STEP, 6000),
                 ];
                 let id = Id::extended(SERVO_STATUS | u32::from(number));
-                (id, Layout::Servo, scales, Effort::Current)
+                (id, PayloadLayout::Servo, scales, Effort::Current)
             }
         };
         Ok(Self {

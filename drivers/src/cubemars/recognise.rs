@@ -1,9 +1,9 @@
 //! Recognising motors: by their uploads in servo mode, or by their replies in MIT mode.
 
 use super::frames::SERVO_STATUS;
-use super::options::Options;
-use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
-use crate::{Driver, Frame, Id};
+use super::options::CubemarsOptions;
+use crate::recognise::{Evidence, Finding, IdUse, Key, Stream, Traffic};
+use crate::{Driver, Frame, Id, Recognise};
 use alloc::vec::Vec;
 
 /// Errors, and that there is none.
@@ -16,15 +16,16 @@ fn has_error(byte: Option<&u8>) -> bool {
     byte.is_some_and(|error| usize::from(*error) < ERRORS)
 }
 
-/// The motors that `seen` shows.
-pub(super) fn motors(seen: &Traffic) -> Vec<Finding> {
-    let servo = (0..=0xFE_u8).filter_map(|number| servo(seen, number));
-    let mit = seen.streams().flat_map(|stream| mit(seen, stream));
-    servo.chain(mit).collect()
+impl Recognise for CubemarsOptions {
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let servo = (0..=0xFE_u8).filter_map(|number| servo(seen, number));
+        let mit = seen.streams().flat_map(|stream| mit(seen, stream));
+        servo.chain(mit).collect()
+    }
 }
 
 fn finding(evidence: Evidence<'_>, number: u8, what: &str, mode: &str) -> Option<Finding> {
-    let finding = evidence.finding(Options::NAME, number.into(), what)?;
+    let finding = evidence.finding(CubemarsOptions::NAME, number.into(), what)?;
     let mode = Key::new("mode", mode);
     let model = Key::fill_in("model", "\"AK80-9\"", "its ranges depend on it");
     Some(finding.with_keys([mode, model]).with_joints([0]))
@@ -130,7 +131,7 @@ fn on_zero(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
         if few && numbers.len() > 1 {
             evidence.add(-3.0);
         }
-        evidence.sends_as(Part::Sends(Some(*number)), stream.id, |frame| {
+        evidence.sends_as(IdUse::Sends(Some(*number)), stream.id, |frame| {
             let first = frame.data().first();
             first.is_some_and(|first| (!few || numbers.contains(first)) && is_reply(frame, *first))
         })?;

@@ -2,12 +2,13 @@
 //! commanded once a period.
 
 use super::frames::{
-    DISABLED, ENABLED, FET, JOINT, MOTOR, OVERLOAD, QUESTIONS, RANGES, READ, SENSOR, STATE, State,
-    frame, quality_of,
+    DISABLED, DamiaoState, ENABLED, FET, JOINT, MOTOR, OVERLOAD, QUESTIONS, RANGES, READ, SENSOR,
+    STATE, frame, quality_of,
 };
-use super::options::{Checked, Options};
+use super::options::{DamiaoKeys, DamiaoOptions};
 use crate::mit::{self, Scale};
-use crate::{Board, EncodeError, Format, Frame, Frames, Spec, SpecError};
+use crate::{Board, EncodeError, Format, Frame, Frames, Simulate, Spec, SpecError, board};
+use alloc::boxed::Box;
 use proprio_topics::{JointState, Nanos, Quality, Reading};
 
 /// The ranges of a motor that neither keys nor a model describe: those of a DM4310.
@@ -15,45 +16,15 @@ const RANGES_USUAL: [f64; 3] = [12.5, 30.0, 10.0];
 
 /// A simulated motor.
 #[derive(Debug)]
-pub struct DamiaoBoard {
-    keys: Checked,
+struct DamiaoBoard {
+    keys: DamiaoKeys,
     /// The ends of its ranges, and their scales.
     ends: [f64; 3],
     scales: [Scale; 3],
-    state: State,
+    state: DamiaoState,
 }
 
 impl DamiaoBoard {
-    /// An enabled motor at 25 degrees Celsius.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 255, a key out of range, ranges that are not known.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        let keys = Checked::new(spec, options)?;
-        let mut ends = RANGES_USUAL;
-        let known = keys.stated.iter().zip(&keys.of_model);
-        for (end, (stated, model)) in ends.iter_mut().zip(known) {
-            *end = stated.or(*model).unwrap_or(*end);
-        }
-        let [position, velocity, torque] = ends;
-        let scales = [
-            Scale::range(position, 16),
-            Scale::range(velocity, 12),
-            Scale::range(torque, 12),
-        ];
-        let state = State {
-            state: ENABLED,
-            raw: scales.map(|scale| scale.raw(0.0)),
-            celsius: [25; 2],
-        };
-        Ok(Self {
-            keys,
-            ends,
-            scales,
-            state,
-        })
-    }
-
     fn frame(&self) -> Frame {
         let data = self.state.pack(self.keys.address);
         frame(self.keys.id, self.keys.fd, data)
@@ -96,9 +67,7 @@ impl DamiaoBoard {
                 };
             }
             (MOTOR | FET, Reading::Temperature(temperature)) => {
-                if !temperature.celsius.is_finite() {
-                    return Err(EncodeError::NotFinite);
-                }
+                board::finite(&[temperature.celsius])?;
                 let [fet, rotor] = &mut self.state.celsius;
                 let place = if output == MOTOR { rotor } else { fet };
                 *place = libm::round(temperature.celsius) as u8;
@@ -107,6 +76,35 @@ impl DamiaoBoard {
             _ => return Err(EncodeError::Output(output)),
         }
         Ok(false)
+    }
+}
+
+impl Simulate for DamiaoOptions {
+    /// An enabled motor at 25 degrees Celsius.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        let keys = DamiaoKeys::new(spec, self)?;
+        let mut ends = RANGES_USUAL;
+        let known = keys.stated.iter().zip(&keys.of_model);
+        for (end, (stated, model)) in ends.iter_mut().zip(known) {
+            *end = stated.or(*model).unwrap_or(*end);
+        }
+        let [position, velocity, torque] = ends;
+        let scales = [
+            Scale::range(position, 16),
+            Scale::range(velocity, 12),
+            Scale::range(torque, 12),
+        ];
+        let state = DamiaoState {
+            state: ENABLED,
+            raw: scales.map(|scale| scale.raw(0.0)),
+            celsius: [25; 2],
+        };
+        Ok(Box::new(DamiaoBoard {
+            keys,
+            ends,
+            scales,
+            state,
+        }))
     }
 }
 

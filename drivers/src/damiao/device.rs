@@ -1,45 +1,37 @@
 //! The host's side: takes the frames of one motor, and asks for them if it is told to.
 
 use super::frames::{
-    ENABLED, FET, JOINT, MOTOR, Message, SENSOR, STATE, State, quality_of, question,
+    DamiaoMessage, DamiaoState, ENABLED, FET, JOINT, MOTOR, SENSOR, STATE, quality_of, question,
 };
-use super::options::{Checked, Options};
+use super::options::{DamiaoKeys, DamiaoOptions};
 use super::ranges::Ranges;
 use crate::bringup::{Bringup, Timing};
-use crate::family::{Family, Link, Rounds, Supervised, temperature};
+use crate::family::{Family, Rounds, Supervised, Supervision, temperature};
 use crate::held::OnChange;
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, bytes, mit};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
+};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, Nanos, Quality, Reading};
+use alloc::vec::Vec;
+use proprio_topics::{Actuator, Counter, Kind, Nanos, Quality, Reading};
 
 /// The host's side of a motor.
 #[derive(Debug)]
-pub(super) struct Motor {
-    keys: Checked,
+pub(super) struct DamiaoMotor {
+    keys: DamiaoKeys,
     /// The motor's state.
     told: OnChange<u8>,
     questions: Rounds,
 }
 
-impl Motor {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, options)?;
-        let (mode, timing) = match keys.request_period {
-            Some(_) => (spec.mode, Timing::POLLED),
-            None => (Mode::Listen, Timing::LISTENED),
-        };
-        let bringup = Bringup::new(spec, mode, timing, keys.id);
-        let this = Self {
-            keys,
-            told: OnChange::NOTHING,
-            questions: Rounds::new(keys.request_period),
-        };
-        let claims = [Claim::shared(keys.id)];
-        let ranges = Ranges::new(keys, mode);
-        Ok(Supervised::boxed(claims, bringup, ranges, this))
-    }
-
-    fn state(&mut self, told: &State, frame: &Frame, link: &mut Link<Ranges>, out: &mut Decoded) {
+impl DamiaoMotor {
+    fn state(
+        &mut self,
+        told: &DamiaoState,
+        frame: &Frame,
+        link: &mut Supervision<Ranges>,
+        out: &mut Decoded,
+    ) {
         let Some(scales) = link.questions.scales() else {
             return out.fault(Counter::Unexpected, 1, frame.id);
         };
@@ -63,10 +55,41 @@ impl Motor {
     }
 }
 
-impl Family for Motor {
+impl Driver for DamiaoOptions {
+    const NAME: &'static str = "damiao";
+
+    fn needs_fd(&self) -> bool {
+        self.fd
+    }
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let temperature = OutputInfo::temperature;
+        let joint = OutputInfo::new(JOINT, Kind::Joint);
+        [joint, temperature(MOTOR, "motor"), temperature(FET, "fet")].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let keys = DamiaoKeys::new(spec, self)?;
+        let (mode, timing) = match keys.request_period {
+            Some(_) => (spec.mode, Timing::POLLED),
+            None => (Mode::Listen, Timing::LISTENED),
+        };
+        let bringup = Bringup::new(spec, mode, timing, keys.id);
+        let this = DamiaoMotor {
+            keys,
+            told: OnChange::NOTHING,
+            questions: Rounds::new(keys.request_period),
+        };
+        let claims = [Claim::shared(keys.id)];
+        let ranges = Ranges::new(keys, mode);
+        Ok(Supervised::boxed(claims, bringup, ranges, this))
+    }
+}
+
+impl Family for DamiaoMotor {
     type Questions = Ranges;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Ranges>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<Ranges>, out: &mut Decoded) {
         if frame.id != self.keys.id {
             return;
         }
@@ -76,13 +99,13 @@ impl Family for Motor {
         if data.len() != 8 {
             return out.fault(Counter::Length, 1, frame.id);
         }
-        match Message::parse(self.keys.address, data) {
-            Some(Message::State(state)) => self.state(&state, frame, link, out),
-            Some(Message::Register(register, value)) => {
+        match DamiaoMessage::parse(self.keys.address, data) {
+            Some(DamiaoMessage::State(state)) => self.state(&state, frame, link, out),
+            Some(DamiaoMessage::Register(register, value)) => {
                 link.questions.answer(register, value, frame, out);
             }
             // Answers to other programs, and frames of other motors.
-            Some(Message::Other) | None => {}
+            Some(DamiaoMessage::Other) | None => {}
         }
     }
 
@@ -93,7 +116,7 @@ impl Family for Motor {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Link<Ranges>,
+        _link: &mut Supervision<Ranges>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         let command = self.questions.ask(&[STATE], now)?;

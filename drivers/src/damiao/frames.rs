@@ -50,8 +50,8 @@ pub(super) fn question(address: u8, fd: bool, command: u8, register: u8) -> Fram
 
 /// What a motor sends.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Message {
-    State(State),
+pub(super) enum DamiaoMessage {
+    State(DamiaoState),
     /// The value of a register, or of one that was written.
     Register(u8, f32),
     /// The answer to another request.
@@ -60,7 +60,7 @@ pub(super) enum Message {
 
 /// A motor's state.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct State {
+pub(super) struct DamiaoState {
     pub(super) state: u8,
     /// Position, velocity, torque.
     pub(super) raw: [i64; 3],
@@ -68,7 +68,7 @@ pub(super) struct State {
     pub(super) celsius: [u8; 2],
 }
 
-impl Message {
+impl DamiaoMessage {
     /// What a payload of 8 bytes tells of motor `address`; `None`: it is another motor's.
     pub(super) fn parse(address: u8, data: &[u8]) -> Option<Self> {
         let (&first, rest) = data.split_first()?;
@@ -86,7 +86,7 @@ impl Message {
         let (raw, &[fet, rotor]) = mit::unpack(rest)? else {
             return None;
         };
-        Some(Self::State(State {
+        Some(Self::State(DamiaoState {
             state: first >> 4,
             raw,
             celsius: [fet, rotor],
@@ -94,7 +94,7 @@ impl Message {
     }
 }
 
-impl State {
+impl DamiaoState {
     pub(super) fn pack(&self, address: u8) -> [u8; 8] {
         let [p0, p1, v0, both, e1] = mit::pack(self.raw);
         let [fet, rotor] = self.celsius;

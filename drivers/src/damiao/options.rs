@@ -10,7 +10,7 @@ use serde::Deserialize;
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[allow(missing_docs)] // the names say it
 #[allow(non_camel_case_types)]
-pub enum Model {
+pub enum DamiaoModel {
     DM4310,
     DM4310_48V,
     DM4340,
@@ -25,7 +25,7 @@ pub enum Model {
     DMG6220,
 }
 
-impl Model {
+impl DamiaoModel {
     /// Ends of the ranges of position \[rad\], velocity \[rad/s\] and torque \[Nm\].
     const fn ranges(self) -> [f64; 3] {
         let (velocity, torque) = match self {
@@ -49,9 +49,9 @@ impl Model {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct DamiaoOptions {
     /// Its model, for ranges that neither a key nor the motor tells.
-    pub model: Option<Model>,
+    pub model: Option<DamiaoModel>,
     /// Identifier of its frames, 0 to 0x7FE; default 0.
     pub host_id: u16,
     /// End of the range of positions \[rad\].
@@ -68,7 +68,7 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for DamiaoOptions {
     fn default() -> Self {
         Self {
             model: None,
@@ -85,7 +85,7 @@ impl Default for Options {
 
 /// The keys of a motor, checked.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Checked {
+pub(super) struct DamiaoKeys {
     pub(super) address: u8,
     /// Of the motor's frames.
     pub(super) id: Id,
@@ -97,8 +97,8 @@ pub(super) struct Checked {
     pub(super) period: Nanos,
 }
 
-impl Checked {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+impl DamiaoKeys {
+    pub(super) fn new(spec: &Spec, options: &DamiaoOptions) -> Result<Self, SpecError> {
         let [address, _] = address(spec, 1..=0xFF)?.to_le_bytes();
         if options.host_id > 0x7FE || options.host_id == u16::from(address) {
             return Err(SpecError::Key {

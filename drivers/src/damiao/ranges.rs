@@ -1,7 +1,7 @@
 //! The ends of a motor's ranges: of the keys, as the motor tells them, or of its model.
 
 use super::frames::{RANGES, READ, question};
-use super::options::Checked;
+use super::options::DamiaoKeys;
 use crate::bringup::{Ask, Attempts, Inquiry, Timing};
 use crate::mit::Scale;
 use crate::{Decoded, Frame, Mode, NotSent};
@@ -10,7 +10,7 @@ use proprio_topics::{Counter, Nanos, Refusal};
 /// Asks a motor for the ranges that no key states.
 #[derive(Debug)]
 pub(super) struct Ranges {
-    keys: Checked,
+    keys: DamiaoKeys,
     mode: Mode,
     /// As the motor has told them.
     told: [Option<f64>; 3],
@@ -20,7 +20,7 @@ pub(super) struct Ranges {
 }
 
 impl Ranges {
-    pub(super) const fn new(keys: Checked, mode: Mode) -> Self {
+    pub(super) const fn new(keys: DamiaoKeys, mode: Mode) -> Self {
         Self {
             keys,
             mode,

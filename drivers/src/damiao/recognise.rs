@@ -1,9 +1,9 @@
 //! Recognising motors by the frames with which they answer commands and questions.
 
-use super::frames::{Message, QUESTIONS, RANGES, READ, STATE, State, question};
-use super::options::Options;
-use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
-use crate::{Driver, Frame, Id};
+use super::frames::{DamiaoMessage, DamiaoState, QUESTIONS, RANGES, READ, STATE, question};
+use super::options::DamiaoOptions;
+use crate::recognise::{Evidence, Finding, IdUse, Key, Stream, Traffic};
+use crate::{Driver, Frame, Id, Recognise};
 use alloc::vec::Vec;
 
 /// How many motors a scan asks: people number them from 1 on.
@@ -23,16 +23,16 @@ const TELLS: f64 = 16.0;
 const ASKS: f64 = 6.0;
 
 /// What `frame` tells of the motor at `address`, if it may be its frame.
-fn message(frame: &Frame, address: u8) -> Option<Message> {
+fn message(frame: &Frame, address: u8) -> Option<DamiaoMessage> {
     let data = (frame.len() == 8).then(|| frame.data())?;
-    Message::parse(address, data).filter(|message| match message {
-        Message::State(State { state, celsius, .. }) => {
+    DamiaoMessage::parse(address, data).filter(|message| match message {
+        DamiaoMessage::State(DamiaoState { state, celsius, .. }) => {
             let is_known = matches!(state, 0 | 1 | 5 | 6 | 8..=0xE);
             let [fet, rotor] = celsius;
             let are_usual = CELSIUS.contains(fet) && CELSIUS.contains(rotor);
             is_known && are_usual && fet.abs_diff(*rotor) <= APART
         }
-        Message::Register(..) | Message::Other => true,
+        DamiaoMessage::Register(..) | DamiaoMessage::Other => true,
     })
 }
 
@@ -40,19 +40,33 @@ fn message(frame: &Frame, address: u8) -> Option<Message> {
 /// those with the identifiers that most motors have.
 const MOTORS: usize = 32;
 
-/// The motors that `seen` shows.
-pub(super) fn motors(seen: &Traffic) -> Vec<Finding> {
-    let form = |frame: &Frame| {
-        let half = frame.data().first().map(|first| first & 0xF);
-        half.is_some_and(|half| message(frame, half).is_some())
-    };
-    let has_form = |stream: &&Stream| stream.frames > 0 && stream.recent().rev().take(4).all(form);
-    let mut streams: Vec<&Stream> = seen.streams().filter(has_form).collect();
-    if streams.len() > MOTORS {
-        streams.retain(|stream| stream.id.raw() < 0x20);
+impl Recognise for DamiaoOptions {
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let form = |frame: &Frame| {
+            let half = frame.data().first().map(|first| first & 0xF);
+            half.is_some_and(|half| message(frame, half).is_some())
+        };
+        let has_form =
+            |stream: &&Stream| stream.frames > 0 && stream.recent().rev().take(4).all(form);
+        let mut streams: Vec<&Stream> = seen.streams().filter(has_form).collect();
+        if streams.len() > MOTORS {
+            streams.retain(|stream| stream.id.raw() < 0x20);
+        }
+        let on = |stream: &Stream| on(seen, stream);
+        streams.into_iter().flat_map(on).collect()
     }
-    let on = |stream: &Stream| on(seen, stream);
-    streams.into_iter().flat_map(on).collect()
+
+    /// The state and a range of the first motors.
+    fn questions(_seen: &Traffic) -> Vec<Frame> {
+        let [range, ..] = RANGES;
+        let asked = |address| {
+            [
+                question(address, false, STATE, 0),
+                question(address, false, READ, range),
+            ]
+        };
+        (1..=ASKED).flat_map(asked).collect()
+    }
 }
 
 /// The motors that answer on the identifier of `stream`.
@@ -107,14 +121,14 @@ fn motor(
     if halves.len() > 1 {
         evidence.add(-3.0);
     }
-    evidence.sends_as(Part::Sends(shared), stream.id, |frame| {
+    evidence.sends_as(IdUse::Sends(shared), stream.id, |frame| {
         let own = frame.data().first().map(|first| first & 0xF);
         own.is_some_and(|own| halves.contains(&own) && message(frame, own).is_some())
     })?;
     let is_its =
         |frame: &Frame| frame.data().first().map(|first| first & 0xF) == Some(address & 0xF);
     let has_told = |frame: &Frame| match message(frame, address) {
-        Some(Message::Register(register, value)) => {
+        Some(DamiaoMessage::Register(register, value)) => {
             RANGES.contains(&register) && ENDS.contains(&value)
         }
         _ => false,
@@ -124,7 +138,7 @@ fn motor(
     }
     evidence.measures(stream);
     evidence.moves(stream, |frame| match message(frame, address) {
-        Some(Message::State(State {
+        Some(DamiaoMessage::State(DamiaoState {
             raw: [position, velocity, _],
             ..
         })) if is_its(frame) => Some((position as f64, velocity as f64 - 2047.5)),
@@ -143,7 +157,7 @@ fn motor(
     for base in [0x100, 0x200, 0x300] {
         evidence.belongs(Id::standard(base + u16::from(address)));
     }
-    let finding = evidence.finding(Options::NAME, address.into(), "Damiao motor")?;
+    let finding = evidence.finding(DamiaoOptions::NAME, address.into(), "Damiao motor")?;
     let model = Key::fill_in("model", "\"DM4310\"", "its ranges depend on it");
     let host = (host != 0).then(|| Key::new("host_id", host));
     let period = Key::period_ms(stream.period_of(is_its), 1, 60_000);
@@ -155,16 +169,4 @@ fn motor(
             .with_joints([0])
             .with_commands([command..=command]),
     )
-}
-
-/// The state and a range of the first motors.
-pub(super) fn questions() -> Vec<Frame> {
-    let [range, ..] = RANGES;
-    let asked = |address| {
-        [
-            question(address, false, STATE, 0),
-            question(address, false, READ, range),
-        ]
-    };
-    (1..=ASKED).flat_map(asked).collect()
 }

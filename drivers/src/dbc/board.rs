@@ -1,15 +1,16 @@
 //! The device's own side: sends its readings in the frames that the file describes, from power-on.
 
-use super::layout::{Layout, Part, Role, implies, shared};
-use super::options::Options;
-use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use super::layout::{DbcLayout, SignalGroup, SignalRole, implies, shared};
+use super::options::DbcOptions;
+use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError};
+use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Nanos, Quality, Reading};
 
 /// A simulated device that a .dbc file describes. Signals that the keys do not name are zero.
 #[derive(Debug)]
-pub struct DbcBoard {
-    layout: Layout,
+struct DbcBoard {
+    layout: DbcLayout,
     period: Nanos,
     frames: Vec<Pending>,
     /// The messages of each reading, in the order that they are sent in.
@@ -22,21 +23,17 @@ pub struct DbcBoard {
 #[derive(Debug)]
 struct Pending {
     message: usize,
-    parts: Vec<Part>,
+    parts: Vec<SignalGroup>,
     data: [u8; 64],
     /// The parts whose values are new, one bit each.
     fresh: u128,
 }
 
-impl DbcBoard {
+impl Simulate for DbcOptions {
     /// A device after power-on.
-    ///
-    /// # Errors
-    /// [`SpecError::Description`]: keys and file do not fit each other; [`SpecError::Key`] for a
-    /// period outside 1 to 60000 ms.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        let layout = Layout::new(spec, options)?;
-        let period_ms = options.period_ms.unwrap_or(10);
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        let layout = DbcLayout::new(spec, self)?;
+        let period_ms = self.period_ms.unwrap_or(10);
         if !(1..=60_000).contains(&period_ms) {
             return Err(SpecError::Key {
                 key: "period_ms",
@@ -52,7 +49,7 @@ impl DbcBoard {
                     let raw = condition.ranges.first().map_or(0, |range| range.0);
                     condition.bits.set(raw, &mut data);
                 }
-                let has = |part: &&Part| implies(&conditions, &part.conditions);
+                let has = |part: &&SignalGroup| implies(&conditions, &part.conditions);
                 frames.push(Pending {
                     message,
                     parts: layout.parts.iter().filter(has).cloned().collect(),
@@ -62,7 +59,7 @@ impl DbcBoard {
             }
         }
         let readings = 0..layout.readings.len();
-        Ok(Self {
+        Ok(Box::new(DbcBoard {
             orders: readings
                 .clone()
                 .map(|reading| layout.order(reading))
@@ -71,7 +68,7 @@ impl DbcBoard {
             layout,
             period: Nanos::from_millis(i64::from(period_ms)),
             frames,
-        })
+        }))
     }
 }
 
@@ -131,9 +128,9 @@ impl Board for DbcBoard {
                     for field in &part.fields {
                         let length = field.bits.length();
                         let raw = match field.role {
-                            Role::Counter => count,
-                            Role::Fault => u64::from(quality.contains(Quality::DEVICE_FAULT)),
-                            Role::Value {
+                            SignalRole::Counter => count,
+                            SignalRole::Fault => u64::from(quality.contains(Quality::DEVICE_FAULT)),
+                            SignalRole::Value {
                                 index,
                                 gain,
                                 offset,

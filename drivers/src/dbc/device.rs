@@ -1,12 +1,16 @@
 //! The host's side: collects the values of each reading out of the frames, and watches that they
 //! come.
 
-use super::layout::{Field, Layout, Part, ReadingLayout, Role};
-use super::options::Options;
+use super::layout::{DbcLayout, ReadingLayout, SignalGroup, SignalRole, UsedSignal};
+use super::options::{DbcOptions, ReadingKeys};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::pairing::within;
-use crate::{Claim, Decoded, Device, Format, Frame, Id, Mode, Output, Spec, SpecError};
+use crate::signal::Message;
+use crate::{
+    Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, Output, OutputInfo, Spec, SpecError,
+};
+use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::reading::VALUES;
@@ -30,7 +34,7 @@ const TIMING: Timing = Timing {
 /// The host's side of a device that a .dbc file describes.
 #[derive(Debug)]
 pub(super) struct DbcDevice {
-    layout: Layout,
+    layout: DbcLayout,
     readings: Vec<Assembly>,
 }
 
@@ -61,38 +65,6 @@ struct Assembly {
     last_count: Option<u64>,
     /// The largest count.
     most: u64,
-}
-
-impl DbcDevice {
-    /// A device in its initial state.
-    ///
-    /// # Errors
-    /// [`SpecError::Description`]: keys and file do not fit each other.
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let layout = Layout::new(spec, options)?;
-        let claims: Vec<Claim> = layout.messages.iter().map(|m| m.frames).collect();
-        let watched = (layout.order(0).first())
-            .and_then(|number| layout.messages.get(*number))
-            .map_or(Id::standard(0), |message| message.frames.id);
-        let readings = layout.readings.iter().enumerate();
-        let readings = readings.map(|(number, reading)| {
-            let parts = layout.messages.iter().flat_map(|message| &message.parts);
-            let fields = parts
-                .filter(|part| part.reading == number)
-                .flat_map(|part| &part.fields);
-            let counter = fields.filter(|field| field.role == Role::Counter);
-            let most = counter
-                .map(|field| u64::MAX >> (64 - field.bits.length()))
-                .max();
-            Assembly::new(reading, most.unwrap_or(0))
-        });
-        let bringup = Bringup::new(spec, Mode::Listen, TIMING, watched);
-        let this = Self {
-            readings: readings.collect(),
-            layout,
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
 }
 
 impl Assembly {
@@ -134,7 +106,13 @@ impl Assembly {
     }
 
     /// Takes the values of a frame. True if the reading is complete.
-    fn take(&mut self, part: &Part, sender: Option<u8>, frame: &Frame, out: &mut Decoded) -> bool {
+    fn take(
+        &mut self,
+        part: &SignalGroup,
+        sender: Option<u8>,
+        frame: &Frame,
+        out: &mut Decoded,
+    ) -> bool {
         let begun = (self.t, self.stamp);
         let in_time = within(begun, (frame.t, frame.stamp), self.layout.limit);
         if self.have != 0 && in_time && sender.zip(self.sender).is_some_and(|(a, b)| a != b) {
@@ -146,15 +124,15 @@ impl Assembly {
         // The values that have come, and those that ride along, one bit each.
         let (mut come, mut along): (u16, u16) = (0, 0);
         for field in &part.fields {
-            let Field { bits, raw, .. } = *field;
+            let UsedSignal { bits, raw, .. } = *field;
             let Some(found) = bits.of(frame.data()) else {
                 continue;
             };
             let is_none = field.is_none(found);
             match field.role {
-                Role::Counter => self.count = Some(found),
-                Role::Fault => self.fault = found != 0 && !is_none,
-                Role::Value {
+                SignalRole::Counter => self.count = Some(found),
+                SignalRole::Fault => self.fault = found != 0 && !is_none,
+                SignalRole::Value {
                     index,
                     gain,
                     offset,
@@ -284,10 +262,62 @@ impl Assembly {
     }
 }
 
+impl Driver for DbcOptions {
+    const NAME: &'static str = "dbc";
+    const ADDRESS: Option<u32> = Some(0);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let info = |(number, reading): (u8, &ReadingKeys)| OutputInfo {
+            number,
+            kind: reading.kind,
+            suffix: Cow::Owned(reading.name.clone()),
+        };
+        (0..).zip(&self.reading).map(info).collect()
+    }
+
+    fn states_period(&self) -> bool {
+        self.period_ms.is_some()
+    }
+
+    fn description(&self) -> Option<&str> {
+        Some(&self.file)
+    }
+
+    fn describe(&mut self, messages: Vec<Message>) {
+        self.messages = messages;
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let layout = DbcLayout::new(spec, self)?;
+        let claims: Vec<Claim> = layout.messages.iter().map(|m| m.frames).collect();
+        let watched = (layout.order(0).first())
+            .and_then(|number| layout.messages.get(*number))
+            .map_or(Id::standard(0), |message| message.frames.id);
+        let readings = layout.readings.iter().enumerate();
+        let readings = readings.map(|(number, reading)| {
+            let parts = layout.messages.iter().flat_map(|message| &message.parts);
+            let fields = parts
+                .filter(|part| part.reading == number)
+                .flat_map(|part| &part.fields);
+            let counter = fields.filter(|field| field.role == SignalRole::Counter);
+            let most = counter
+                .map(|field| u64::MAX >> (64 - field.bits.length()))
+                .max();
+            Assembly::new(reading, most.unwrap_or(0))
+        });
+        let bringup = Bringup::new(spec, Mode::Listen, TIMING, watched);
+        let this = DbcDevice {
+            readings: readings.collect(),
+            layout,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+}
+
 impl Family for DbcDevice {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         // Who asks for a frame of the device says nothing of it.
         if matches!(frame.format, Format::Error | Format::Remote) {
             return;

@@ -1,7 +1,7 @@
 //! The table that decoding and encoding follow: per message, which of its bits are which value of
 //! which reading. Made from the keys and the file at start; every mistake in either is found here.
 
-use super::options::{Options, ReadingKeys};
+use super::options::{DbcOptions, ReadingKeys};
 use crate::signal::{Bits, Message, Raw, Signal};
 use crate::unit::{Unit, is_multiple, is_of_other_case, quantities, spellings, unit};
 use crate::{Claim, Decoded, Format, Id, Spec, SpecError};
@@ -14,7 +14,7 @@ use proprio_topics::{Kind, Nanos};
 
 /// What a signal is for its reading.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Role {
+pub(super) enum SignalRole {
     /// A value: SI value = gain x raw + offset.
     Value {
         /// Its number.
@@ -32,7 +32,7 @@ pub(super) enum Role {
     Fault,
 }
 
-impl Role {
+impl SignalRole {
     /// Whether it belongs to one reading, and is not kept for the next ones.
     const fn is_timed(self) -> bool {
         match self {
@@ -45,15 +45,15 @@ impl Role {
 
 /// A signal that is used.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Field {
-    pub(super) role: Role,
+pub(super) struct UsedSignal {
+    pub(super) role: SignalRole,
     pub(super) bits: Bits,
     pub(super) raw: Raw,
     /// The least raw value that stands for none (J1939).
     pub(super) none_from: Option<u64>,
 }
 
-impl Field {
+impl UsedSignal {
     /// Whether the raw value `found` stands for none.
     pub(super) fn is_none(&self, found: u64) -> bool {
         self.none_from.is_some_and(|least| found >= least)
@@ -64,12 +64,12 @@ impl Field {
 /// the highest one is FE for an error, and FF where there is no value; of two bits these are 2 and
 /// 3. Of others, all bits are 1 where there is none. An error of a fault flag is a fault. What has
 /// a sign is of a maker's own.
-fn none_from(raw: Raw, bits: Bits, role: Role) -> Option<u64> {
+fn none_from(raw: Raw, bits: Bits, role: SignalRole) -> Option<u64> {
     let length = u32::from(bits.length());
-    if raw != Raw::Unsigned || role == Role::Counter || length == 1 {
+    if raw != Raw::Unsigned || role == SignalRole::Counter || length == 1 {
         return None;
     }
-    let has_error = role != Role::Fault;
+    let has_error = role != SignalRole::Fault;
     Some(match length {
         2 if has_error => 2,
         _ if length % 8 == 0 => (if has_error { 0xFE } else { 0xFF }) << (length - 8),
@@ -144,16 +144,16 @@ pub(super) fn shared<'c>(
 /// The signals of one reading that the same frames have. A signal that more frames have is in the
 /// parts of all those that have another signal of the reading.
 #[derive(Debug, Clone)]
-pub(super) struct Part {
+pub(super) struct SignalGroup {
     /// The reading's number.
     pub(super) reading: usize,
     pub(super) conditions: Vec<Condition>,
-    pub(super) fields: Vec<Field>,
+    pub(super) fields: Vec<UsedSignal>,
     /// The length of the shortest frame that has them all \[bytes\].
     pub(super) reach: usize,
 }
 
-impl Part {
+impl SignalGroup {
     /// Whether its signals belong to one reading: it has no held values and no fault.
     fn is_timed(&self) -> bool {
         self.fields.iter().all(|field| field.role.is_timed())
@@ -161,8 +161,8 @@ impl Part {
 
     /// The values that a reading needs of these frames, one bit each.
     pub(super) fn needed(&self) -> u16 {
-        let bit = |field: &Field| match field.role {
-            Role::Value {
+        let bit = |field: &UsedSignal| match field.role {
+            SignalRole::Value {
                 index,
                 hold: None,
                 rides: false,
@@ -182,7 +182,7 @@ pub(super) struct MessageLayout {
     /// They are frames of J1939.
     pub(super) j1939: bool,
     pub(super) size: usize,
-    pub(super) parts: Vec<Part>,
+    pub(super) parts: Vec<SignalGroup>,
 }
 
 impl MessageLayout {
@@ -197,12 +197,12 @@ impl MessageLayout {
 
     /// Puts the signals of reading `reading` that a frame has together into one part.
     fn join(&mut self, reading: usize) {
-        let is_mine = |part: &Part| part.reading == reading && part.is_timed();
-        let mine: Vec<Part> = self.parts.iter().filter(|p| is_mine(p)).cloned().collect();
+        let is_mine = |part: &SignalGroup| part.reading == reading && part.is_timed();
+        let mine: Vec<SignalGroup> = self.parts.iter().filter(|p| is_mine(p)).cloned().collect();
         self.parts.retain(|part| !is_mine(part));
         let mut taken: u16 = 0;
         for conditions in shared(mine.iter().map(|part| &part.conditions)) {
-            let mut joint = Part {
+            let mut joint = SignalGroup {
                 reading,
                 conditions,
                 fields: Vec::new(),
@@ -216,7 +216,7 @@ impl MessageLayout {
                 joint.fields.extend(part.fields.iter().cloned());
             }
             for field in &mut joint.fields {
-                if let Role::Value { index, rides, .. } = &mut field.role {
+                if let SignalRole::Value { index, rides, .. } = &mut field.role {
                     *rides = taken & 1 << *index != 0;
                 }
             }
@@ -252,14 +252,14 @@ pub(super) struct ReadingLayout {
 
 /// Everything that is read.
 #[derive(Debug, Clone)]
-pub(super) struct Layout {
+pub(super) struct DbcLayout {
     /// Sorted by identifier.
     pub(super) messages: Vec<MessageLayout>,
     pub(super) readings: Vec<ReadingLayout>,
 }
 
-impl Layout {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+impl DbcLayout {
+    pub(super) fn new(spec: &Spec, options: &DbcOptions) -> Result<Self, SpecError> {
         let fail = |problem| Err(SpecError::Description(problem));
         if options.reading.is_empty() {
             return fail("there is no [[bus.device.reading]]: name what is to be read".into());
@@ -313,7 +313,7 @@ impl Layout {
 
     fn add(
         &mut self,
-        options: &Options,
+        options: &DbcOptions,
         spec: &Spec,
         number: usize,
         keys: &ReadingKeys,
@@ -369,7 +369,7 @@ impl Layout {
                     messages.push(message);
                 }
             }
-            let role = Role::Value {
+            let role = SignalRole::Value {
                 index,
                 gain: signal.factor * unit.factor,
                 offset: signal.offset * unit.factor + unit.offset,
@@ -392,13 +392,13 @@ impl Layout {
             ));
         }
         for (key, path, role) in [
-            ("counter", &keys.counter, Role::Counter),
-            ("fault", &keys.fault, Role::Fault),
+            ("counter", &keys.counter, SignalRole::Counter),
+            ("fault", &keys.fault, SignalRole::Fault),
         ] {
             let Some(path) = path else { continue };
             let at = |problem: String| format!("{key} = {path:?}: {problem}");
             let (message, signal) = find(options, path).map_err(at)?;
-            if role == Role::Counter && !ptr::eq(message, opener) {
+            if role == SignalRole::Counter && !ptr::eq(message, opener) {
                 return Err(at(format!("it must be a signal of {}", name(opener))));
             }
             if matches!(signal.raw, Raw::Float32 | Raw::Float64) {
@@ -457,9 +457,9 @@ impl Layout {
         for message in &self.messages {
             let overlaps = |other: &&MessageLayout| other.frames.overlaps(&message.frames);
             let others = self.messages.iter().filter(overlaps);
-            let parts: Vec<&Part> = others.flat_map(|other| &other.parts).collect();
+            let parts: Vec<&SignalGroup> = others.flat_map(|other| &other.parts).collect();
             for conditions in shared(parts.iter().map(|part| &part.conditions)) {
-                let comes = |part: &&&Part| implies(&conditions, &part.conditions);
+                let comes = |part: &&&SignalGroup| implies(&conditions, &part.conditions);
                 let readings = parts.iter().filter(comes).map(|part| part.reading);
                 let mut readings: Vec<usize> = readings.collect();
                 readings.sort_unstable();
@@ -480,11 +480,11 @@ impl Layout {
     /// Adds a signal to the part that has the same frames.
     fn field(
         &mut self,
-        options: &Options,
+        options: &DbcOptions,
         spec: &Spec,
         reading: usize,
         (message, signal): (&Message, &Signal),
-        role: Role,
+        role: SignalRole,
     ) -> Result<(), String> {
         let (frames, j1939) = frames(options, spec, message)?;
         let bits = signal.bits.clone()?;
@@ -497,7 +497,7 @@ impl Layout {
                 message.size
             ));
         }
-        let field = Field {
+        let field = UsedSignal {
             role,
             bits,
             raw: signal.raw,
@@ -517,7 +517,7 @@ impl Layout {
         let Some(layout) = messages.get_mut(at) else {
             return Ok(());
         };
-        let same = |part: &&mut Part| {
+        let same = |part: &&mut SignalGroup| {
             part.reading == reading
                 && part.conditions == conditions
                 && part.is_timed() == role.is_timed()
@@ -527,7 +527,7 @@ impl Layout {
                 part.fields.push(field);
                 part.reach = part.reach.max(reach);
             }
-            None => layout.parts.push(Part {
+            None => layout.parts.push(SignalGroup {
                 reading,
                 conditions,
                 fields: [field].to_vec(),
@@ -576,7 +576,7 @@ const fn group(raw: u32) -> u32 {
 /// Which frames are those of `message`, and whether they are of J1939: then their parameter group
 /// counts, and what the keys ask for. Where the file has several messages of one group, their
 /// addresses count.
-fn frames(options: &Options, spec: &Spec, message: &Message) -> Result<(Claim, bool), String> {
+fn frames(options: &DbcOptions, spec: &Spec, message: &Message) -> Result<(Claim, bool), String> {
     let id = message.id.clone()?;
     let (Id::Extended(mut raw), true) = (id, options.j1939.unwrap_or(message.j1939)) else {
         let id = shifted(id, spec.address)
@@ -638,7 +638,7 @@ fn id_in(wanted: &str) -> Option<(u32, bool)> {
 }
 
 /// The messages that have the name `wanted`, or the identifier.
-fn messages_of<'o>(options: &'o Options, wanted: &str) -> Vec<&'o Message> {
+fn messages_of<'o>(options: &'o DbcOptions, wanted: &str) -> Vec<&'o Message> {
     let id = id_in(wanted);
     let is_wanted = |message: &&Message| match (id, &message.id) {
         (Some(wanted), Ok(id)) => (id.raw(), matches!(id, Id::Extended(_))) == wanted,
@@ -656,7 +656,7 @@ fn messages_of<'o>(options: &'o Options, wanted: &str) -> Vec<&'o Message> {
 }
 
 /// The message that has the name `wanted`, or the identifier.
-fn find_message<'o>(options: &'o Options, wanted: &str) -> Result<&'o Message, String> {
+fn find_message<'o>(options: &'o DbcOptions, wanted: &str) -> Result<&'o Message, String> {
     let is_id = id_in(wanted).is_some();
     let found = messages_of(options, wanted);
     match *found {
@@ -697,7 +697,7 @@ fn find_message<'o>(options: &'o Options, wanted: &str) -> Result<&'o Message, S
 }
 
 /// The message and the signal of `path`.
-fn find<'o>(options: &'o Options, path: &str) -> Result<(&'o Message, &'o Signal), String> {
+fn find<'o>(options: &'o DbcOptions, path: &str) -> Result<(&'o Message, &'o Signal), String> {
     let Some((message, signal)) = path.split_once('.') else {
         return Err("it must be written Message.Signal".into());
     };

@@ -11,7 +11,7 @@ use serde::{Deserialize, Deserializer, de};
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
-pub struct Options {
+pub struct DbcOptions {
     /// The .dbc file, relative to the configuration.
     pub file: String,
     /// The period of the readings of a simulated device \[ms\].

@@ -1,7 +1,7 @@
 //! Recognising boards of the protocol: by what they tell of themselves, and by their streams.
 
 use super::{ADDRESSES, BROADCAST, board, class, command, to_board, to_host};
-use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic, log2};
+use crate::recognise::{Evidence, Finding, IdUse, Key, Stream, Traffic, log2};
 use crate::{Format, Frame};
 use alloc::format;
 use alloc::string::String;
@@ -9,7 +9,7 @@ use alloc::vec::Vec;
 
 /// What a board has told of itself.
 #[derive(Debug, Clone)]
-struct Told {
+struct BoardIdentity {
     board: u8,
     /// Major, minor; build in the application alone.
     version: [u8; 2],
@@ -19,7 +19,11 @@ struct Told {
 }
 
 /// Takes the answers of board `address`, if it is of one of `types`; `Err` if it is of another one.
-fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option<Told>, ()> {
+fn told(
+    evidence: &mut Evidence<'_>,
+    address: u8,
+    types: &[u8],
+) -> Result<Option<BoardIdentity>, ()> {
     let mut told = None;
     let id = to_host(class::MANAGEMENT, address);
     // Commands of the bootloader are below 10.
@@ -27,7 +31,7 @@ fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option
         let first = frame.data().first().copied();
         first.is_some_and(|c| c == command::DISCOVER || c < 0x10)
     };
-    if let Some(stream) = evidence.sends_as(Part::Tells, id, rule) {
+    if let Some(stream) = evidence.sends_as(IdUse::Tells, id, rule) {
         let mut texts: [Option<[u8; 4]>; 8] = [None; 8];
         let (mut frames, mut answers) = (0, 0_usize);
         for frame in stream.kept() {
@@ -35,7 +39,7 @@ fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option
             match *frame.data() {
                 [command::DISCOVER, board, major, minor, ref build @ ..] if build.len() < 2 => {
                     answers += 1;
-                    told = Some(Told {
+                    told = Some(BoardIdentity {
                         board,
                         version: [major, minor],
                         build: build.first().copied(),
@@ -92,7 +96,7 @@ fn told(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Result<Option
             let fits = if fits == 1 { 7.0 } else { 1.0 };
             let bits = 8.0 + (8.0 - log2(types.len())) + fits;
             evidence.tells(id, bits - log2(answers.len() / count));
-            told.get_or_insert(Told {
+            told.get_or_insert(BoardIdentity {
                 board,
                 version,
                 build: Some(build),

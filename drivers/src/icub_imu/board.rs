@@ -1,13 +1,13 @@
 //! The IMU board's own side. It executes the host's commands and sends readings as frames.
 
 use super::frames::{
-    FIELD_LSB, LEGACY_ACCELEROMETERS, LEGACY_GYROSCOPE, Legacy, QUATERNION_LSB, Quantity, kind,
+    FIELD_LSB, ImuQuantity, LEGACY_ACCELEROMETERS, LEGACY_GYROSCOPE, Legacy, QUATERNION_LSB, kind,
     sensor,
 };
-use super::options::{Options, Plan};
-use crate::bytes;
+use super::options::{IcubImuOptions, ImuKeys};
 use crate::icub::{self, class, command};
-use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
+use crate::{Board, EncodeError, Frame, Frames, Mode, Simulate, Spec, SpecError, board, bytes};
+use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading};
 
 /// Duration of a simulated board's acquisition \[us\]; real boards take 2 to 6 ms.
@@ -15,8 +15,8 @@ const ACQUISITION_US: u32 = 4000;
 
 /// The board's own side.
 #[derive(Debug)]
-pub struct ImuBoard {
-    plan: Plan,
+struct ImuBoard {
+    plan: ImuKeys,
     period: Nanos,
     streaming: bool,
     /// The configuration received, in the form of IMU_CONFIG_SET.
@@ -28,36 +28,20 @@ pub struct ImuBoard {
 }
 
 impl ImuBoard {
-    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
-    ///
-    /// # Errors
-    /// As [`ImuDevice::new`](super::ImuDevice::new).
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        let plan = Plan::new(spec, options)?;
-        Ok(Self {
-            period: Nanos::from_millis(i64::from(plan.period_ms)),
-            streaming: spec.mode == Mode::Listen,
-            configuration: None,
-            legacy_mask: None,
-            sequence: 0,
-            plan,
-        })
-    }
-
     /// The plan for encoding a reading: the configuration received, else the keys.
     fn mask(&self) -> u16 {
         match (self.plan.legacy, self.configuration, self.legacy_mask) {
             (Legacy::None, Some([_, low, high, ..]), _) => u16::from_le_bytes([low, high]),
             (Legacy::Mtb | Legacy::Bno055, _, Some(mask)) => {
-                let bit = |sensors: u8, quantity: Quantity| {
+                let bit = |sensors: u8, quantity: ImuQuantity| {
                     if mask & sensors == 0 {
                         0
                     } else {
                         quantity.bit()
                     }
                 };
-                bit(LEGACY_ACCELEROMETERS, Quantity::Acceleration)
-                    | bit(LEGACY_GYROSCOPE, Quantity::AngularVelocity)
+                bit(LEGACY_ACCELEROMETERS, ImuQuantity::Acceleration)
+                    | bit(LEGACY_GYROSCOPE, ImuQuantity::AngularVelocity)
             }
             _ => self.plan.want,
         }
@@ -68,6 +52,21 @@ impl ImuBoard {
             icub::stream(class::PERIODIC_INERTIAL, self.plan.address, kind),
             data,
         ));
+    }
+}
+
+impl Simulate for IcubImuOptions {
+    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        let plan = ImuKeys::new(spec, self)?;
+        Ok(Box::new(ImuBoard {
+            period: Nanos::from_millis(i64::from(plan.period_ms)),
+            streaming: spec.mode == Mode::Listen,
+            configuration: None,
+            legacy_mask: None,
+            sequence: 0,
+            plan,
+        }))
     }
 }
 
@@ -128,19 +127,14 @@ impl Board for ImuBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        let Reading::Imu(imu) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
+        let imu = board::only_imu(output, reading)?;
         let mask = self.mask();
-        let sends = |quantity: Quantity| mask & quantity.bit() != 0;
+        let sends = |quantity: ImuQuantity| mask & quantity.bit() != 0;
         let finite = |values: &[f64]| values.iter().all(|value| value.is_finite());
-        if (sends(Quantity::Acceleration) && !finite(&imu.proper_acceleration))
-            || (sends(Quantity::AngularVelocity) && !finite(&imu.angular_velocity))
-            || (sends(Quantity::MagneticField) && !finite(&imu.magnetic_field))
-            || (sends(Quantity::Orientation) && !finite(&imu.orientation))
+        if (sends(ImuQuantity::Acceleration) && !finite(&imu.proper_acceleration))
+            || (sends(ImuQuantity::AngularVelocity) && !finite(&imu.angular_velocity))
+            || (sends(ImuQuantity::MagneticField) && !finite(&imu.magnetic_field))
+            || (sends(ImuQuantity::Orientation) && !finite(&imu.orientation))
         {
             return Err(EncodeError::NotFinite);
         }
@@ -153,10 +147,10 @@ impl Board for ImuBoard {
         let acceleration = bytes(imu.proper_acceleration, acceleration_lsb);
         let rate = bytes(imu.angular_velocity, rate_lsb);
         if self.plan.legacy != Legacy::None {
-            if sends(Quantity::Acceleration) {
+            if sends(ImuQuantity::Acceleration) {
                 self.send(kind::LEGACY_ACCELEROMETER, &acceleration, out);
             }
-            if sends(Quantity::AngularVelocity) {
+            if sends(ImuQuantity::AngularVelocity) {
                 self.send(kind::LEGACY_GYROSCOPE, &rate, out);
             }
             return Ok(());
@@ -164,27 +158,27 @@ impl Board for ImuBoard {
         self.sequence = self.sequence.wrapping_add(1);
         let sequence = self.sequence;
         let triple = |sensor: u8, [a, b, c, d, e, f]: [u8; 6]| [sequence, sensor, a, b, c, d, e, f];
-        if sends(Quantity::Acceleration) {
+        if sends(ImuQuantity::Acceleration) {
             self.send(
                 kind::TRIPLE,
                 &triple(sensor::ACCELERATION, acceleration),
                 out,
             );
         }
-        if sends(Quantity::MagneticField) {
+        if sends(ImuQuantity::MagneticField) {
             let field = bytes(imu.magnetic_field, FIELD_LSB);
             self.send(kind::TRIPLE, &triple(sensor::MAGNETIC_FIELD, field), out);
         }
-        if sends(Quantity::AngularVelocity) {
+        if sends(ImuQuantity::AngularVelocity) {
             self.send(kind::TRIPLE, &triple(sensor::ANGULAR_VELOCITY, rate), out);
         }
-        if sends(Quantity::Orientation) {
+        if sends(ImuQuantity::Orientation) {
             let [w, x, y, z] = imu.orientation;
             let [w0, w1] = bytes::quantise_i16(w, QUATERNION_LSB).to_le_bytes();
             let [a, b, c, d, e, f] = bytes([x, y, z], QUATERNION_LSB);
             self.send(kind::QUATERNION, &[w0, w1, a, b, c, d, e, f], out);
         }
-        if sends(Quantity::Status) {
+        if sends(ImuQuantity::Status) {
             let calibration = if quality.contains(Quality::NOT_CALIBRATED) {
                 0
             } else {

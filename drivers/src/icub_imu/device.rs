@@ -2,19 +2,21 @@
 //! acquisition into a reading.
 
 use super::frames::{
-    ACCELERATION_LSB, FIELD_LSB, Legacy, QUATERNION_LSB, Quantity, RATE_LSB, kind, sensor,
+    ACCELERATION_LSB, FIELD_LSB, ImuQuantity, Legacy, QUATERNION_LSB, RATE_LSB, kind, sensor,
 };
-use super::options::{Options, Plan};
+use super::options::{IcubImuOptions, ImuKeys};
 use crate::bringup::Bringup;
-use crate::bytes;
 use crate::configure::{Configure, Setting};
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
-use crate::pairing::{self, Limit, Order, Paired, Pairing};
-use crate::{Claim, Decoded, Device, Frame, NotSent, Output, Spec, SpecError};
+use crate::pairing::{self, HalfOrder, Limit, Paired, Pairing};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
+};
 use alloc::boxed::Box;
+use alloc::vec::Vec;
 use arrayvec::ArrayVec;
-use proprio_topics::{Counter, Imu, Nanos, Quality, Reading, StampKind};
+use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, StampKind};
 
 /// A frame up to this many sequence numbers back is late; further back, the counter has restarted
 /// or there is a long gap.
@@ -47,7 +49,7 @@ impl Acquisition {
 /// The host's side of an IMU.
 #[derive(Debug)]
 pub(super) struct ImuDevice {
-    plan: Plan,
+    plan: ImuKeys,
     acquisition: Acquisition,
     /// SEQ of the last acquisition begun.
     sequence: Option<u8>,
@@ -64,68 +66,6 @@ pub(super) struct ImuDevice {
 }
 
 impl ImuDevice {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let plan = Plan::new(spec, options)?;
-        let timing = icub::timing(options.power_on_silence_ms)?;
-        let is_legacy = plan.legacy != Legacy::None;
-        let kinds: &[u8] = if is_legacy {
-            &[kind::LEGACY_ACCELEROMETER, kind::LEGACY_GYROSCOPE]
-        } else {
-            &[kind::TRIPLE, kind::QUATERNION, kind::STATUS]
-        };
-        let watched = icub::stream(
-            class::PERIODIC_INERTIAL,
-            plan.address,
-            *kinds.first().unwrap_or(&kind::TRIPLE),
-        );
-        let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
-        let id = icub::to_board(class::POLLING_ANALOG, plan.address);
-        let mut claims: ArrayVec<Claim, 4> =
-            icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);
-        if is_legacy {
-            bringup.start_with(
-                id,
-                &[command::ACC_GYRO_SETUP, plan.legacy_mask, plan.period_ms],
-            );
-            bringup.stop_with(id, &[command::ACC_GYRO_SETUP, 0, 0]);
-        } else {
-            bringup.start_with(id, &[command::IMU_TRANSMIT, plan.period_ms]);
-            bringup.stop_with(id, &[command::IMU_TRANSMIT, 0]);
-            claims.push(Claim::shared(icub::to_host(
-                class::POLLING_ANALOG,
-                plan.address,
-            )));
-        }
-        let setting = Setting {
-            set: Frame::new(id, &plan.configuration),
-            get: Frame::new(id, &[command::IMU_CONFIG_GET]),
-            // Mask, mode and orientation; the rest is unused.
-            compared: 1..5,
-        };
-        let period = Nanos::from_millis(i64::from(plan.period_ms));
-        // Legacy boards have no such configuration.
-        let configure = Configure::new(spec, (!is_legacy).then_some(setting), icub::TIMING);
-        let this = Self {
-            acquisition: Acquisition::NONE,
-            sequence: None,
-            may_jump: Nanos::MIN,
-            not_calibrated: false,
-            // A BNO055 board sends the accelerometer first; the order of an mtb is not documented.
-            legacy: Pairing::new(
-                Limit::of_period(period),
-                match plan.legacy {
-                    Legacy::Bno055 => Order::Usual,
-                    _ => Order::Any,
-                },
-            ),
-            together: Nanos(period.0 / 2),
-            gap: false,
-            seen: false,
-            plan,
-        };
-        Ok(Supervised::boxed(claims, bringup, configure, this))
-    }
-
     /// Whether a frame with `sequence` belongs to the open acquisition; a later `sequence` opens a
     /// new one.
     fn belongs(&mut self, sequence: u8, frame: &Frame, out: &mut Decoded) -> bool {
@@ -172,7 +112,13 @@ impl ImuDevice {
 
     /// Records that the acquisition has `bit`; outputs the reading when all wanted quantities are
     /// present.
-    fn hold(&mut self, bit: u16, frame: &Frame, link: &mut Link<Configure>, out: &mut Decoded) {
+    fn hold(
+        &mut self,
+        bit: u16,
+        frame: &Frame,
+        link: &mut Supervision<Configure>,
+        out: &mut Decoded,
+    ) {
         self.acquisition.have |= bit;
         if self.acquisition.have & self.plan.want != self.plan.want {
             return;
@@ -201,7 +147,7 @@ impl ImuDevice {
         device_counter: u32,
         mut quality: Quality,
         frame: &Frame,
-        link: &mut Link<Configure>,
+        link: &mut Supervision<Configure>,
         out: &mut Decoded,
     ) {
         if core::mem::take(&mut self.gap) | link.bringup.reading(frame.t) {
@@ -221,7 +167,7 @@ impl ImuDevice {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Configure>,
+        link: &mut Supervision<Configure>,
         out: &mut Decoded,
     ) {
         let &[sequence, sensor, ..] = data else {
@@ -252,10 +198,10 @@ impl ImuDevice {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Configure>,
+        link: &mut Supervision<Configure>,
         out: &mut Decoded,
     ) {
-        let bit = Quantity::Orientation.bit();
+        let bit = ImuQuantity::Orientation.bit();
         // Before the first acquisition that is heard it belongs to an earlier one.
         if self.plan.want & bit == 0 || self.sequence.is_none() {
             return;
@@ -278,7 +224,7 @@ impl ImuDevice {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Configure>,
+        link: &mut Supervision<Configure>,
         out: &mut Decoded,
     ) {
         let &[sequence, gyroscope, accelerometer, magnetometer, ..] = data else {
@@ -287,16 +233,16 @@ impl ImuDevice {
         if gyroscope > 3 || accelerometer > 3 || magnetometer > 3 {
             return out.fault(Counter::Value, 1, frame.id);
         }
-        let bit = Quantity::Status.bit();
+        let bit = ImuQuantity::Status.bit();
         if self.plan.want & bit == 0 || !self.belongs(sequence, frame, out) {
             return;
         }
-        let lacks = |quantity: Quantity, calibration| {
+        let lacks = |quantity: ImuQuantity, calibration| {
             self.plan.want & quantity.bit() != 0 && calibration == 0
         };
-        self.not_calibrated = lacks(Quantity::Acceleration, accelerometer)
-            || lacks(Quantity::AngularVelocity, gyroscope)
-            || lacks(Quantity::MagneticField, magnetometer);
+        self.not_calibrated = lacks(ImuQuantity::Acceleration, accelerometer)
+            || lacks(ImuQuantity::AngularVelocity, gyroscope)
+            || lacks(ImuQuantity::MagneticField, magnetometer);
         self.hold(bit, frame, link, out);
     }
 
@@ -305,13 +251,13 @@ impl ImuDevice {
         is_gyroscope: bool,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<Configure>,
+        link: &mut Supervision<Configure>,
         out: &mut Decoded,
     ) {
         let quantity = if is_gyroscope {
-            Quantity::AngularVelocity
+            ImuQuantity::AngularVelocity
         } else {
-            Quantity::Acceleration
+            ImuQuantity::Acceleration
         };
         if self.plan.want & quantity.bit() == 0 {
             return;
@@ -356,10 +302,80 @@ fn vector(data: &[u8], at: usize) -> [i16; 3] {
     ]
 }
 
+impl Driver for IcubImuOptions {
+    const NAME: &'static str = "icub_imu";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Imu)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let plan = ImuKeys::new(spec, self)?;
+        let timing = icub::timing(self.power_on_silence_ms)?;
+        let is_legacy = plan.legacy != Legacy::None;
+        let kinds: &[u8] = if is_legacy {
+            &[kind::LEGACY_ACCELEROMETER, kind::LEGACY_GYROSCOPE]
+        } else {
+            &[kind::TRIPLE, kind::QUATERNION, kind::STATUS]
+        };
+        let watched = icub::stream(
+            class::PERIODIC_INERTIAL,
+            plan.address,
+            *kinds.first().unwrap_or(&kind::TRIPLE),
+        );
+        let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
+        let id = icub::to_board(class::POLLING_ANALOG, plan.address);
+        let mut claims: ArrayVec<Claim, 4> =
+            icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);
+        if is_legacy {
+            bringup.start_with(
+                id,
+                &[command::ACC_GYRO_SETUP, plan.legacy_mask, plan.period_ms],
+            );
+            bringup.stop_with(id, &[command::ACC_GYRO_SETUP, 0, 0]);
+        } else {
+            bringup.start_with(id, &[command::IMU_TRANSMIT, plan.period_ms]);
+            bringup.stop_with(id, &[command::IMU_TRANSMIT, 0]);
+            claims.push(Claim::shared(icub::to_host(
+                class::POLLING_ANALOG,
+                plan.address,
+            )));
+        }
+        let setting = Setting {
+            set: Frame::new(id, &plan.configuration),
+            get: Frame::new(id, &[command::IMU_CONFIG_GET]),
+            // Mask, mode and orientation; the rest is unused.
+            compared: 1..5,
+        };
+        let period = Nanos::from_millis(i64::from(plan.period_ms));
+        // Legacy boards have no such configuration.
+        let configure = Configure::new(spec, (!is_legacy).then_some(setting), icub::TIMING);
+        let this = ImuDevice {
+            acquisition: Acquisition::NONE,
+            sequence: None,
+            may_jump: Nanos::MIN,
+            not_calibrated: false,
+            // A BNO055 board sends the accelerometer first; the order of an mtb is not documented.
+            legacy: Pairing::new(
+                Limit::of_period(period),
+                match plan.legacy {
+                    Legacy::Bno055 => HalfOrder::Usual,
+                    _ => HalfOrder::Any,
+                },
+            ),
+            together: Nanos(period.0 / 2),
+            gap: false,
+            seen: false,
+            plan,
+        };
+        Ok(Supervised::boxed(claims, bringup, configure, this))
+    }
+}
+
 impl Family for ImuDevice {
     type Questions = Configure;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Configure>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<Configure>, out: &mut Decoded) {
         let is_legacy = self.plan.legacy != Legacy::None;
         if let Some(stream) =
             icub::stream_type(frame.id, class::PERIODIC_INERTIAL, self.plan.address)

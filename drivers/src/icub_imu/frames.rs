@@ -42,7 +42,7 @@ const MTB_RATE_LSB: f64 = 250.0 / 32768.0 * PI / 180.0;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum Quantity {
+pub enum ImuQuantity {
     /// Proper acceleration.
     Acceleration,
     /// Magnetic field.
@@ -55,7 +55,7 @@ pub enum Quantity {
     Status,
 }
 
-impl Quantity {
+impl ImuQuantity {
     /// Its bit in the mask.
     pub(super) const fn bit(self) -> u16 {
         1 << match self {

@@ -1,7 +1,7 @@
 //! The keys of an IMU in gateway.toml. They are checked here and converted to a plan, which both
 //! sides of the driver use.
 
-use super::frames::{Fusion, LEGACY_ACCELEROMETERS, LEGACY_GYROSCOPE, Legacy, Quantity};
+use super::frames::{Fusion, ImuQuantity, LEGACY_ACCELEROMETERS, LEGACY_GYROSCOPE, Legacy};
 use crate::icub::{self, command};
 use crate::{Spec, SpecError};
 use alloc::vec::Vec;
@@ -11,9 +11,9 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct IcubImuOptions {
     /// The quantities of a reading; default acceleration and angular velocity.
-    pub quantities: Vec<Quantity>,
+    pub quantities: Vec<ImuQuantity>,
     /// Period \[ms\], 1 to 255; default 10.
     pub period_ms: u32,
     /// The chip's operation mode; default ndof.
@@ -28,10 +28,10 @@ pub struct Options {
     pub power_on_silence_ms: u32,
 }
 
-impl Default for Options {
+impl Default for IcubImuOptions {
     fn default() -> Self {
         Self {
-            quantities: [Quantity::Acceleration, Quantity::AngularVelocity].to_vec(),
+            quantities: [ImuQuantity::Acceleration, ImuQuantity::AngularVelocity].to_vec(),
             period_ms: 10,
             mode: Fusion::Ndof,
             placement: None,
@@ -47,7 +47,7 @@ const LEGACY_MASK: u8 = 0b110;
 
 /// The plan that results from the keys.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Plan {
+pub(super) struct ImuKeys {
     pub(super) address: u8,
     pub(super) period_ms: u8,
     /// The mask of the quantities of a reading.
@@ -58,17 +58,17 @@ pub(super) struct Plan {
     pub(super) legacy_mask: u8,
 }
 
-impl Plan {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+impl ImuKeys {
+    pub(super) fn new(spec: &Spec, options: &IcubImuOptions) -> Result<Self, SpecError> {
         let address = icub::address(spec)?;
         let period_ms = icub::period_ms("period_ms", options.period_ms)?;
         let want = options
             .quantities
             .iter()
             .fold(0, |mask, quantity| mask | quantity.bit());
-        let inertial = Quantity::Acceleration.bit() | Quantity::AngularVelocity.bit();
+        let inertial = ImuQuantity::Acceleration.bit() | ImuQuantity::AngularVelocity.bit();
         // Every reading needs a frame with SEQ, which identifies its acquisition.
-        if want & (inertial | Quantity::MagneticField.bit()) == 0 {
+        if want & (inertial | ImuQuantity::MagneticField.bit()) == 0 {
             let expected =
                 "a list with at least one of acceleration, angular_velocity, magnetic_field";
             return Err(SpecError::Keys {
@@ -92,9 +92,9 @@ impl Plan {
                     expected,
                 });
             }
-            let lacks = (want & Quantity::Acceleration.bit() != 0
+            let lacks = (want & ImuQuantity::Acceleration.bit() != 0
                 && legacy_mask & LEGACY_ACCELEROMETERS == 0)
-                || (want & Quantity::AngularVelocity.bit() != 0
+                || (want & ImuQuantity::AngularVelocity.bit() != 0
                     && legacy_mask & LEGACY_GYROSCOPE == 0);
             if lacks || legacy_mask > 0xF {
                 let expected = "at most 15, with bit 2 for angular_velocity and bit 0, 1 or 3 for \

@@ -2,11 +2,11 @@
 //! readings as frames.
 
 use super::exchange::MINUS_PRESENT;
-use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind, saturation_bytes};
-use super::options::{Options, Stream};
-use crate::bytes;
+use super::frames::{CELSIUS_PER_LSB, STEPS, StrainHalf, ZERO, kind, saturation_bytes};
+use super::options::{IcubStrainOptions, StrainStream};
 use crate::icub::{self, class, command};
-use crate::{Board, EncodeError, Frame, Frames, Mode, Spec, SpecError};
+use crate::{Board, EncodeError, Frame, Frames, Mode, Simulate, Spec, SpecError, board, bytes};
+use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading, Saturation, Temperature};
 
 /// Default full scales: the iCub's usual sensor \[N, Nm\]. A simulated board reports them on
@@ -19,7 +19,7 @@ const USUAL_FULL_SCALE: [f64; 6] = [1804.0, 1804.0, 1804.0, 31.0, 31.0, 31.0];
 /// memory holds the configured full scales, else 1804 N and 31 Nm. The matrix in its memory can be
 /// overwritten and read, and is not used: what the board would then send is not simulated.
 #[derive(Debug)]
-pub struct StrainBoard {
+struct StrainBoard {
     address: u8,
     full_scale: [f64; 6],
     /// Whether the host knows the scale: from the same configuration, or from the board's answer
@@ -27,7 +27,7 @@ pub struct StrainBoard {
     scale_known: bool,
     period: Nanos,
     /// The stream selected by the host; `None` while it is silent.
-    stream: Option<Stream>,
+    stream: Option<StrainStream>,
     /// The calibrated counts of the last vector that was not saturated.
     last_good: Option<[u16; 6]>,
     /// The gauges of the last vector.
@@ -39,31 +39,6 @@ pub struct StrainBoard {
 }
 
 impl StrainBoard {
-    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
-    ///
-    /// # Errors
-    /// As [`Strain::new`](super::Strain::new), but a full scale of zero is legal: a board with a
-    /// corrupt memory.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        let address = icub::address(spec)?;
-        let configured = options.full_scale(true)?;
-        let period =
-            Nanos::from_millis(i64::from(icub::period_ms("period_ms", options.period_ms)?));
-        Ok(Self {
-            address,
-            full_scale: configured.unwrap_or(USUAL_FULL_SCALE),
-            scale_known: configured.is_some() || spec.mode == Mode::Listen,
-            period,
-            stream: (spec.mode == Mode::Listen).then_some(options.stream),
-            last_good: None,
-            gauges: [ZERO; 6],
-            tare: [0; 6],
-            matrix: core::array::from_fn(|axis| {
-                core::array::from_fn(|gauge| if axis == gauge { i16::MAX } else { 0 })
-            }),
-        })
-    }
-
     /// The frames of both halves.
     fn send(&self, first_kind: u8, counts: [u16; 6], saturation: [u8; 2], out: &mut Frames) {
         let [a, b, c, d, e, f] = counts;
@@ -72,7 +47,7 @@ impl StrainBoard {
             (first_kind + 1, [d, e, f], saturation[1]),
         ] {
             let id = icub::stream(class::PERIODIC_ANALOG, self.address, kind);
-            let _ = out.try_push(Half { counts, saturation }.frame(id));
+            let _ = out.try_push(StrainHalf { counts, saturation }.frame(id));
         }
     }
 }
@@ -87,6 +62,28 @@ fn entry(matrix: &mut [[i16; 6]; 6], row: u8, column: u8) -> Option<&mut i16> {
 /// `steps`, limited to the range of a Q15 number.
 fn signed(steps: i32) -> i16 {
     i16::try_from(steps).unwrap_or(if steps > 0 { i16::MAX } else { i16::MIN })
+}
+
+impl Simulate for IcubStrainOptions {
+    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        let address = icub::address(spec)?;
+        let configured = self.full_scale(true)?;
+        let period = Nanos::from_millis(i64::from(icub::period_ms("period_ms", self.period_ms)?));
+        Ok(Box::new(StrainBoard {
+            address,
+            full_scale: configured.unwrap_or(USUAL_FULL_SCALE),
+            scale_known: configured.is_some() || spec.mode == Mode::Listen,
+            period,
+            stream: (spec.mode == Mode::Listen).then_some(self.stream),
+            last_good: None,
+            gauges: [ZERO; 6],
+            tare: [0; 6],
+            matrix: core::array::from_fn(|axis| {
+                core::array::from_fn(|gauge| if axis == gauge { i16::MAX } else { 0 })
+            }),
+        }))
+    }
 }
 
 impl Board for StrainBoard {
@@ -151,7 +148,7 @@ impl Board for StrainBoard {
             Some(&[command::SET_CANDATARATE, ms]) if ms > 0 => {
                 self.period = Nanos::from_millis(i64::from(ms));
             }
-            Some(&[command::SET_TXMODE, mode]) => self.stream = Stream::from_code(mode),
+            Some(&[command::SET_TXMODE, mode]) => self.stream = StrainStream::from_code(mode),
             _ => {}
         }
     }
@@ -167,16 +164,10 @@ impl Board for StrainBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
+        board::only_output(output)?;
         match reading {
             Reading::Wrench(wrench) => {
-                let ([fx, fy, fz], [tx, ty, tz]) = (wrench.force, wrench.torque);
-                let values = [fx, fy, fz, tx, ty, tz];
-                if !values.iter().all(|value| value.is_finite()) {
-                    return Err(EncodeError::NotFinite);
-                }
+                let values = board::axes(wrench)?;
                 if !self.scale_known {
                     return Err(EncodeError::NoFullScale);
                 }
@@ -225,10 +216,10 @@ impl Board for StrainBoard {
                 // A board that was not started encodes a recording, in which a wrench is a
                 // calibrated reading.
                 let stream = self.stream.unwrap_or_default();
-                if stream != Stream::Uncalibrated {
+                if stream != StrainStream::Uncalibrated {
                     self.send(kind::FORCE, counts, saturation, out);
                 }
-                if stream != Stream::Calibrated {
+                if stream != StrainStream::Calibrated {
                     self.send(kind::RAW_FORCE, raw, saturation, out);
                 }
             }
@@ -241,9 +232,7 @@ impl Board for StrainBoard {
                 self.send(kind::RAW_FORCE, counts, saturation_bytes(quality), out);
             }
             Reading::Temperature(Temperature { celsius }) => {
-                if !celsius.is_finite() {
-                    return Err(EncodeError::NotFinite);
-                }
+                board::finite(&[*celsius])?;
                 let [low, high] = bytes::quantise_i16(*celsius, CELSIUS_PER_LSB).to_le_bytes();
                 let id = icub::stream(class::PERIODIC_ANALOG, self.address, kind::THERMOMETER);
                 let _ = out.try_push(Frame::new(id, &[1, low, high, 0, 0]));

@@ -2,26 +2,26 @@
 //! two halves of each reading.
 
 use super::exchange::{Exchange, Told};
-use super::frames::{CELSIUS_PER_LSB, Half, STEPS, ZERO, kind};
-use super::options::{Options, Stream};
+use super::frames::{CELSIUS_PER_LSB, STEPS, StrainHalf, ZERO, kind};
+use super::options::{IcubStrainOptions, StrainStream};
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry};
-use crate::bytes;
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
-use crate::pairing::{Limit, Order, Paired, Pairing};
+use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::{
     Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
-    Frame, Mode, NotSent, Output, Spec, SpecError,
+    Driver, Frame, Mode, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
 };
 use alloc::boxed::Box;
+use alloc::vec::Vec;
 use arrayvec::ArrayVec;
 use proprio_topics::{
-    Counter, Gauges, Nanos, Quality, Reading, Refusal, StampKind, Temperature, Wrench,
+    Counter, Gauges, Kind, Nanos, Quality, Reading, Refusal, StampKind, Temperature, Wrench,
 };
 
 /// The full scales: configured, requested axis by axis, or from replies to another program.
 #[derive(Debug)]
-pub(super) struct FullScales {
+pub(super) struct StrainScales {
     /// The scale is configured, or not needed because only raw gauges are streamed: nothing to ask.
     settled: bool,
     /// N or Nm per step of the stream, once all six are known.
@@ -38,10 +38,10 @@ pub(super) struct FullScales {
     open: [u8; 6],
 }
 
-impl FullScales {
-    fn new(address: u8, configured: Option<[f64; 6]>, stream: Stream) -> Self {
+impl StrainScales {
+    fn new(address: u8, configured: Option<[f64; 6]>, stream: StrainStream) -> Self {
         Self {
-            settled: configured.is_some() || stream == Stream::Uncalibrated,
+            settled: configured.is_some() || stream == StrainStream::Uncalibrated,
             per_step: configured.map(|all| all.map(|full_scale| full_scale / STEPS)),
             told: [None; 6],
             refusal: None,
@@ -110,7 +110,7 @@ impl FullScales {
     }
 }
 
-impl Inquiry for FullScales {
+impl Inquiry for StrainScales {
     fn begin(&mut self) {
         self.axis = 0;
         self.attempts.begin();
@@ -166,22 +166,22 @@ impl Inquiry for FullScales {
 struct Whole {
     acquired: Nanos,
     stamp: StampKind,
-    first: Half,
-    second: Half,
+    first: StrainHalf,
+    second: StrainHalf,
     quality: Quality,
 }
 
 /// One of the two streams: its halves, and whether a reading was lost since the last one.
 #[derive(Debug)]
 struct Pair {
-    pairing: Pairing<Half>,
+    pairing: Pairing<StrainHalf>,
     gap: bool,
 }
 
 impl Pair {
     const fn new(limit: Limit) -> Self {
         Self {
-            pairing: Pairing::new(limit, Order::Usual),
+            pairing: Pairing::new(limit, HalfOrder::Usual),
             gap: false,
         }
     }
@@ -194,7 +194,7 @@ impl Pair {
         frame: &Frame,
         out: &mut Decoded,
     ) -> Option<Whole> {
-        let half = match Half::parse(data) {
+        let half = match StrainHalf::parse(data) {
             Ok(half) => half,
             Err(counter) => {
                 out.fault(counter, 1, frame.id);
@@ -236,72 +236,12 @@ impl Pair {
 pub(super) struct Strain {
     address: u8,
     exchange: Exchange,
-    stream: Stream,
+    stream: StrainStream,
     calibrated: Pair,
     raw: Pair,
 }
 
 impl Strain {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let address = icub::address(spec)?;
-        let period = icub::period_ms("period_ms", options.period_ms)?;
-        let configured = options.full_scale(false)?;
-        let timing = icub::timing(options.power_on_silence_ms)?;
-        let limit = match options.pair_timeout_ms {
-            None => Limit::of_period(Nanos::from_millis(i64::from(period))),
-            Some(ms) if ms.is_finite() && ms > 0.0 && ms <= 1000.0 => {
-                Limit::fixed(Nanos::from_seconds(ms * 1e-3))
-            }
-            Some(value) => {
-                return Err(SpecError::Key {
-                    key: "pair_timeout_ms",
-                    value,
-                    expected: "above 0 and at most 1000",
-                });
-            }
-        };
-        let (force, command_id) = (
-            icub::stream(class::PERIODIC_ANALOG, address, kind::FORCE),
-            icub::to_board(class::POLLING_ANALOG, address),
-        );
-        let watched = match options.stream {
-            Stream::Uncalibrated => icub::stream(class::PERIODIC_ANALOG, address, kind::RAW_FORCE),
-            Stream::Calibrated | Stream::Both => force,
-        };
-        let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
-        bringup.start_with(command_id, &[command::SET_CANDATARATE, period]);
-        if let Some(seconds) = options.temperature_period_s {
-            let seconds = icub::period_ms("temperature_period_s", seconds)?;
-            bringup.start_with(command_id, &[command::THERMOMETER_CONFIG_SET, 1]);
-            bringup.start_with(command_id, &[command::THERMOMETER_TRANSMIT, seconds]);
-            bringup.stop_with(command_id, &[command::THERMOMETER_TRANSMIT, 0]);
-        }
-        bringup.start_with(command_id, &[command::SET_TXMODE, options.stream.code()]);
-        bringup.stop_with(command_id, &[command::SET_TXMODE, 1]);
-        let mut claims: ArrayVec<Claim, 7> = icub::claims(
-            class::PERIODIC_ANALOG,
-            address,
-            &[
-                kind::FORCE,
-                kind::TORQUE,
-                kind::RAW_FORCE,
-                kind::RAW_TORQUE,
-                kind::THERMOMETER,
-                kind::THERMOMETER_FIRMWARE,
-            ],
-        );
-        claims.push(Claim::shared(icub::to_host(class::POLLING_ANALOG, address)));
-        let scales = FullScales::new(address, configured, options.stream);
-        let this = Self {
-            address,
-            exchange: Exchange::new(address),
-            stream: options.stream,
-            calibrated: Pair::new(limit),
-            raw: Pair::new(limit),
-        };
-        Ok(Supervised::boxed(claims, bringup, scales, this))
-    }
-
     /// Outputs a reading from its two frames.
     fn give(
         &mut self,
@@ -309,7 +249,7 @@ impl Strain {
         quality: Quality,
         reading: Reading,
         frame: &Frame,
-        link: &mut Link<FullScales>,
+        link: &mut Supervision<StrainScales>,
         out: &mut Decoded,
     ) {
         if quality.contains(Quality::SATURATED) {
@@ -333,7 +273,7 @@ impl Strain {
         second: bool,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<FullScales>,
+        link: &mut Supervision<StrainScales>,
         out: &mut Decoded,
     ) {
         let Some(whole) = self.calibrated.push(second, data, frame, out) else {
@@ -376,7 +316,7 @@ impl Strain {
         second: bool,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<FullScales>,
+        link: &mut Supervision<StrainScales>,
         out: &mut Decoded,
     ) {
         let Some(whole) = self.raw.push(second, data, frame, out) else {
@@ -391,10 +331,80 @@ impl Strain {
     }
 }
 
-impl Family for Strain {
-    type Questions = FullScales;
+impl Driver for IcubStrainOptions {
+    const NAME: &'static str = "icub_strain";
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<FullScales>, out: &mut Decoded) {
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Wrench)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let address = icub::address(spec)?;
+        let period = icub::period_ms("period_ms", self.period_ms)?;
+        let configured = self.full_scale(false)?;
+        let timing = icub::timing(self.power_on_silence_ms)?;
+        let limit = match self.pair_timeout_ms {
+            None => Limit::of_period(Nanos::from_millis(i64::from(period))),
+            Some(ms) if ms.is_finite() && ms > 0.0 && ms <= 1000.0 => {
+                Limit::fixed(Nanos::from_seconds(ms * 1e-3))
+            }
+            Some(value) => {
+                return Err(SpecError::Key {
+                    key: "pair_timeout_ms",
+                    value,
+                    expected: "above 0 and at most 1000",
+                });
+            }
+        };
+        let (force, command_id) = (
+            icub::stream(class::PERIODIC_ANALOG, address, kind::FORCE),
+            icub::to_board(class::POLLING_ANALOG, address),
+        );
+        let watched = match self.stream {
+            StrainStream::Uncalibrated => {
+                icub::stream(class::PERIODIC_ANALOG, address, kind::RAW_FORCE)
+            }
+            StrainStream::Calibrated | StrainStream::Both => force,
+        };
+        let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
+        bringup.start_with(command_id, &[command::SET_CANDATARATE, period]);
+        if let Some(seconds) = self.temperature_period_s {
+            let seconds = icub::period_ms("temperature_period_s", seconds)?;
+            bringup.start_with(command_id, &[command::THERMOMETER_CONFIG_SET, 1]);
+            bringup.start_with(command_id, &[command::THERMOMETER_TRANSMIT, seconds]);
+            bringup.stop_with(command_id, &[command::THERMOMETER_TRANSMIT, 0]);
+        }
+        bringup.start_with(command_id, &[command::SET_TXMODE, self.stream.code()]);
+        bringup.stop_with(command_id, &[command::SET_TXMODE, 1]);
+        let mut claims: ArrayVec<Claim, 7> = icub::claims(
+            class::PERIODIC_ANALOG,
+            address,
+            &[
+                kind::FORCE,
+                kind::TORQUE,
+                kind::RAW_FORCE,
+                kind::RAW_TORQUE,
+                kind::THERMOMETER,
+                kind::THERMOMETER_FIRMWARE,
+            ],
+        );
+        claims.push(Claim::shared(icub::to_host(class::POLLING_ANALOG, address)));
+        let scales = StrainScales::new(address, configured, self.stream);
+        let this = Strain {
+            address,
+            exchange: Exchange::new(address),
+            stream: self.stream,
+            calibrated: Pair::new(limit),
+            raw: Pair::new(limit),
+        };
+        Ok(Supervised::boxed(claims, bringup, scales, this))
+    }
+}
+
+impl Family for Strain {
+    type Questions = StrainScales;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<StrainScales>, out: &mut Decoded) {
         if let Some(stream) = icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) {
             let known = matches!(stream, kind::RAW_FORCE..=kind::TORQUE | kind::THERMOMETER..);
             let Some(data) = known.then(|| bytes::payload(frame, out)).flatten() else {
@@ -438,7 +448,7 @@ impl Family for Strain {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Link<FullScales>,
+        _link: &mut Supervision<StrainScales>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         self.exchange.poll(now)
@@ -460,10 +470,11 @@ impl Family for Strain {
         &mut self,
         command: Command,
         now: Nanos,
-        link: &Link<FullScales>,
+        link: &Supervision<StrainScales>,
     ) -> Result<(), CommandRefused> {
         let tares = command == Command::Tare;
-        if tares && self.stream == Stream::Uncalibrated && link.bringup.mode() != Mode::Listen {
+        if tares && self.stream == StrainStream::Uncalibrated && link.bringup.mode() != Mode::Listen
+        {
             return Err(CommandRefused::Useless(
                 "this device streams raw gauges alone, which a tare does not change",
             ));
@@ -478,7 +489,7 @@ impl Family for Strain {
 
     fn outcome(
         &mut self,
-        link: &Link<FullScales>,
+        link: &Supervision<StrainScales>,
     ) -> Option<Result<CommandOutcome, CommandFailed>> {
         Some(match self.exchange.outcome()? {
             Ok((Command::Tare, told)) => {

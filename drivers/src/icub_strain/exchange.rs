@@ -18,7 +18,7 @@ const ALL: usize = SCALES + 36;
 pub(super) type Told = [u16; ALL];
 
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Step {
+enum ExchangeStep {
     Idle,
     /// The command is to be sent, or on its way.
     Commanding,
@@ -32,7 +32,7 @@ enum Step {
 pub(super) struct Exchange {
     address: u8,
     what: Command,
-    step: Step,
+    step: ExchangeStep,
     /// Given up after this.
     limit: Nanos,
     attempts: Attempts,
@@ -50,7 +50,7 @@ impl Exchange {
         Self {
             address,
             what: Command::Tare,
-            step: Step::Idle,
+            step: ExchangeStep::Idle,
             limit: Nanos::MIN,
             attempts: Attempts::new(icub::TIMING),
             under_way: None,
@@ -63,7 +63,7 @@ impl Exchange {
 
     /// Whether one has begun and its outcome has not been taken.
     pub(super) const fn is_open(&self) -> bool {
-        !matches!(self.step, Step::Idle) || self.outcome.is_some()
+        !matches!(self.step, ExchangeStep::Idle) || self.outcome.is_some()
     }
 
     const fn tares(&self) -> bool {
@@ -73,15 +73,15 @@ impl Exchange {
     /// Whether this reading may be the first with a new zero: each one from the command to the end
     /// of the tare, and the next.
     pub(super) fn take_step(&mut self) -> bool {
-        let taring = self.tares() && matches!(self.step, Step::Asking(_));
+        let taring = self.tares() && matches!(self.step, ExchangeStep::Asking(_));
         core::mem::take(&mut self.may_step) || taring
     }
 
     pub(super) fn begin(&mut self, what: Command, now: Nanos) {
         self.what = what;
         self.step = match what {
-            Command::Tare => Step::Commanding,
-            Command::Calibration => Step::Asking(0),
+            Command::Tare => ExchangeStep::Commanding,
+            Command::Calibration => ExchangeStep::Asking(0),
         };
         self.attempts.begin();
         self.limit = now + COMMAND_TIME;
@@ -112,7 +112,7 @@ impl Exchange {
 
     /// The next frame to send at `now`.
     pub(super) fn poll(&mut self, now: Nanos) -> Option<Frame> {
-        if self.step == Step::Idle || self.under_way.is_some() {
+        if self.step == ExchangeStep::Idle || self.under_way.is_some() {
             return None;
         }
         if now > self.limit {
@@ -120,15 +120,15 @@ impl Exchange {
             return None;
         }
         self.under_way = match self.step {
-            Step::Asking(at) if now >= self.attempts.next() => {
+            ExchangeStep::Asking(at) if now >= self.attempts.next() => {
                 self.attempts.ask(now);
                 if let Some(open) = self.open.get_mut(at) {
                     *open = open.saturating_add(1);
                 }
                 Some(self.question(at))
             }
-            Step::Commanding => Some(self.command()),
-            Step::Asking(_) | Step::Idle => None,
+            ExchangeStep::Commanding => Some(self.command()),
+            ExchangeStep::Asking(_) | ExchangeStep::Idle => None,
         };
         self.under_way
     }
@@ -142,12 +142,12 @@ impl Exchange {
         // A command that was given up on its way takes effect, too.
         self.may_step |= commanded && outcome.is_ok();
         match self.step {
-            Step::Commanding if commanded && outcome.is_ok() => {
-                self.step = Step::Asking(0);
+            ExchangeStep::Commanding if commanded && outcome.is_ok() => {
+                self.step = ExchangeStep::Asking(0);
                 self.attempts.begin();
             }
-            Step::Commanding if commanded => self.end(Err(CommandFailed::NotSent)),
-            Step::Asking(at) if !commanded => {
+            ExchangeStep::Commanding if commanded => self.end(Err(CommandFailed::NotSent)),
+            ExchangeStep::Asking(at) if !commanded => {
                 // If the answer is here already, the next question is another one.
                 let asked = if *frame == self.question(at) {
                     self.attempts.sent(outcome);
@@ -215,11 +215,11 @@ impl Exchange {
             return out.fault(Counter::Unexpected, 1, frame.id);
         }
         *open -= 1;
-        if self.step != Step::Asking(at) {
+        if self.step != ExchangeStep::Asking(at) {
             return;
         }
         *told = number;
-        self.step = Step::Asking(at + 1);
+        self.step = ExchangeStep::Asking(at + 1);
         self.attempts.begin();
         if at + 1 == if is_tare { 6 } else { ALL } {
             self.end(Ok((self.what, self.told)));
@@ -237,15 +237,17 @@ impl Exchange {
 
     fn give_up(&mut self, why: CommandFailed) {
         match self.step {
-            Step::Idle => {}
-            Step::Commanding if self.under_way.is_none() => self.end(Err(CommandFailed::NotSent)),
-            Step::Commanding | Step::Asking(_) => self.end(Err(why)),
+            ExchangeStep::Idle => {}
+            ExchangeStep::Commanding if self.under_way.is_none() => {
+                self.end(Err(CommandFailed::NotSent));
+            }
+            ExchangeStep::Commanding | ExchangeStep::Asking(_) => self.end(Err(why)),
         }
     }
 
     fn end(&mut self, outcome: Result<(Command, Told), CommandFailed>) {
-        self.may_step |= self.tares() && matches!(self.step, Step::Asking(_));
-        self.step = Step::Idle;
+        self.may_step |= self.tares() && matches!(self.step, ExchangeStep::Asking(_));
+        self.step = ExchangeStep::Idle;
         self.outcome = Some(outcome);
     }
 
@@ -257,9 +259,9 @@ impl Exchange {
     pub(super) fn wake(&self) -> Option<Nanos> {
         match self.step {
             _ if self.under_way.is_some() => None,
-            Step::Idle => None,
-            Step::Commanding => Some(Nanos::MIN),
-            Step::Asking(_) => Some(self.attempts.next().min(self.limit + Nanos(1))),
+            ExchangeStep::Idle => None,
+            ExchangeStep::Commanding => Some(Nanos::MIN),
+            ExchangeStep::Asking(_) => Some(self.attempts.next().min(self.limit + Nanos(1))),
         }
     }
 }

@@ -25,13 +25,13 @@ pub(super) const CELSIUS_PER_LSB: f64 = 0.1;
 
 /// Half a reading: one frame of a pair.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Half {
+pub(super) struct StrainHalf {
     pub(super) counts: [u16; 3],
     /// Its saturation byte, 0 if there is none.
     pub(super) saturation: u8,
 }
 
-impl Half {
+impl StrainHalf {
     pub(super) fn parse(data: &[u8]) -> Result<Self, Counter> {
         let saturation = match *data {
             [_, _, _, _, _, _] => 0,

@@ -8,7 +8,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum Stream {
+pub enum StrainStream {
     /// Wrenches.
     #[default]
     Calibrated,
@@ -18,7 +18,7 @@ pub enum Stream {
     Both,
 }
 
-impl Stream {
+impl StrainStream {
     /// The mode of SET_TXMODE.
     pub(super) const fn code(self) -> u8 {
         match self {
@@ -43,7 +43,7 @@ impl Stream {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct IcubStrainOptions {
     /// Full scale of fx fy fz \[N\]; default: the board's own.
     #[serde(deserialize_with = "wrench::three")]
     pub full_scale_n: Option<[f64; 3]>,
@@ -53,7 +53,7 @@ pub struct Options {
     /// Period \[ms\], 1 to 255; default 10.
     pub period_ms: u32,
     /// The streamed quantities; default calibrated.
-    pub stream: Stream,
+    pub stream: StrainStream,
     /// Period of the temperature \[s\], 1 to 255; default none.
     pub temperature_period_s: Option<u32>,
     /// Longest time from a force frame to its torque frame \[ms\]; default by the period.
@@ -62,13 +62,13 @@ pub struct Options {
     pub power_on_silence_ms: u32,
 }
 
-impl Default for Options {
+impl Default for IcubStrainOptions {
     fn default() -> Self {
         Self {
             full_scale_n: None,
             full_scale_nm: None,
             period_ms: 10,
-            stream: Stream::Calibrated,
+            stream: StrainStream::Calibrated,
             temperature_period_s: None,
             pair_timeout_ms: None,
             power_on_silence_ms: 0,
@@ -76,7 +76,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl IcubStrainOptions {
     /// The configured full scale, force then torque.
     pub(super) fn full_scale(&self, zero_allowed: bool) -> Result<Option<[f64; 6]>, SpecError> {
         wrench::full_scale(self.full_scale_n, self.full_scale_nm, zero_allowed)

@@ -1,10 +1,12 @@
 //! The board's own side. It reports its full scales, executes the host's commands, and sends
 //! readings as frames.
 
-use super::options::Options;
+use super::options::Jr3CanOptions;
 use super::protocol::{NEWTON_METRE_PER_LSB, READY, SAMPLE, STEPS, id, node, op, op_of};
-use crate::bytes;
-use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Spec, SpecError};
+use crate::{
+    Board, EncodeError, Format, Frame, Frames, Mode, Simulate, Spec, SpecError, board, bytes,
+};
+use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading, Saturation};
 
 /// The full scales of a sensor of the firmware's authors \[N, Nm\]: those of a simulated one.
@@ -12,7 +14,7 @@ const USUAL_FULL_SCALE: [f64; 6] = [115.0, 111.0, 185.0, 5.6, 5.2, 6.1];
 
 /// The board's own side.
 #[derive(Debug)]
-pub struct Jr3Board {
+struct Jr3Board {
     node: u16,
     full_scale: [f64; 6],
     period: Nanos,
@@ -25,23 +27,6 @@ pub struct Jr3Board {
 }
 
 impl Jr3Board {
-    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
-    ///
-    /// # Errors
-    /// [`SpecError`]: a number outside 1 to 127, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        options.cutoff()?;
-        Ok(Self {
-            node: node(spec)?,
-            full_scale: options.full_scale()?.unwrap_or(USUAL_FULL_SCALE),
-            period: options.period()?,
-            streaming: spec.mode == Mode::Listen,
-            elapsed: Nanos::ZERO,
-            zero: [0; 6],
-            zeroing: false,
-        })
-    }
-
     fn acknowledge(&self, scales: &[(f64, f64)], out: &mut Frames) {
         let mut data = [READY; 7];
         let (_, to) = data.split_at_mut(1);
@@ -52,6 +37,22 @@ impl Jr3Board {
         let length = 1 + 2 * scales.len();
         let id = id(op::ACKNOWLEDGE, self.node);
         let _ = out.try_push(Frame::new(id, data.get(..length).unwrap_or(&data)));
+    }
+}
+
+impl Simulate for Jr3CanOptions {
+    /// A board after power-on; in [`Mode::Listen`] another program has already started it.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        self.cutoff()?;
+        Ok(Box::new(Jr3Board {
+            node: node(spec)?,
+            full_scale: self.full_scale()?.unwrap_or(USUAL_FULL_SCALE),
+            period: self.period()?,
+            streaming: spec.mode == Mode::Listen,
+            elapsed: Nanos::ZERO,
+            zero: [0; 6],
+            zeroing: false,
+        }))
     }
 }
 
@@ -103,17 +104,7 @@ impl Board for Jr3Board {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        let Reading::Wrench(wrench) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
-        let ([fx, fy, fz], [tx, ty, tz]) = (wrench.force, wrench.torque);
-        let values = [fx, fy, fz, tx, ty, tz];
-        if !values.iter().all(|value| value.is_finite()) {
-            return Err(EncodeError::NotFinite);
-        }
+        let values = board::axes(board::only_wrench(output, reading)?)?;
         let mut counts = [0; 6];
         for (count, (value, full_scale)) in counts
             .iter_mut()

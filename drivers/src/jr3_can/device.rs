@@ -1,31 +1,31 @@
 //! The host's side of a board. It asks for the full scales, starts the board, and combines the
 //! frames of force and moment.
 
-use super::options::Options;
+use super::options::Jr3CanOptions;
 use super::protocol::{READY, SAMPLE, STEPS, id, node, op, op_of};
-use super::scales::{FullScales, Question};
+use super::scales::{Jr3Scales, Question};
 use crate::bringup::{Bringup, Timing};
-use crate::bytes;
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::wrench::{NewZero, TareCommand, at_end};
 use crate::{
     Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
-    Frame, Mode, NotSent, Output, Spec, SpecError,
+    Driver, Frame, Mode, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
 };
 use alloc::boxed::Box;
-use proprio_topics::{Counter, Nanos, Quality, Reading, Refusal, StampKind, Wrench};
+use alloc::vec::Vec;
+use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Refusal, StampKind, Wrench};
 
 /// A command that is not acknowledged within this time has taken effect, or was lost.
 const ACKNOWLEDGED: Nanos = Nanos::from_millis(100);
 
 /// One frame of a reading.
 #[derive(Debug, Clone, Copy)]
-struct Half {
+struct Jr3Half {
     counts: [i16; 3],
     counter: u16,
 }
 
-impl Half {
+impl Jr3Half {
     fn parse(data: &[u8]) -> Option<Self> {
         let &[a, b, c, d, e, f, g, h] = data else {
             return None;
@@ -43,7 +43,7 @@ pub(super) struct Jr3 {
     node: u16,
     period: Nanos,
     /// The force that waits for its moment, and its stamp.
-    waiting: Option<(Nanos, StampKind, Half)>,
+    waiting: Option<(Nanos, StampKind, Jr3Half)>,
     /// Whether a force was heard: the moment of an earlier one is not missing anything.
     joined: bool,
     /// The counter of the last reading.
@@ -55,40 +55,6 @@ pub(super) struct Jr3 {
 }
 
 impl Jr3 {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let node = node(spec)?;
-        let (period, cutoff) = (options.period()?, options.cutoff()?);
-        let scales = FullScales::new(node, options.full_scale()?);
-        let mut bringup = Bringup::new(spec, spec.mode, Timing::USUAL, id(op::FORCE, node));
-        let [c0, c1] = cutoff.to_le_bytes();
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // at most a second
-        let [p0, p1, p2, p3] = ((period.0 / 1000) as u32).to_le_bytes();
-        bringup.start_with(id(op::START, node), &[c0, c1, p0, p1, p2, p3]);
-        bringup.stop_with(id(op::STOP, node), &[]);
-        let own = [op::FORCE, op::MOMENT, op::ACKNOWLEDGE, op::BOOT_UP];
-        let heard = [
-            op::START_SYNC,
-            op::START,
-            op::ZERO,
-            op::GET_FORCE_SCALES,
-            op::GET_MOMENT_SCALES,
-        ];
-        let own = own.map(|op| Claim::exclusive(id(op, node)));
-        let heard = heard.map(|op| Claim::shared(id(op, node)));
-        let this = Self {
-            node,
-            period,
-            waiting: None,
-            joined: false,
-            last: None,
-            zero: NewZero::default(),
-            tare: TareCommand::default(),
-            outcome: None,
-        };
-        let claims = own.into_iter().chain(heard);
-        Ok(Supervised::boxed(claims, bringup, scales, this))
-    }
-
     /// A command that changes the zero was sent at `t`.
     fn expect_zero(&mut self, t: Nanos) {
         self.zero.expect(t + ACKNOWLEDGED);
@@ -98,7 +64,7 @@ impl Jr3 {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Link<FullScales>,
+        link: &mut Supervision<Jr3Scales>,
         out: &mut Decoded,
     ) {
         match *data {
@@ -119,7 +85,13 @@ impl Jr3 {
         }
     }
 
-    fn force(&mut self, half: Half, frame: &Frame, link: &mut Link<FullScales>, out: &mut Decoded) {
+    fn force(
+        &mut self,
+        half: Jr3Half,
+        frame: &Frame,
+        link: &mut Supervision<Jr3Scales>,
+        out: &mut Decoded,
+    ) {
         self.joined = true;
         if self.waiting.replace((frame.t, frame.stamp, half)).is_some() {
             link.bringup.lost();
@@ -129,9 +101,9 @@ impl Jr3 {
 
     fn moment(
         &mut self,
-        half: Half,
+        half: Jr3Half,
         frame: &Frame,
-        link: &mut Link<FullScales>,
+        link: &mut Supervision<Jr3Scales>,
         out: &mut Decoded,
     ) {
         let force = (self.waiting).take_if(|(_, _, force)| force.counter == half.counter);
@@ -193,10 +165,53 @@ impl Jr3 {
     }
 }
 
-impl Family for Jr3 {
-    type Questions = FullScales;
+impl Driver for Jr3CanOptions {
+    const NAME: &'static str = "jr3_can";
+    const ADDRESS: Option<u32> = Some(1);
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<FullScales>, out: &mut Decoded) {
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Wrench)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let node = node(spec)?;
+        let (period, cutoff) = (self.period()?, self.cutoff()?);
+        let scales = Jr3Scales::new(node, self.full_scale()?);
+        let mut bringup = Bringup::new(spec, spec.mode, Timing::USUAL, id(op::FORCE, node));
+        let [c0, c1] = cutoff.to_le_bytes();
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // at most a second
+        let [p0, p1, p2, p3] = ((period.0 / 1000) as u32).to_le_bytes();
+        bringup.start_with(id(op::START, node), &[c0, c1, p0, p1, p2, p3]);
+        bringup.stop_with(id(op::STOP, node), &[]);
+        let own = [op::FORCE, op::MOMENT, op::ACKNOWLEDGE, op::BOOT_UP];
+        let heard = [
+            op::START_SYNC,
+            op::START,
+            op::ZERO,
+            op::GET_FORCE_SCALES,
+            op::GET_MOMENT_SCALES,
+        ];
+        let own = own.map(|op| Claim::exclusive(id(op, node)));
+        let heard = heard.map(|op| Claim::shared(id(op, node)));
+        let this = Jr3 {
+            node,
+            period,
+            waiting: None,
+            joined: false,
+            last: None,
+            zero: NewZero::default(),
+            tare: TareCommand::default(),
+            outcome: None,
+        };
+        let claims = own.into_iter().chain(heard);
+        Ok(Supervised::boxed(claims, bringup, scales, this))
+    }
+}
+
+impl Family for Jr3 {
+    type Questions = Jr3Scales;
+
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<Jr3Scales>, out: &mut Decoded) {
         let Some(op) = op_of(frame.id, self.node) else {
             return;
         };
@@ -214,7 +229,7 @@ impl Family for Jr3 {
         let Some(data) = bytes::payload(frame, out) else {
             return;
         };
-        match (op, Half::parse(data)) {
+        match (op, Jr3Half::parse(data)) {
             (op::ACKNOWLEDGE, _) => self.acknowledge(data, frame, link, out),
             (op::FORCE, Some(half)) => self.force(half, frame, link, out),
             (op::MOMENT, Some(half)) => self.moment(half, frame, link, out),
@@ -227,7 +242,7 @@ impl Family for Jr3 {
         }
     }
 
-    fn full_scale(&self, link: &Link<FullScales>) -> Option<[f64; 6]> {
+    fn full_scale(&self, link: &Supervision<Jr3Scales>) -> Option<[f64; 6]> {
         Some(link.questions.per_step?.map(|step| step * STEPS))
     }
 
@@ -240,7 +255,7 @@ impl Family for Jr3 {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Link<FullScales>,
+        _link: &mut Supervision<Jr3Scales>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         let due = self.tare.poll(now);
@@ -271,7 +286,7 @@ impl Family for Jr3 {
         &mut self,
         command: Command,
         now: Nanos,
-        link: &Link<FullScales>,
+        link: &Supervision<Jr3Scales>,
     ) -> Result<(), CommandRefused> {
         if self.tare.is_open() {
             return Err(CommandRefused::Busy);
@@ -294,7 +309,7 @@ impl Family for Jr3 {
 
     fn outcome(
         &mut self,
-        _link: &Link<FullScales>,
+        _link: &Supervision<Jr3Scales>,
     ) -> Option<Result<CommandOutcome, CommandFailed>> {
         self.outcome.take().map(Ok).or_else(|| self.tare.outcome())
     }

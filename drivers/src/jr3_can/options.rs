@@ -8,7 +8,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct Jr3CanOptions {
     /// Full scale of fx fy fz \[N\]; default: the board's own.
     #[serde(deserialize_with = "wrench::three")]
     pub full_scale_n: Option<[f64; 3]>,
@@ -21,7 +21,7 @@ pub struct Options {
     pub cutoff_hz: f64,
 }
 
-impl Default for Options {
+impl Default for Jr3CanOptions {
     fn default() -> Self {
         Self {
             full_scale_n: None,
@@ -32,7 +32,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl Jr3CanOptions {
     /// The configured full scale, force then torque.
     pub(super) fn full_scale(&self) -> Result<Option<[f64; 6]>, SpecError> {
         wrench::full_scale(self.full_scale_n, self.full_scale_nm, false)

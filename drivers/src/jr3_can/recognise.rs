@@ -1,12 +1,13 @@
 //! Recognising boards: by the counter in both halves of a reading, and by their full scales.
 
+use super::Jr3CanOptions;
 use super::protocol::{READY, id, op};
 use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
-use crate::{Frame, bytes};
+use crate::{Driver, Frame, Recognise, bytes};
 use alloc::vec::Vec;
 
 /// Board `node`, if `seen` shows it.
-pub(super) fn board(seen: &Traffic, driver: &'static str, node: u16) -> Option<Finding> {
+fn board(seen: &Traffic, driver: &'static str, node: u16) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, 127);
     let force = evidence.sends_length(id(op::FORCE, node), 8);
     let moment = evidence.sends_length(id(op::MOMENT, node), 8);
@@ -66,9 +67,19 @@ pub(super) fn board(seen: &Traffic, driver: &'static str, node: u16) -> Option<F
 
 const WHAT: &str = "JR3 sensor at a board of UC3M";
 
-/// All boards are asked for their full scales.
-pub(super) fn questions() -> Vec<Frame> {
-    let ops = [op::GET_FORCE_SCALES, op::GET_MOMENT_SCALES];
-    let questions = (1..=0x7F).flat_map(|node| ops.map(|op| Frame::new(id(op, node), &[])));
-    questions.collect()
+impl Recognise for Jr3CanOptions {
+    const ASKED_BY_NAME: bool = true;
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        (1..=0x7F)
+            .filter_map(|node| board(seen, Self::NAME, node))
+            .collect()
+    }
+
+    /// All boards are asked for their full scales.
+    fn questions(_seen: &Traffic) -> Vec<Frame> {
+        let ops = [op::GET_FORCE_SCALES, op::GET_MOMENT_SCALES];
+        let questions = (1..=0x7F).flat_map(|node| ops.map(|op| Frame::new(id(op, node), &[])));
+        questions.collect()
+    }
 }

@@ -17,7 +17,7 @@ pub(super) enum Question {
 }
 
 #[derive(Debug)]
-pub(super) struct FullScales {
+pub(super) struct Jr3Scales {
     /// The full scales are configured: nothing to ask.
     pub(super) settled: bool,
     /// N or Nm per step of the stream, once all six are known.
@@ -35,7 +35,7 @@ pub(super) struct FullScales {
     open_until: Nanos,
 }
 
-impl FullScales {
+impl Jr3Scales {
     pub(super) fn new(node: u16, configured: Option<[f64; 6]>) -> Self {
         Self {
             settled: configured.is_some(),
@@ -128,7 +128,7 @@ impl FullScales {
     }
 }
 
-impl Inquiry for FullScales {
+impl Inquiry for Jr3Scales {
     fn begin(&mut self) {
         self.question = Question::Forces;
         self.attempts.begin();

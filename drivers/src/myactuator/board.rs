@@ -2,40 +2,25 @@
 //! asked once a period.
 
 use super::frames::{
-    ANY_ERROR, Answer, ENCODER_ERROR, JOINT, LENGTH, MOTOR, Protocol, State, command,
+    ANY_ERROR, Answer, ENCODER_ERROR, JOINT, LENGTH, MOTOR, MotorStatus, MyactuatorProtocol,
+    command,
 };
-use super::options::{Checked, Options, Position};
+use super::options::{MyactuatorKeys, MyactuatorOptions, MyactuatorPosition};
 use crate::bytes::{quantise, quantise_i16};
-use crate::{Board, EncodeError, Format, Frame, Frames, Spec, SpecError, mit};
+use crate::{Board, EncodeError, Format, Frame, Frames, Simulate, Spec, SpecError, mit};
+use alloc::boxed::Box;
 use proprio_topics::{JointState, Nanos, Quality, Reading};
 
 /// A simulated motor.
 #[derive(Debug)]
-pub struct MyactuatorBoard {
-    keys: Checked,
+struct MyactuatorBoard {
+    keys: MyactuatorKeys,
     joint: JointState,
     errors: u16,
     celsius: i8,
 }
 
 impl MyactuatorBoard {
-    /// A motor at 25 degrees Celsius.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 32, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        Ok(Self {
-            keys: Checked::new(spec, options)?,
-            joint: JointState {
-                position: 0.0,
-                velocity: 0.0,
-                ..JointState::ABSENT
-            },
-            errors: 0,
-            celsius: 25,
-        })
-    }
-
     fn frame(&self, answer: Answer) -> Frame {
         let data = answer.pack(self.keys.protocol, self.celsius);
         Frame::new(self.keys.answers(), &data)
@@ -43,7 +28,7 @@ impl MyactuatorBoard {
 
     #[allow(clippy::cast_possible_truncation)] // limited, or within a turn
     fn state(&self) -> Answer {
-        let Checked {
+        let MyactuatorKeys {
             protocol,
             place_step,
             speed_step,
@@ -66,13 +51,13 @@ impl MyactuatorBoard {
         };
         let current = current / ampere_per_step;
         let place = match protocol {
-            Protocol::V3 => i64::from(quantise_i16(position, place_step)),
-            Protocol::V2 => {
+            MyactuatorProtocol::V3 => i64::from(quantise_i16(position, place_step)),
+            MyactuatorProtocol::V2 => {
                 let steps = quantise(position, place_step, i64::MIN, i64::MAX);
                 steps.rem_euclid(1 << encoder_bits)
             }
         };
-        Answer::State(State {
+        Answer::State(MotorStatus {
             celsius: self.celsius,
             current: if current.is_finite() {
                 quantise_i16(current, 1.0)
@@ -86,8 +71,8 @@ impl MyactuatorBoard {
 
     fn angle(&self) -> Answer {
         let most = match self.keys.protocol {
-            Protocol::V3 => i64::from(i32::MAX),
-            Protocol::V2 => (1 << 55) - 1,
+            MyactuatorProtocol::V3 => i64::from(i32::MAX),
+            MyactuatorProtocol::V2 => (1 << 55) - 1,
         };
         Answer::Angle(quantise(
             self.joint.position,
@@ -130,8 +115,8 @@ impl MyactuatorBoard {
                     let set = |flag, error| if quality.contains(flag) { error } else { 0 };
                     // V2 has no error of the encoder.
                     let sensor = match self.keys.protocol {
-                        Protocol::V3 => ENCODER_ERROR,
-                        Protocol::V2 => ANY_ERROR,
+                        MyactuatorProtocol::V3 => ENCODER_ERROR,
+                        MyactuatorProtocol::V2 => ANY_ERROR,
                     };
                     self.errors =
                         set(Quality::DEVICE_FAULT, sensor) | set(Quality::DRIVE_FAULT, ANY_ERROR);
@@ -147,6 +132,22 @@ impl MyactuatorBoard {
             _ => return Err(EncodeError::Output(output)),
         }
         Ok((self.errors != errors, sent))
+    }
+}
+
+impl Simulate for MyactuatorOptions {
+    /// A motor at 25 degrees Celsius.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(MyactuatorBoard {
+            keys: MyactuatorKeys::new(spec, self)?,
+            joint: JointState {
+                position: 0.0,
+                velocity: 0.0,
+                ..JointState::ABSENT
+            },
+            errors: 0,
+            celsius: 25,
+        }))
     }
 }
 
@@ -188,12 +189,12 @@ impl Board for MyactuatorBoard {
         let errors = new.then(|| self.frame(Answer::Errors(self.errors)));
         let joint = match self.keys.position {
             _ if !sent => [None, None],
-            Position::Angle => [
+            MyactuatorPosition::Angle => [
                 Some(self.frame(self.state())),
                 Some(self.frame(self.angle())),
             ],
-            Position::Status => [Some(self.frame(self.state())), None],
-            Position::Motion => [Some(self.motion()), None],
+            MyactuatorPosition::Status => [Some(self.frame(self.state())), None],
+            MyactuatorPosition::Motion => [Some(self.motion()), None],
         };
         for frame in errors.into_iter().chain(joint.into_iter().flatten()) {
             let _ = out.try_push(frame);

@@ -1,64 +1,42 @@
 //! The host's side: takes the answers of one motor, and asks for them if it is told to.
 
-use super::frames::{Answer, JOINT, LENGTH, MOTOR, Protocol, State, command};
-use super::options::{Checked, Options, Position};
+use super::frames::{Answer, JOINT, LENGTH, MOTOR, MotorStatus, MyactuatorProtocol, command};
+use super::options::{MyactuatorKeys, MyactuatorOptions, MyactuatorPosition};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Link, Rounds, Supervised, temperature};
-use crate::held::{Held, OnChange};
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError, bytes, mit};
+use crate::family::{Family, Rounds, Supervised, Supervision, temperature};
+use crate::held::{HeldValue, OnChange};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
+};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading};
+use alloc::vec::Vec;
+use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
 
 /// How often the errors are asked for.
 const ERRORS_PERIOD: Nanos = Nanos::from_millis(1000);
 
 /// The host's side of a motor.
 #[derive(Debug)]
-pub(super) struct Motor {
-    keys: Checked,
+pub(super) struct MyactuatorMotor {
+    keys: MyactuatorKeys,
     errors: u16,
     told: OnChange<u16>,
     temperature: OnChange<()>,
-    velocity: Held,
-    current: Held,
+    velocity: HeldValue,
+    current: HeldValue,
     /// The questions for what is measured, and the one for the errors.
     questions: Rounds,
     of_errors: Rounds,
 }
 
-impl Motor {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, options)?;
-        let (mode, timing) = match keys.request_period {
-            Some(_) => (spec.mode, Timing::POLLED),
-            None => (Mode::Listen, Timing::LISTENED),
-        };
-        let mut claims = [Claim::exclusive(keys.answers())].to_vec();
-        if keys.position == Position::Motion {
-            claims.insert(0, Claim::exclusive(keys.motion()));
-        }
-        let watched = claims.first().map_or(keys.answers(), |claim| claim.id);
-        let bringup = Bringup::new(spec, mode, timing, watched);
-        let this = Self {
-            keys,
-            errors: 0,
-            told: OnChange::NOTHING,
-            temperature: OnChange::NOTHING,
-            velocity: Held::ABSENT,
-            current: Held::ABSENT,
-            questions: Rounds::new(keys.request_period),
-            of_errors: Rounds::new(keys.request_period.map(|_| ERRORS_PERIOD)),
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
+impl MyactuatorMotor {
     /// A reading at `position`, with the speed and the current that are known.
     fn joint(
         &self,
         position: f64,
         saturated: bool,
         frame: &Frame,
-        link: &mut Link<NoInquiry>,
+        link: &mut Supervision<NoInquiry>,
         out: &mut Decoded,
     ) {
         let mut quality = self.keys.quality(self.errors);
@@ -78,30 +56,30 @@ impl Motor {
 
     fn state(
         &mut self,
-        state: State,
+        state: MotorStatus,
         frame: &Frame,
-        link: &mut Link<NoInquiry>,
+        link: &mut Supervision<NoInquiry>,
         out: &mut Decoded,
     ) {
-        let Checked {
+        let MyactuatorKeys {
             speed_step,
             ampere_per_step,
             place_step,
             ..
         } = self.keys;
-        self.velocity = Held::new(frame, f64::from(state.speed) * speed_step);
-        self.current = Held::new(frame, f64::from(state.current) * ampere_per_step);
+        self.velocity = HeldValue::new(frame, f64::from(state.speed) * speed_step);
+        self.current = HeldValue::new(frame, f64::from(state.current) * ampere_per_step);
         if self.temperature.is_due((), frame) {
             temperature(MOTOR, f64::from(state.celsius), frame, out);
         }
-        if self.keys.position != Position::Status {
+        if self.keys.position != MyactuatorPosition::Status {
             return;
         }
         let is_end = |value: i16| value == i16::MIN || value == i16::MAX;
         // An encoder begins anew.
         let place = match self.keys.protocol {
-            Protocol::V3 => i16::try_from(state.place).is_ok_and(is_end),
-            Protocol::V2 => false,
+            MyactuatorProtocol::V3 => i16::try_from(state.place).is_ok_and(is_end),
+            MyactuatorProtocol::V2 => false,
         };
         let saturated = place || is_end(state.speed) || is_end(state.current);
         let position = f64::from(state.place) * place_step;
@@ -122,7 +100,13 @@ impl Motor {
         }
     }
 
-    fn motion(&self, data: &[u8], frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn motion(
+        &self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Supervision<NoInquiry>,
+        out: &mut Decoded,
+    ) {
         let measured = (data.split_first()).filter(|(id, _)| u16::from(**id) == self.keys.address);
         let Some((raw, _)) = measured.and_then(|(_, measured)| mit::unpack(measured)) else {
             return out.fault(Counter::Value, 1, frame.id);
@@ -133,12 +117,47 @@ impl Motor {
     }
 }
 
-impl Family for Motor {
+impl Driver for MyactuatorOptions {
+    const NAME: &'static str = "myactuator";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let motor = OutputInfo::temperature(MOTOR, "motor");
+        [OutputInfo::new(JOINT, Kind::Joint), motor].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let keys = MyactuatorKeys::new(spec, self)?;
+        let (mode, timing) = match keys.request_period {
+            Some(_) => (spec.mode, Timing::POLLED),
+            None => (Mode::Listen, Timing::LISTENED),
+        };
+        let mut claims = [Claim::exclusive(keys.answers())].to_vec();
+        if keys.position == MyactuatorPosition::Motion {
+            claims.insert(0, Claim::exclusive(keys.motion()));
+        }
+        let watched = claims.first().map_or(keys.answers(), |claim| claim.id);
+        let bringup = Bringup::new(spec, mode, timing, watched);
+        let this = MyactuatorMotor {
+            keys,
+            errors: 0,
+            told: OnChange::NOTHING,
+            temperature: OnChange::NOTHING,
+            velocity: HeldValue::ABSENT,
+            current: HeldValue::ABSENT,
+            questions: Rounds::new(keys.request_period),
+            of_errors: Rounds::new(keys.request_period.map(|_| ERRORS_PERIOD)),
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+}
+
+impl Family for MyactuatorMotor {
     type Questions = NoInquiry;
 
     #[allow(clippy::cast_precision_loss)] // an angle of 2^53 steps is none
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
-        let is_motion = self.keys.position == Position::Motion && frame.id == self.keys.motion();
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+        let is_motion =
+            self.keys.position == MyactuatorPosition::Motion && frame.id == self.keys.motion();
         if !is_motion && frame.id != self.keys.answers() {
             return;
         }
@@ -154,7 +173,7 @@ impl Family for Motor {
         let asks = link.bringup.mode() == Mode::Supervise;
         match Answer::parse(self.keys.protocol, asks, data) {
             Some(Answer::State(state)) => self.state(state, frame, link, out),
-            Some(Answer::Angle(angle)) if self.keys.position == Position::Angle => {
+            Some(Answer::Angle(angle)) if self.keys.position == MyactuatorPosition::Angle => {
                 self.joint(angle as f64 * self.keys.angle_step, false, frame, link, out);
             }
             Some(Answer::Errors(errors)) => self.errors(errors, frame, out),
@@ -167,18 +186,18 @@ impl Family for Motor {
         self.errors = 0;
         self.told = OnChange::NOTHING;
         self.temperature = OnChange::NOTHING;
-        (self.velocity, self.current) = (Held::ABSENT, Held::ABSENT);
+        (self.velocity, self.current) = (HeldValue::ABSENT, HeldValue::ABSENT);
     }
 
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Link<NoInquiry>,
+        _link: &mut Supervision<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         let round: &[u8] = match self.keys.position {
-            Position::Angle => &[command::STATE, command::ANGLE],
-            Position::Status | Position::Motion => &[command::STATE],
+            MyactuatorPosition::Angle => &[command::STATE, command::ANGLE],
+            MyactuatorPosition::Status | MyactuatorPosition::Motion => &[command::STATE],
         };
         let errors = self.of_errors.ask(&[command::ERRORS], now);
         let command = errors.or_else(|| self.questions.ask(round, now))?;

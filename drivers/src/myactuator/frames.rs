@@ -7,7 +7,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum Protocol {
+pub enum MyactuatorProtocol {
     /// V3 and V4.
     #[default]
     V3,
@@ -42,7 +42,7 @@ pub(super) const ANY_ERROR: u16 = 0x40;
 /// What a motor answers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Answer {
-    State(State),
+    State(MotorStatus),
     /// Hundredths of a degree.
     Angle(i64),
     Errors(u16),
@@ -50,7 +50,7 @@ pub(super) enum Answer {
 
 /// A motor's state.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct State {
+pub(super) struct MotorStatus {
     /// Temperature \[degrees Celsius\].
     pub(super) celsius: i8,
     /// Current, in steps, and speed \[deg/s\].
@@ -62,12 +62,12 @@ pub(super) struct State {
 
 impl Answer {
     /// Reads a payload of 8 bytes; `None`: another command's, or no answer.
-    pub(super) fn parse(protocol: Protocol, asks: bool, data: &[u8]) -> Option<Self> {
+    pub(super) fn parse(protocol: MyactuatorProtocol, asks: bool, data: &[u8]) -> Option<Self> {
         let &[command, second, .., last] = data else {
             return None;
         };
         let is_state = command == command::STATE || command::MOVES.contains(&command);
-        if protocol == Protocol::V2 {
+        if protocol == MyactuatorProtocol::V2 {
             // The same identifier has commands: an answer tells a temperature.
             let is_question = data.iter().skip(1).all(|byte| *byte == 0);
             let is_command = command::MOVES.contains(&command) && second < 2;
@@ -77,31 +77,31 @@ impl Answer {
         }
         let signed = second.cast_signed();
         match (command, protocol) {
-            _ if is_state => Some(Self::State(State {
+            _ if is_state => Some(Self::State(MotorStatus {
                 celsius: signed,
                 current: i16_le(data, 2),
                 speed: i16_le(data, 4),
                 place: match protocol {
-                    Protocol::V3 => i32::from(i16_le(data, 6)),
-                    Protocol::V2 => i32::from(u16_le(data, 6)),
+                    MyactuatorProtocol::V3 => i32::from(i16_le(data, 6)),
+                    MyactuatorProtocol::V2 => i32::from(u16_le(data, 6)),
                 },
             })),
-            (command::ANGLE, Protocol::V3) => {
+            (command::ANGLE, MyactuatorProtocol::V3) => {
                 Some(Self::Angle(i64::from(u32_le(data, 4).cast_signed())))
             }
-            (command::ANGLE, Protocol::V2) => {
+            (command::ANGLE, MyactuatorProtocol::V2) => {
                 let high = i64::from(u32_le(data, 4).cast_signed());
                 Some(Self::Angle(high << 24 | i64::from(u32_le(data, 0) >> 8)))
             }
-            (command::ERRORS, Protocol::V3) => Some(Self::Errors(u16_le(data, 6))),
-            (command::ERRORS, Protocol::V2) => Some(Self::Errors(u16::from(last))),
+            (command::ERRORS, MyactuatorProtocol::V3) => Some(Self::Errors(u16_le(data, 6))),
+            (command::ERRORS, MyactuatorProtocol::V2) => Some(Self::Errors(u16::from(last))),
             _ => None,
         }
     }
 
     /// The payload; a state's as the answer to a question.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // within their ranges
-    pub(super) fn pack(self, protocol: Protocol, celsius: i8) -> [u8; 8] {
+    pub(super) fn pack(self, protocol: MyactuatorProtocol, celsius: i8) -> [u8; 8] {
         match (self, protocol) {
             (Self::State(state), _) => {
                 let [c0, c1] = state.current.to_le_bytes();
@@ -110,11 +110,11 @@ impl Answer {
                 let celsius = state.celsius.cast_unsigned();
                 [command::STATE, celsius, c0, c1, s0, s1, p0, p1]
             }
-            (Self::Angle(angle), Protocol::V3) => {
+            (Self::Angle(angle), MyactuatorProtocol::V3) => {
                 let [a, b, c, d] = (angle as i32).to_le_bytes();
                 [command::ANGLE, 0, 0, 0, a, b, c, d]
             }
-            (Self::Angle(angle), Protocol::V2) => {
+            (Self::Angle(angle), MyactuatorProtocol::V2) => {
                 let [a, b, c, d, e, f, g, _] = angle.to_le_bytes();
                 [command::ANGLE, a, b, c, d, e, f, g]
             }
@@ -122,8 +122,8 @@ impl Answer {
                 let [low, high] = errors.to_le_bytes();
                 let celsius = celsius.cast_unsigned();
                 match protocol {
-                    Protocol::V3 => [command::ERRORS, celsius, 0, 1, 0, 0, low, high],
-                    Protocol::V2 => [command::ERRORS, celsius, 0, 0, 0, 0, 0, low],
+                    MyactuatorProtocol::V3 => [command::ERRORS, celsius, 0, 1, 0, 0, low, high],
+                    MyactuatorProtocol::V2 => [command::ERRORS, celsius, 0, 0, 0, 0, 0, low],
                 }
             }
         }

@@ -1,6 +1,6 @@
 //! The keys of a motor in gateway.toml, for both sides of the driver.
 
-use super::frames::{ANSWERS, COMMANDS, ENCODER_ERROR, MOTION, Protocol};
+use super::frames::{ANSWERS, COMMANDS, ENCODER_ERROR, MOTION, MyactuatorProtocol};
 use crate::keys::{above_zero, address, duration};
 use crate::mit::Scale;
 use crate::{Id, Spec, SpecError};
@@ -12,7 +12,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum Position {
+pub enum MyactuatorPosition {
     /// Answers with an angle.
     #[default]
     Angle,
@@ -26,11 +26,11 @@ pub enum Position {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct MyactuatorOptions {
     /// Its protocol; default V3.
-    pub protocol: Protocol,
+    pub protocol: MyactuatorProtocol,
     /// Which frames are a reading of the joint; default those with an angle.
-    pub position: Position,
+    pub position: MyactuatorPosition,
     /// Turns of the shaft that is measured per turn of the output; default 1.
     pub gear_ratio: f64,
     /// Bits of the encoder, 12 to 16; default 16.
@@ -53,11 +53,11 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for MyactuatorOptions {
     fn default() -> Self {
         Self {
-            protocol: Protocol::V3,
-            position: Position::Angle,
+            protocol: MyactuatorProtocol::V3,
+            position: MyactuatorPosition::Angle,
             gear_ratio: 1.0,
             encoder_bits: 16,
             ampere_per_step: None,
@@ -77,10 +77,10 @@ const DEGREE: f64 = TAU / 360.0;
 
 /// The keys of a motor, checked.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Checked {
+pub(super) struct MyactuatorKeys {
     pub(super) address: u16,
-    pub(super) protocol: Protocol,
-    pub(super) position: Position,
+    pub(super) protocol: MyactuatorProtocol,
+    pub(super) position: MyactuatorPosition,
     /// Steps of an angle and of a place \[rad\], of a speed \[rad/s\], of a current \[A\].
     pub(super) angle_step: f64,
     pub(super) place_step: f64,
@@ -95,17 +95,17 @@ pub(super) struct Checked {
     pub(super) period: Nanos,
 }
 
-impl Checked {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+impl MyactuatorKeys {
+    pub(super) fn new(spec: &Spec, options: &MyactuatorOptions) -> Result<Self, SpecError> {
         let address = address(spec, 1..=32)?;
         let (protocol, position) = (options.protocol, options.position);
-        if position == Position::Motion && protocol == Protocol::V2 {
+        if position == MyactuatorPosition::Motion && protocol == MyactuatorProtocol::V2 {
             return Err(SpecError::Keys {
                 key: "position",
                 expected: "\"angle\" or \"status\" with protocol = \"v2\"",
             });
         }
-        if position == Position::Motion && options.request_period_ms.is_some() {
+        if position == MyactuatorPosition::Motion && options.request_period_ms.is_some() {
             return Err(SpecError::Keys {
                 key: "request_period_ms",
                 expected: "left out with position = \"motion\": what asks for it is a command",
@@ -128,14 +128,14 @@ impl Checked {
             position,
             angle_step: 0.01 * DEGREE / ratio,
             place_step: match protocol {
-                Protocol::V3 => DEGREE / ratio,
-                Protocol::V2 => TAU / f64::from(1 << options.encoder_bits) / ratio,
+                MyactuatorProtocol::V3 => DEGREE / ratio,
+                MyactuatorProtocol::V2 => TAU / f64::from(1 << options.encoder_bits) / ratio,
             },
             speed_step: DEGREE / ratio,
             ampere_per_step: match (ampere, protocol) {
                 (Some(ampere), _) => ampere,
-                (None, Protocol::V3) => 0.01,
-                (None, Protocol::V2) => f64::NAN,
+                (None, MyactuatorProtocol::V3) => 0.01,
+                (None, MyactuatorProtocol::V2) => f64::NAN,
             },
             encoder_bits: options.encoder_bits,
             torque_constant: stated("torque_constant", options.torque_constant)?
@@ -160,8 +160,8 @@ impl Checked {
 
     pub(super) const fn answers(&self) -> Id {
         match self.protocol {
-            Protocol::V3 => Id::standard(ANSWERS + self.address),
-            Protocol::V2 => self.commands(),
+            MyactuatorProtocol::V3 => Id::standard(ANSWERS + self.address),
+            MyactuatorProtocol::V2 => self.commands(),
         }
     }
 
@@ -172,8 +172,8 @@ impl Checked {
     /// The errors that make a position doubtful.
     pub(super) const fn encoder_errors(&self) -> u16 {
         match self.protocol {
-            Protocol::V3 => ENCODER_ERROR,
-            Protocol::V2 => 0,
+            MyactuatorProtocol::V3 => ENCODER_ERROR,
+            MyactuatorProtocol::V2 => 0,
         }
     }
 

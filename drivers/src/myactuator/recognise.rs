@@ -1,10 +1,10 @@
 //! Recognising motors by their answers to commands and questions.
 
 use super::frames::{ANSWERS, COMMANDS, LENGTH, MOTION, command};
-use super::options::Options;
+use super::options::MyactuatorOptions;
 use crate::bytes::{i16_le, u32_le};
 use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
-use crate::{Driver, Frame, Id, mit};
+use crate::{Driver, Frame, Id, Recognise, mit};
 use alloc::vec::Vec;
 
 /// The highest number.
@@ -33,11 +33,25 @@ fn is_answer(frame: &Frame) -> bool {
         }
 }
 
-/// The motors that `seen` shows.
-pub(super) fn motors(seen: &Traffic) -> Vec<Finding> {
-    let v3 = (1..=NUMBERS).filter_map(|address| v3(seen, address));
-    let v2 = (1..=NUMBERS).filter_map(|address| v2(seen, address));
-    v3.chain(v2).collect()
+impl Recognise for MyactuatorOptions {
+    const ASKED_BY_NAME: bool = true;
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let v3 = (1..=NUMBERS).filter_map(|address| v3(seen, address));
+        let v2 = (1..=NUMBERS).filter_map(|address| v2(seen, address));
+        v3.chain(v2).collect()
+    }
+
+    /// The errors and the state of all motors.
+    fn questions(_seen: &Traffic) -> Vec<Frame> {
+        let asked = |address: u16| {
+            [command::ERRORS, command::STATE].map(|command| {
+                let data = [command, 0, 0, 0, 0, 0, 0, 0];
+                Frame::new(Id::standard(COMMANDS + address), &data)
+            })
+        };
+        (1..=NUMBERS).flat_map(asked).collect()
+    }
 }
 
 /// Whether answers to `command` are in `stream`.
@@ -69,7 +83,7 @@ const AGREE: f64 = 5.0;
 
 fn finding(evidence: Evidence<'_>, address: u16, stream: &Stream) -> Option<Finding> {
     let what = "MyActuator RMD or LKMTech motor";
-    let finding = evidence.finding(Options::NAME, address.into(), what)?;
+    let finding = evidence.finding(MyactuatorOptions::NAME, address.into(), what)?;
     let position = (!has(stream, command::ANGLE)).then(|| Key::new("position", "\"status\""));
     let commands = Id::standard(COMMANDS + address);
     Some(
@@ -158,15 +172,4 @@ fn v2(seen: &Traffic, address: u16) -> Option<Finding> {
     }
     let finding = finding(evidence, address, stream)?;
     Some(finding.with_keys([Key::new("protocol", "\"v2\"")]))
-}
-
-/// The errors and the state of all motors.
-pub(super) fn questions() -> Vec<Frame> {
-    let asked = |address: u16| {
-        [command::ERRORS, command::STATE].map(|command| {
-            let data = [command, 0, 0, 0, 0, 0, 0, 0];
-            Frame::new(Id::standard(COMMANDS + address), &data)
-        })
-    };
-    (1..=NUMBERS).flat_map(asked).collect()
 }

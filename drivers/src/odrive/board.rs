@@ -2,8 +2,9 @@
 
 use super::firmware::{Firmware, error};
 use super::frames::{FET, JOINT, MOTOR, command, is_request};
-use super::options::{Checked, Options};
-use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use super::options::{OdriveKeys, OdriveOptions};
+use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board};
+use alloc::boxed::Box;
 use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
 use proprio_topics::{Nanos, Quality, Reading};
@@ -14,8 +15,8 @@ const VERSION: [u8; 8] = [2, 4, 4, 58, 0, 6, 9, 0];
 /// The device's own side of an axis. It streams the estimates, or answers requests if the keys say
 /// that it is asked.
 #[derive(Debug)]
-pub struct OdriveBoard {
-    keys: Checked,
+struct OdriveBoard {
+    keys: OdriveKeys,
     errors: u32,
     state: u8,
     estimates: [f64; 2],
@@ -28,23 +29,6 @@ pub struct OdriveBoard {
 }
 
 impl OdriveBoard {
-    /// An axis in closed-loop control.
-    ///
-    /// # Errors
-    /// [`SpecError`]: a node above 63, a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        Ok(Self {
-            keys: Checked::new(spec, options)?,
-            errors: 0,
-            state: 8,
-            estimates: [0.0; 2],
-            current: 0.0,
-            torque: 0.0,
-            temperatures: [f64::NAN; 2],
-            fresh: 0,
-        })
-    }
-
     /// The frame of `command` with the present values.
     #[allow(clippy::cast_possible_truncation)] // the protocol has single precision
     fn frame(&self, command: u8) -> Frame {
@@ -84,9 +68,7 @@ impl OdriveBoard {
         let mut messages = ArrayVec::new();
         match (output, reading) {
             (JOINT, Reading::Joint(joint)) => {
-                if !joint.position.is_finite() {
-                    return Err(EncodeError::NotFinite);
-                }
+                board::finite(&[joint.position])?;
                 let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
                 if firmware.quality(self.errors).0 != quality.0 & told.0 {
                     let (encoder, drive) = match firmware {
@@ -131,6 +113,22 @@ impl OdriveBoard {
             _ => return Err(EncodeError::Output(output)),
         }
         Ok(messages)
+    }
+}
+
+impl Simulate for OdriveOptions {
+    /// An axis in closed-loop control.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(OdriveBoard {
+            keys: OdriveKeys::new(spec, self)?,
+            errors: 0,
+            state: 8,
+            estimates: [0.0; 2],
+            current: 0.0,
+            torque: 0.0,
+            temperatures: [f64::NAN; 2],
+            fresh: 0,
+        }))
     }
 }
 

@@ -2,15 +2,17 @@
 
 use super::firmware::{Firmware, error};
 use super::frames::{FET, JOINT, LENGTH, MOTOR, command, is_request};
-use super::options::{Checked, Options};
+use super::options::{OdriveKeys, OdriveOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::bytes;
-use crate::family::{Family, Link, Rounds, Supervised, temperature};
-use crate::held::Held;
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
+use crate::family::{Family, Rounds, Supervised, Supervision, temperature};
+use crate::held::HeldValue;
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+};
 use alloc::boxed::Box;
+use alloc::vec::Vec;
 use core::f64::consts::TAU;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading};
+use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
 
 /// The float in half `half` of a payload.
 fn float(data: &[u8], half: usize) -> f64 {
@@ -19,36 +21,23 @@ fn float(data: &[u8], half: usize) -> f64 {
 
 /// The host's side of an axis.
 #[derive(Debug)]
-pub(super) struct Axis {
-    keys: Checked,
+pub(super) struct OdriveAxis {
+    keys: OdriveKeys,
     /// The quality from the last heartbeat.
     status: Quality,
-    current: Held,
-    torque: Held,
+    current: HeldValue,
+    torque: HeldValue,
     requests: Rounds,
 }
 
-impl Axis {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, options)?;
-        let mode = match keys.request_period {
-            Some(_) => spec.mode,
-            None => Mode::Listen,
-        };
-        let bringup = Bringup::new(spec, mode, Timing::LISTENED, keys.id(command::ESTIMATES));
-        let commands = keys.firmware.commands().iter();
-        let claims = commands.map(|command| Claim::exclusive(keys.id(*command)));
-        let this = Self {
-            keys,
-            status: Quality::GOOD,
-            current: Held::ABSENT,
-            torque: Held::ABSENT,
-            requests: Rounds::new(keys.request_period),
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
-    fn estimates(&self, data: &[u8], frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+impl OdriveAxis {
+    fn estimates(
+        &self,
+        data: &[u8],
+        frame: &Frame,
+        link: &mut Supervision<NoInquiry>,
+        out: &mut Decoded,
+    ) {
         let (position, velocity) = (float(data, 0) * TAU, float(data, 1) * TAU);
         if !position.is_finite() {
             link.bringup.lost();
@@ -94,10 +83,44 @@ impl Axis {
     }
 }
 
-impl Family for Axis {
+impl Driver for OdriveOptions {
+    const NAME: &'static str = "odrive";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let temperature = OutputInfo::temperature;
+        let joint = OutputInfo::new(JOINT, Kind::Joint);
+        match self.firmware {
+            Firmware::V0_5 => [joint].to_vec(),
+            Firmware::V0_6 => {
+                [joint, temperature(MOTOR, "motor"), temperature(FET, "fet")].to_vec()
+            }
+        }
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let keys = OdriveKeys::new(spec, self)?;
+        let mode = match keys.request_period {
+            Some(_) => spec.mode,
+            None => Mode::Listen,
+        };
+        let bringup = Bringup::new(spec, mode, Timing::LISTENED, keys.id(command::ESTIMATES));
+        let commands = keys.firmware.commands().iter();
+        let claims = commands.map(|command| Claim::exclusive(keys.id(*command)));
+        let this = OdriveAxis {
+            keys,
+            status: Quality::GOOD,
+            current: HeldValue::ABSENT,
+            torque: HeldValue::ABSENT,
+            requests: Rounds::new(keys.request_period),
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+}
+
+impl Family for OdriveAxis {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let Some(command) = self.keys.command(frame.id) else {
             return;
         };
@@ -112,8 +135,8 @@ impl Family for Axis {
         }
         match command {
             command::ESTIMATES => self.estimates(data, frame, link, out),
-            command::IQ => self.current = Held::new(frame, float(data, 1)),
-            command::TORQUES => self.torque = Held::new(frame, float(data, 1)),
+            command::IQ => self.current = HeldValue::new(frame, float(data, 1)),
+            command::TORQUES => self.torque = HeldValue::new(frame, float(data, 1)),
             command::TEMPERATURE => {
                 temperature(FET, float(data, 0), frame, out);
                 temperature(MOTOR, float(data, 1), frame, out);
@@ -124,13 +147,13 @@ impl Family for Axis {
 
     fn reset(&mut self) {
         self.status = Quality::GOOD;
-        (self.current, self.torque) = (Held::ABSENT, Held::ABSENT);
+        (self.current, self.torque) = (HeldValue::ABSENT, HeldValue::ABSENT);
     }
 
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Link<NoInquiry>,
+        _link: &mut Supervision<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         let command = self.requests.ask(self.keys.firmware.requests(), now)?;

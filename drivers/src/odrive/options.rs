@@ -11,7 +11,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct OdriveOptions {
     /// Its firmware; default 0.6.
     pub firmware: Firmware,
     /// Torque per current \[Nm/A\]; default: the torque that firmware 0.6 sends.
@@ -24,7 +24,7 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for OdriveOptions {
     fn default() -> Self {
         Self {
             firmware: Firmware::V0_6,
@@ -38,7 +38,7 @@ impl Default for Options {
 
 /// The keys of a device, checked.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Checked {
+pub(super) struct OdriveKeys {
     pub(super) node: u16,
     pub(super) firmware: Firmware,
     pub(super) torque_constant: Option<f64>,
@@ -47,8 +47,8 @@ pub(super) struct Checked {
     pub(super) period: Nanos,
 }
 
-impl Checked {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+impl OdriveKeys {
+    pub(super) fn new(spec: &Spec, options: &OdriveOptions) -> Result<Self, SpecError> {
         let node = address(spec, 0..=NODE_MOST)?;
         let torque_constant = (options.torque_constant)
             .map(|constant| above_zero("torque_constant", constant))

@@ -1,8 +1,9 @@
 //! Recognising axes: by heartbeat and estimates, and by the version that they tell.
 
+use super::OdriveOptions;
 use super::frames::{NODE_MOST, command};
 use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
-use crate::{Format, Frame, Id, bytes};
+use crate::{Driver, Format, Frame, Id, Recognise, bytes};
 use alloc::format;
 use alloc::vec::Vec;
 
@@ -32,7 +33,7 @@ fn is_heartbeat(frame: &Frame) -> bool {
 }
 
 /// Axis `node`, if `seen` shows it.
-pub(super) fn axis(seen: &Traffic, driver: &'static str, node: u16) -> Option<Finding> {
+fn axis(seen: &Traffic, driver: &'static str, node: u16) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, usize::from(NODE_MOST) + 1);
     let heartbeat = id(node, command::HEARTBEAT);
     let beats = evidence.sends(heartbeat, is_heartbeat);
@@ -77,15 +78,23 @@ pub(super) fn axis(seen: &Traffic, driver: &'static str, node: u16) -> Option<Fi
     Some(finding.with_joints([0]).with_commands([commands]))
 }
 
-/// Axes that are heard are asked for their version, by a remote frame.
-pub(super) fn questions(seen: &Traffic) -> Vec<Frame> {
-    let is_axis = |node: &u16| {
-        let heard = seen.stream(id(*node, command::HEARTBEAT));
-        heard.is_some_and(|stream| stream.frames > 0 && stream.kept().all(is_heartbeat))
-    };
-    // The identifier of axis 0 is that of CANopen's network management.
-    let nodes = (1..=NODE_MOST).filter(is_axis);
-    nodes
-        .map(|node| Frame::remote(id(node, command::VERSION), 8))
-        .collect()
+impl Recognise for OdriveOptions {
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        (0..=NODE_MOST)
+            .filter_map(|node| axis(seen, Self::NAME, node))
+            .collect()
+    }
+
+    /// Axes that are heard are asked for their version, by a remote frame.
+    fn questions(seen: &Traffic) -> Vec<Frame> {
+        let is_axis = |node: &u16| {
+            let heard = seen.stream(id(*node, command::HEARTBEAT));
+            heard.is_some_and(|stream| stream.frames > 0 && stream.kept().all(is_heartbeat))
+        };
+        // The identifier of axis 0 is that of CANopen's network management.
+        let nodes = (1..=NODE_MOST).filter(is_axis);
+        nodes
+            .map(|node| Frame::remote(id(node, command::VERSION), 8))
+            .collect()
+    }
 }

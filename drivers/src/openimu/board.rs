@@ -1,17 +1,18 @@
 //! The sensor's own side.
 
 use super::frames::{
-    ACCELERATION, ANGLE, Quantity, RATE, RATE_LIMIT, REPETITION, group_and_source, merit, period,
-    pgn, pitch_and_roll,
+    ACCELERATION, ANGLE, OpenImuQuantity, RATE, RATE_LIMIT, REPETITION, group_and_source, merit,
+    period, pgn, pitch_and_roll,
 };
-use super::options::{Options, Plan};
-use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Spec, SpecError};
+use super::options::{OpenImuKeys, OpenImuOptions};
+use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Simulate, Spec, SpecError, board};
+use alloc::boxed::Box;
 use proprio_topics::{Imu, Nanos, Quality, Reading, Saturation};
 
 /// The sensor's own side. From power-on it sends the quantities of its keys at 100 Hz.
 #[derive(Debug)]
-pub struct OpenImuBoard {
-    plan: Plan,
+struct OpenImuBoard {
+    plan: OpenImuKeys,
     /// The messages to send, as bits of the command.
     types: u8,
     /// 0: quiet.
@@ -19,22 +20,6 @@ pub struct OpenImuBoard {
 }
 
 impl OpenImuBoard {
-    /// A sensor after power-on; in [`Mode::Listen`] another program has set its rate already.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 0x80 to 0xF7, a period that is none.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        let plan = Plan::new(spec, options)?;
-        Ok(Self {
-            types: plan.types(),
-            divider: match spec.mode {
-                Mode::Supervise => 1,
-                Mode::Listen => plan.divider,
-            },
-            plan,
-        })
-    }
-
     /// Six bytes of three values in x, y, z.
     fn six(&self, counts: [u32; 3]) -> [u8; 6] {
         let [[a, b, ..], [c, d, ..], [e, f, ..]] =
@@ -45,7 +30,7 @@ impl OpenImuBoard {
     /// The payload of the message that holds `quantity`.
     fn payload(
         &self,
-        quantity: Quantity,
+        quantity: OpenImuQuantity,
         imu: &Imu,
         quality: Quality,
     ) -> Result<[u8; 8], EncodeError> {
@@ -60,20 +45,20 @@ impl OpenImuBoard {
             all.then_some(()).ok_or(EncodeError::NotFinite)
         };
         let [a, b, c, d, e, f, merits] = match quantity {
-            Quantity::Orientation => {
+            OpenImuQuantity::Orientation => {
                 finite(&imu.orientation)?;
                 let [[a, b, c, _], [d, e, f, _]] =
                     pitch_and_roll(imu.orientation).map(|angle| ANGLE.count(angle).to_le_bytes());
                 [a, b, c, d, e, f, merits(&merit::OF_ANGLES)]
             }
-            Quantity::Acceleration => {
+            OpenImuQuantity::Acceleration => {
                 finite(&imu.proper_acceleration)?;
                 let turned = self.plan.upright.turn(imu.proper_acceleration);
                 let counts = turned.map(|value| ACCELERATION.count(value));
                 let [a, b, c, d, e, f] = self.six(counts);
                 [a, b, c, d, e, f, merits(&merit::OF_AXES) | REPETITION]
             }
-            Quantity::AngularVelocity => {
+            OpenImuQuantity::AngularVelocity => {
                 finite(&imu.angular_velocity)?;
                 let mut counts = imu
                     .angular_velocity
@@ -90,6 +75,21 @@ impl OpenImuBoard {
             }
         };
         Ok([a, b, c, d, e, f, merits, 0])
+    }
+}
+
+impl Simulate for OpenImuOptions {
+    /// A sensor after power-on; in [`Mode::Listen`] another program has set its rate already.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        let plan = OpenImuKeys::new(spec, self)?;
+        Ok(Box::new(OpenImuBoard {
+            types: plan.types(),
+            divider: match spec.mode {
+                Mode::Supervise => 1,
+                Mode::Listen => plan.divider,
+            },
+            plan,
+        }))
     }
 }
 
@@ -116,14 +116,9 @@ impl Board for OpenImuBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        let Reading::Imu(imu) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
+        let imu = board::only_imu(output, reading)?;
         let mut sent = Frames::new();
-        for quantity in Quantity::ALL {
+        for quantity in OpenImuQuantity::ALL {
             if self.types & quantity.pgn_priority_bit().2 != 0 {
                 let payload = self.payload(quantity, imu, quality)?;
                 let _ = sent.try_push(Frame::new(self.plan.message(quantity), &payload));

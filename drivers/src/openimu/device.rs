@@ -2,18 +2,18 @@
 //! period into a reading.
 
 use super::frames::{
-    ACCELERATION, ANGLE, ANY_PRIORITY, COMMANDS, HOST, Quantity, RATE, RATE_LIMIT,
-    group_and_source, identifier, merit, period, pgn, quaternion,
+    ACCELERATION, ANGLE, ANY_PRIORITY, COMMANDS, DELIVERED, HOST, OpenImuQuantity, RATE,
+    RATE_LIMIT, group_and_source, identifier, merit, period, pgn, quaternion,
 };
-use super::options::{Options, Plan};
+use super::options::{OpenImuKeys, OpenImuOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::bytes;
-use crate::family::{Family, Link, Supervised};
-use crate::group::Group;
+use crate::family::{Family, Supervised, Supervision};
+use crate::group::FrameGroup;
 use crate::pairing::Limit;
-use crate::{Claim, Decoded, Device, Frame, Output, Spec, SpecError};
+use crate::{Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Spec, SpecError, bytes};
 use alloc::boxed::Box;
-use proprio_topics::{Counter, Imu, Nanos, Quality, Reading, Saturation};
+use alloc::vec::Vec;
+use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Saturation};
 
 /// How long the host waits for these sensors, which answer nothing.
 const TIMING: Timing = Timing {
@@ -30,36 +30,36 @@ const TIMING: Timing = Timing {
 
 /// What the messages of a period hold.
 #[derive(Debug, Clone, Copy)]
-struct Sample {
+struct OpenImuSample {
     imu: Imu,
     quality: Quality,
 }
 
-impl Sample {
+impl OpenImuSample {
     const EMPTY: Self = Self {
         imu: Imu::ABSENT,
         quality: Quality::GOOD,
     };
 
     /// What `data` of a message with `quantity` holds; `None` if a value is none.
-    fn of(plan: &Plan, quantity: Quantity, data: &[u8; 8]) -> Option<Self> {
+    fn of(plan: &OpenImuKeys, quantity: OpenImuQuantity, data: &[u8; 8]) -> Option<Self> {
         let mut this = Self::EMPTY;
         let merits = data[6];
         let is_wrong = |bit: &u8| merits >> bit & 3 == merit::ERROR;
         let counts = [0, 2, 4].map(|at| u32::from(bytes::u16_le(data, at)));
         let mut wrong = false;
         match quantity {
-            Quantity::Orientation => {
+            OpenImuQuantity::Orientation => {
                 let angle = |at| ANGLE.value(bytes::u32_le(data, at) & 0xFF_FFFF);
                 this.imu.orientation = quaternion(angle(0)?, angle(3)?);
                 wrong = merit::OF_ANGLES.iter().any(is_wrong);
             }
-            Quantity::Acceleration => {
+            OpenImuQuantity::Acceleration => {
                 let values = all(counts.map(|count| ACCELERATION.value(count)))?;
                 this.imu.proper_acceleration = plan.upright.turn(plan.axes.exchange(values));
                 wrong = merit::OF_AXES.iter().any(is_wrong);
             }
-            Quantity::AngularVelocity => {
+            OpenImuQuantity::AngularVelocity => {
                 let values = all(counts.map(|count| RATE.value(count)))?;
                 this.imu.angular_velocity = plan.axes.exchange(values);
                 let bits = plan.axes.exchange(merit::OF_AXES);
@@ -82,13 +82,13 @@ impl Sample {
     }
 
     /// Adds `part`, which holds `quantity`.
-    fn add(&mut self, quantity: Quantity, part: Self) {
+    fn add(&mut self, quantity: OpenImuQuantity, part: Self) {
         self.quality |= part.quality;
         let (to, from) = (&mut self.imu, part.imu);
         match quantity {
-            Quantity::Orientation => to.orientation = from.orientation,
-            Quantity::Acceleration => to.proper_acceleration = from.proper_acceleration,
-            Quantity::AngularVelocity => to.angular_velocity = from.angular_velocity,
+            OpenImuQuantity::Orientation => to.orientation = from.orientation,
+            OpenImuQuantity::Acceleration => to.proper_acceleration = from.proper_acceleration,
+            OpenImuQuantity::AngularVelocity => to.angular_velocity = from.angular_velocity,
         }
     }
 }
@@ -103,38 +103,48 @@ const fn all(values: [Option<f64>; 3]) -> Option<[f64; 3]> {
 
 /// The host's side of a sensor.
 #[derive(Debug)]
-pub(super) struct Sensor {
-    plan: Plan,
-    group: Group<Sample>,
+pub(super) struct OpenImuSensor {
+    plan: OpenImuKeys,
+    group: FrameGroup<OpenImuSample>,
 }
 
-impl Sensor {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let plan = Plan::new(spec, options)?;
-        let watched = plan.quantities.first().unwrap_or(&Quantity::Acceleration);
+impl Driver for OpenImuOptions {
+    const NAME: &'static str = "openimu";
+    const ADDRESS: Option<u32> = Some(DELIVERED);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Imu)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let plan = OpenImuKeys::new(spec, self)?;
+        let watched = plan
+            .quantities
+            .first()
+            .unwrap_or(&OpenImuQuantity::Acceleration);
         let mut bringup = Bringup::new(spec, spec.mode, TIMING, plan.message(*watched));
         let command = |pgn| identifier(COMMANDS, pgn, HOST);
         let types = [plan.address, plan.types(), 0, 0, 0];
         bringup.start_with(command(pgn::PACKET_TYPE), &types);
         bringup.start_with(command(pgn::PACKET_RATE), &[plan.address, plan.divider]);
         bringup.stop_with(command(pgn::PACKET_RATE), &[plan.address, 0]);
-        let claims = Quantity::ALL.map(|quantity| Claim {
+        let claims = OpenImuQuantity::ALL.map(|quantity| Claim {
             mask: !ANY_PRIORITY,
             ..Claim::exclusive(plan.message(quantity))
         });
         let limit = Limit::of_period(period(plan.divider));
-        let this = Self {
-            group: Group::new(plan.quantities.len(), limit),
+        let this = OpenImuSensor {
+            group: FrameGroup::new(plan.quantities.len(), limit),
             plan,
         };
         Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
 }
 
-impl Family for Sensor {
+impl Family for OpenImuSensor {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let Some((pgn, source)) = group_and_source(frame.id) else {
             return;
         };
@@ -149,18 +159,18 @@ impl Family for Sensor {
         let Ok(data) = <&[u8; 8]>::try_from(data) else {
             return out.fault(Counter::Length, 1, frame.id);
         };
-        let Some(part) = Sample::of(&self.plan, quantity, data) else {
+        let Some(part) = OpenImuSample::of(&self.plan, quantity, data) else {
             return out.fault(Counter::Value, 1, frame.id);
         };
         let mut dropped = 0;
-        let add = |sample: &mut Sample| sample.add(quantity, part);
-        let whole = (self.group).push(position, frame, Sample::EMPTY, add, &mut dropped);
+        let add = |sample: &mut OpenImuSample| sample.add(quantity, part);
+        let whole = (self.group).push(position, frame, OpenImuSample::EMPTY, add, &mut dropped);
         if dropped > 0 {
             link.bringup.lost();
             out.fault(Counter::Unpaired, dropped, frame.id);
         }
         let Some(whole) = whole else { return };
-        let Sample { imu, mut quality } = whole.content;
+        let OpenImuSample { imu, mut quality } = whole.content;
         for (flag, counter) in [
             (Quality::DEVICE_FAULT, Counter::DeviceFault),
             (Quality::SATURATED, Counter::Saturated),

@@ -90,7 +90,7 @@ pub(super) const REPETITION: u8 = 2 << 6;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum Quantity {
+pub enum OpenImuQuantity {
     /// Pitch and roll.
     Orientation,
     /// Proper acceleration.
@@ -99,7 +99,7 @@ pub enum Quantity {
     AngularVelocity,
 }
 
-impl Quantity {
+impl OpenImuQuantity {
     pub(super) const ALL: [Self; 3] =
         [Self::Orientation, Self::Acceleration, Self::AngularVelocity];
 
@@ -117,7 +117,7 @@ impl Quantity {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum Axes {
+pub enum AxisOrder {
     /// Pitch, roll, yaw.
     #[default]
     Yxz,
@@ -125,7 +125,7 @@ pub enum Axes {
     Xyz,
 }
 
-impl Axes {
+impl AxisOrder {
     /// From a message's order to x, y, z, and back.
     pub(super) const fn exchange<T: Copy>(self, [a, b, c]: [T; 3]) -> [T; 3] {
         match self {

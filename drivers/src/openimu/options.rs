@@ -1,6 +1,8 @@
 //! The keys of a sensor in gateway.toml, and what they mean to both sides of the driver.
 
-use super::frames::{ADDRESSES, Axes, BASE_PERIOD_MS, DIVIDERS, Quantity, Upright, identifier};
+use super::frames::{
+    ADDRESSES, AxisOrder, BASE_PERIOD_MS, DIVIDERS, OpenImuQuantity, Upright, identifier,
+};
 use crate::{Id, Spec, SpecError};
 use alloc::vec::Vec;
 use serde::Deserialize;
@@ -9,23 +11,27 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct OpenImuOptions {
     /// The quantities of a reading; default acceleration and angular velocity.
-    pub quantities: Vec<Quantity>,
+    pub quantities: Vec<OpenImuQuantity>,
     /// Period \[ms\]; default 10.
     pub period_ms: u32,
     /// Order of the axes; default y, x, z.
-    pub axes: Axes,
+    pub axes: AxisOrder,
     /// Axes of the acceleration; default z up.
     pub acceleration_z: Upright,
 }
 
-impl Default for Options {
+impl Default for OpenImuOptions {
     fn default() -> Self {
         Self {
-            quantities: [Quantity::Acceleration, Quantity::AngularVelocity].to_vec(),
+            quantities: [
+                OpenImuQuantity::Acceleration,
+                OpenImuQuantity::AngularVelocity,
+            ]
+            .to_vec(),
             period_ms: u32::from(BASE_PERIOD_MS),
-            axes: Axes::Yxz,
+            axes: AxisOrder::Yxz,
             acceleration_z: Upright::Up,
         }
     }
@@ -33,17 +39,17 @@ impl Default for Options {
 
 /// What the keys mean.
 #[derive(Debug)]
-pub(super) struct Plan {
+pub(super) struct OpenImuKeys {
     pub(super) address: u8,
     /// In the order of their messages.
-    pub(super) quantities: Vec<Quantity>,
+    pub(super) quantities: Vec<OpenImuQuantity>,
     pub(super) divider: u8,
-    pub(super) axes: Axes,
+    pub(super) axes: AxisOrder,
     pub(super) upright: Upright,
 }
 
-impl Plan {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+impl OpenImuKeys {
+    pub(super) fn new(spec: &Spec, options: &OpenImuOptions) -> Result<Self, SpecError> {
         let wrong_address = SpecError::Address {
             address: spec.address,
             least: *ADDRESSES.start(),
@@ -54,8 +60,8 @@ impl Plan {
         let mut dividers = DIVIDERS.into_iter();
         let period = options.period_ms;
         let divider = dividers.find(|by| u32::from(*by) * u32::from(BASE_PERIOD_MS) == period);
-        let quantities = Quantity::ALL.into_iter();
-        let quantities: Vec<Quantity> = quantities
+        let quantities = OpenImuQuantity::ALL.into_iter();
+        let quantities: Vec<OpenImuQuantity> = quantities
             .filter(|quantity| options.quantities.contains(quantity))
             .collect();
         if quantities.is_empty() {
@@ -83,7 +89,7 @@ impl Plan {
     }
 
     /// The identifier of the messages that hold `quantity`.
-    pub(super) const fn message(&self, quantity: Quantity) -> Id {
+    pub(super) const fn message(&self, quantity: OpenImuQuantity) -> Id {
         let (pgn, priority, _) = quantity.pgn_priority_bit();
         identifier(priority, pgn, self.address)
     }

@@ -1,24 +1,32 @@
 //! Recognising sensors: by the groups that they send.
 
-use super::frames::{ADDRESSES, DIVIDERS, Quantity, identifier, period};
-use super::options::Options;
-use crate::Driver;
+use super::frames::{ADDRESSES, DIVIDERS, OpenImuQuantity, identifier, period};
+use super::options::OpenImuOptions;
 use crate::recognise::{Evidence, Finding, Key, Traffic};
+use crate::{Driver, Recognise};
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
 
+impl Recognise for OpenImuOptions {
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        ADDRESSES
+            .filter_map(|address| sensor(seen, address))
+            .collect()
+    }
+}
+
 /// The sensor at `address`, if `seen` shows it. One group alone may be that of a tilt sensor of
 /// another maker.
-pub(super) fn sensor(seen: &Traffic, address: u32) -> Option<Finding> {
+fn sensor(seen: &Traffic, address: u32) -> Option<Finding> {
     let source = u8::try_from(address).ok()?;
     let mut evidence = Evidence::new(seen, ADDRESSES.count());
     let mut quantities: Vec<&str> = Vec::new();
     let mut measured = None;
     for (quantity, name) in [
-        (Quantity::Orientation, "orientation"),
-        (Quantity::Acceleration, "acceleration"),
-        (Quantity::AngularVelocity, "angular_velocity"),
+        (OpenImuQuantity::Orientation, "orientation"),
+        (OpenImuQuantity::Acceleration, "acceleration"),
+        (OpenImuQuantity::AngularVelocity, "angular_velocity"),
     ] {
         let (pgn, priority, _) = quantity.pgn_priority_bit();
         if let Some(stream) = evidence.sends_length(identifier(priority, pgn, source), 8) {
@@ -30,7 +38,7 @@ pub(super) fn sensor(seen: &Traffic, address: u32) -> Option<Finding> {
         return None;
     }
     let what = "Aceinna OpenIMU or MTLT (J1939)";
-    let finding = evidence.finding(Options::NAME, address, what)?;
+    let finding = evidence.finding(OpenImuOptions::NAME, address, what)?;
     let words: String = format!("{quantities:?}");
     let mut keys = Vec::from([Key::new("quantities", words)]);
     let is_near = |divider: &&u8| {

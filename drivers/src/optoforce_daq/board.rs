@@ -1,18 +1,20 @@
 //! The unit's own side. It takes configurations and sends packets.
 
-use super::options::Options;
+use super::options::OptoforceDaqOptions;
 use super::protocol::{
-    ANSWER, CONFIGURATION, DEFAULT_RATE, Ids, OVERLOAD_FX, PACKET, SENSOR_FAILURE, ZERO_HERE,
+    ANSWER, CONFIGURATION, DEFAULT_RATE, OVERLOAD_FX, OptoIds, PACKET, SENSOR_FAILURE, ZERO_HERE,
     period, sum,
 };
-use crate::bytes;
-use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Spec, SpecError};
+use crate::{
+    Board, EncodeError, Format, Frame, Frames, Mode, Simulate, Spec, SpecError, board, bytes,
+};
+use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading, Saturation};
 
 /// The unit's own side.
 #[derive(Debug)]
-pub struct OptoBoard {
-    ids: Ids,
+struct OptoBoard {
+    ids: OptoIds,
     /// Steps per N.
     scale: [f64; 3],
     /// `None` while it is stopped.
@@ -25,24 +27,21 @@ pub struct OptoBoard {
     zeroing: bool,
 }
 
-impl OptoBoard {
+impl Simulate for OptoforceDaqOptions {
     /// A unit after power-on, which sends at once; in [`Mode::Listen`] another program has already
     /// configured it.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an identifier or a key out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        let ids = options.ids(spec)?;
-        let settings = options.settings()?.filter(|_| spec.mode == Mode::Listen);
-        Ok(Self {
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        let ids = self.ids(spec)?;
+        let settings = self.settings()?.filter(|_| spec.mode == Mode::Listen);
+        Ok(Box::new(OptoBoard {
             ids,
-            scale: options.scale()?,
+            scale: self.scale()?,
             period: Some(period(settings.map_or(DEFAULT_RATE, |s| s.speed))),
             counter: 0,
             first: None,
             zero: [0; 3],
             zeroing: false,
-        })
+        }))
     }
 }
 
@@ -83,15 +82,8 @@ impl Board for OptoBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        let Reading::Wrench(wrench) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
-        if !wrench.force.iter().all(|value| value.is_finite()) {
-            return Err(EncodeError::NotFinite);
-        }
+        let wrench = board::only_wrench(output, reading)?;
+        board::finite(&wrench.force)?;
         let mut counts = [0; 3];
         for (count, (value, scale)) in counts.iter_mut().zip(wrench.force.iter().zip(self.scale)) {
             *count = bytes::quantise_i16(*value, 1.0 / scale);

@@ -1,25 +1,28 @@
 //! The host's side of a unit. It configures the unit if the keys say so, and combines the two
 //! frames of each packet.
 
-use super::options::Options;
+use super::options::OptoforceDaqOptions;
 use super::protocol::{
-    ANSWER, CONFIGURATION, ERRORS, Ids, OVERLOAD_FX, PACKET, Settings, ZERO_OWN, sum,
+    ANSWER, CONFIGURATION, ERRORS, OVERLOAD_FX, OptoIds, OptoSettings, PACKET, ZERO_OWN, sum,
 };
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::bytes;
-use crate::family::{Family, Link, Supervised};
+use crate::family::{Family, Supervised, Supervision};
 use crate::wrench::{self, NewZero};
-use crate::{Claim, Decoded, Device, Frame, Id, Mode, NotSent, Output, Spec, SpecError};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Id, Mode, NotSent, Output, OutputInfo, Spec, SpecError,
+    bytes,
+};
 use alloc::boxed::Box;
-use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind, Wrench};
+use alloc::vec::Vec;
+use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, StampKind, Wrench};
 
 /// A configuration that is not answered within this time has taken effect, or was lost.
 const ANSWERED: Nanos = Nanos::from_millis(100);
 
 /// The frames of a configuration.
-fn frames(id: Id, settings: Settings, fill: bool) -> [Frame; 2] {
+fn frames(id: Id, settings: OptoSettings, fill: bool) -> [Frame; 2] {
     let [a, b, c, d] = CONFIGURATION;
-    let Settings {
+    let OptoSettings {
         speed,
         filter,
         zero,
@@ -36,7 +39,7 @@ fn frames(id: Id, settings: Settings, fill: bool) -> [Frame; 2] {
 /// The host's side of a unit.
 #[derive(Debug)]
 pub(super) struct Opto {
-    ids: Ids,
+    ids: OptoIds,
     /// Steps per N.
     scale: [f64; 3],
     /// The first frame that waits for its second, and its stamp.
@@ -50,39 +53,6 @@ pub(super) struct Opto {
 }
 
 impl Opto {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let ids = options.ids(spec)?;
-        let settings = options.settings()?;
-        let mode = match settings {
-            Some(_) => spec.mode,
-            None => Mode::Listen,
-        };
-        let mut bringup = Bringup::new(spec, mode, Timing::USUAL, ids.data);
-        if let Some(settings) = settings {
-            for frame in frames(ids.config, settings, options.fill) {
-                bringup.start_with(frame.id, frame.data());
-            }
-            let stopped = Settings {
-                speed: 0,
-                zero: ZERO_OWN,
-                ..settings
-            };
-            for frame in frames(ids.config, stopped, options.fill) {
-                bringup.stop_with(frame.id, frame.data());
-            }
-        }
-        let this = Self {
-            ids,
-            scale: options.scale()?,
-            waiting: None,
-            joined: false,
-            last: None,
-            zero: NewZero::default(),
-        };
-        let claims = [Claim::exclusive(ids.data)];
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
     /// Takes a frame that is not half a packet.
     fn answer(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
         let Some((&[a, b, c, d, error], _)) = data.split_first_chunk() else {
@@ -106,7 +76,7 @@ impl Opto {
         halves: [[u8; 8]; 2],
         first: (Nanos, StampKind),
         frame: &Frame,
-        link: &mut Link<NoInquiry>,
+        link: &mut Supervision<NoInquiry>,
         out: &mut Decoded,
     ) {
         let [[_, _, _, _, c0, c1, s0, s1], [a, b, c, d, e, f, _, _]] = halves;
@@ -160,10 +130,52 @@ impl Opto {
     }
 }
 
+impl Driver for OptoforceDaqOptions {
+    const NAME: &'static str = "optoforce_daq";
+    const ADDRESS: Option<u32> = Some(0x100);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Wrench)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let ids = self.ids(spec)?;
+        let settings = self.settings()?;
+        let mode = match settings {
+            Some(_) => spec.mode,
+            None => Mode::Listen,
+        };
+        let mut bringup = Bringup::new(spec, mode, Timing::USUAL, ids.data);
+        if let Some(settings) = settings {
+            for frame in frames(ids.config, settings, self.fill) {
+                bringup.start_with(frame.id, frame.data());
+            }
+            let stopped = OptoSettings {
+                speed: 0,
+                zero: ZERO_OWN,
+                ..settings
+            };
+            for frame in frames(ids.config, stopped, self.fill) {
+                bringup.stop_with(frame.id, frame.data());
+            }
+        }
+        let this = Opto {
+            ids,
+            scale: self.scale()?,
+            waiting: None,
+            joined: false,
+            last: None,
+            zero: NewZero::default(),
+        };
+        let claims = [Claim::exclusive(ids.data)];
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+}
+
 impl Family for Opto {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         if frame.id != self.ids.data {
             return;
         }

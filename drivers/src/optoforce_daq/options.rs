@@ -1,6 +1,6 @@
 //! The keys of a unit in gateway.toml, for both sides of the driver.
 
-use super::protocol::{DEFAULT_FILTER, FILTERS, Ids, RATES, Settings, ZERO_HERE, ZERO_OWN};
+use super::protocol::{DEFAULT_FILTER, FILTERS, OptoIds, OptoSettings, RATES, ZERO_HERE, ZERO_OWN};
 use crate::{Id, Spec, SpecError, keys, wrench};
 use serde::Deserialize;
 
@@ -8,7 +8,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct OptoforceDaqOptions {
     /// Steps per N of fx fy fz. Needed.
     #[serde(deserialize_with = "wrench::three")]
     pub counts_per_newton: Option<[f64; 3]>,
@@ -24,7 +24,7 @@ pub struct Options {
     pub id_config: u16,
 }
 
-impl Default for Options {
+impl Default for OptoforceDaqOptions {
     fn default() -> Self {
         Self {
             counts_per_newton: None,
@@ -37,7 +37,7 @@ impl Default for Options {
     }
 }
 
-impl Options {
+impl OptoforceDaqOptions {
     pub(super) fn scale(&self) -> Result<[f64; 3], SpecError> {
         let key = "counts_per_newton";
         let expected = "three numbers above 0, from the sensor's sensitivity report";
@@ -54,7 +54,7 @@ impl Options {
         }
     }
 
-    pub(super) fn settings(&self) -> Result<Option<Settings>, SpecError> {
+    pub(super) fn settings(&self) -> Result<Option<OptoSettings>, SpecError> {
         let Some(rate) = self.rate_hz else {
             let given = match (self.filter_hz, self.zero) {
                 (None, None) => return Ok(None),
@@ -81,17 +81,17 @@ impl Options {
             Some(true) => ZERO_HERE,
             _ => ZERO_OWN,
         };
-        Ok(Some(Settings {
+        Ok(Some(OptoSettings {
             speed,
             filter,
             zero,
         }))
     }
 
-    pub(super) fn ids(&self, spec: &Spec) -> Result<Ids, SpecError> {
+    pub(super) fn ids(&self, spec: &Spec) -> Result<OptoIds, SpecError> {
         let address = keys::address(spec, 0..=0x7FF)?;
         let expected = "from 0 to 0x7FF";
-        let ids = Ids {
+        let ids = OptoIds {
             data: Id::standard(address),
             config: keys::id("id_config", self.id_config, 0..=0x7FF, expected)?,
         };

@@ -25,7 +25,7 @@ pub(super) const DEFAULT_FILTER: f64 = 15.0;
 
 /// The settings of a configuration, as the unit writes them.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Settings {
+pub(super) struct OptoSettings {
     pub(super) speed: u8,
     pub(super) filter: u8,
     pub(super) zero: u8,
@@ -33,7 +33,7 @@ pub(super) struct Settings {
 
 /// The identifiers of a unit.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Ids {
+pub(super) struct OptoIds {
     pub(super) data: Id,
     pub(super) config: Id,
 }

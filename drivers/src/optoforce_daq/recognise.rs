@@ -1,12 +1,21 @@
 //! Recognising a unit: by the beginning and the checksum of its packets, on any identifier.
 
-use super::options::Options;
+use super::options::OptoforceDaqOptions;
 use super::protocol::PACKET;
 use crate::recognise::{Evidence, Finding, Key, Stream, Traffic};
-use crate::{Driver, Format, Frame, Id, bytes};
+use crate::{Driver, Format, Frame, Id, Recognise, bytes};
+use alloc::vec::Vec;
+
+impl Recognise for OptoforceDaqOptions {
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        seen.streams()
+            .filter_map(|stream| unit(seen, stream))
+            .collect()
+    }
+}
 
 /// The unit that sends on `stream`, if it is one.
-pub(super) fn unit(seen: &Traffic, stream: &Stream) -> Option<Finding> {
+fn unit(seen: &Traffic, stream: &Stream) -> Option<Finding> {
     let Id::Standard(address) = stream.id else {
         return None;
     };
@@ -33,7 +42,11 @@ pub(super) fn unit(seen: &Traffic, stream: &Stream) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, 1 << 11);
     // Four bytes and a checksum.
     evidence.explains(stream.id, 48.0);
-    let finding = evidence.finding(Options::NAME, address.into(), "OptoForce sensor at a DAQ")?;
+    let finding = evidence.finding(
+        OptoforceDaqOptions::NAME,
+        address.into(),
+        "OptoForce sensor at a DAQ",
+    )?;
     let scale = "[1.0, 1.0, 1.0]";
     let note = "from the sensor's sensitivity report";
     // Not its rate: with that key each start would change the zero.

@@ -7,7 +7,7 @@
 
 use super::background::{NEAR, common, identifier};
 use super::traffic::Traffic;
-use super::{Certainty, Explained, Finding, PRIOR, Part, probability};
+use super::{Certainty, Explained, Finding, IdUse, PRIOR, probability};
 use crate::Id;
 use alloc::collections::BTreeSet;
 use alloc::vec::Vec;
@@ -22,13 +22,13 @@ const FAMILY: f64 = PRIOR - 1.0;
 fn contests(a: &Finding, b: &Finding, of: &Explained) -> bool {
     b.explains.iter().any(|other| {
         let shared = match (of.part, other.part) {
-            (_, Part::Takes) | (Part::Takes, Part::Tells) => true,
-            (Part::Takes, Part::Sends(_)) => false,
-            (Part::Tells, Part::Tells) => a.address == b.address,
-            (Part::Sends(Some(one)), Part::Sends(Some(another))) => {
+            (_, IdUse::Takes) | (IdUse::Takes, IdUse::Tells) => true,
+            (IdUse::Takes, IdUse::Sends(_)) => false,
+            (IdUse::Tells, IdUse::Tells) => a.address == b.address,
+            (IdUse::Sends(Some(one)), IdUse::Sends(Some(another))) => {
                 a.driver == b.driver && one != another
             }
-            (Part::Tells | Part::Sends(_), _) => false,
+            (IdUse::Tells | IdUse::Sends(_), _) => false,
         };
         other.id == of.id && !shared
     })
@@ -44,7 +44,7 @@ const fn of_format(counts: &mut [usize; 2], id: Id) -> &mut usize {
 }
 
 /// A finding that is not yet judged.
-struct Open {
+struct OpenFinding {
     finding: Finding,
     /// The probability that nothing before it is there that contests it.
     free: f64,
@@ -54,7 +54,7 @@ struct Open {
     family: BTreeSet<Id>,
 }
 
-impl Open {
+impl OpenFinding {
     /// How many streams that nobody of its family explains are near `id`.
     fn near(&self, seen: &Traffic, id: Id) -> usize {
         let same = |raw: u32| match id {
@@ -77,7 +77,7 @@ impl Open {
         let mut before: Vec<Id> = Vec::new();
         for explained in &finding.explains {
             let part = explained.part;
-            if part == Part::Takes {
+            if part == IdUse::Takes {
                 continue;
             }
             if !alone && sure.iter().any(|known| contests(finding, known, explained)) {
@@ -111,7 +111,7 @@ pub(crate) fn explain(seen: &Traffic, findings: Vec<Finding>) -> Vec<Finding> {
         let explains = finding.explains.iter();
         explains.map(|explained| explained.id).collect::<Vec<Id>>()
     };
-    let mut open: Vec<Open> = Vec::new();
+    let mut open: Vec<OpenFinding> = Vec::new();
     let all: Vec<(&'static str, Vec<Id>)> = findings
         .iter()
         .map(|finding| (finding.driver, own(finding)))
@@ -123,7 +123,7 @@ pub(crate) fn explain(seen: &Traffic, findings: Vec<Finding>) -> Vec<Finding> {
         for stream in seen.streams().filter(|stream| !family.contains(&stream.id)) {
             *of_format(&mut others, stream.id) += 1;
         }
-        open.push(Open {
+        open.push(OpenFinding {
             finding,
             free: 1.0,
             others,
@@ -132,7 +132,7 @@ pub(crate) fn explain(seen: &Traffic, findings: Vec<Finding>) -> Vec<Finding> {
     }
     let mut sure: Vec<Finding> = Vec::new();
     loop {
-        let odds = |one: &Open| {
+        let odds = |one: &OpenFinding| {
             let alone = one.bits(seen, &sure, true);
             let taken = 1.0 - one.free;
             if taken <= 0.0 {
@@ -158,7 +158,7 @@ pub(crate) fn explain(seen: &Traffic, findings: Vec<Finding>) -> Vec<Finding> {
             return sure;
         }
         let mut best = open.remove(place).finding;
-        let contested = |one: &Open| {
+        let contested = |one: &OpenFinding| {
             best.explains
                 .iter()
                 .any(|e| contests(&best, &one.finding, e))

@@ -1,9 +1,11 @@
 //! The sensor's own side.
 
-use super::options::{Model, Options};
-use super::protocol::{DEFAULT_RATE, Ids, OVERLOAD_FX, RATES, SET, command, period};
-use crate::bytes;
-use crate::{Board, EncodeError, Format, Frame, Frames, Mode, Spec, SpecError};
+use super::options::{RftModel, RobotousRftOptions};
+use super::protocol::{DEFAULT_RATE, OVERLOAD_FX, RATES, RftIds, SET, command, period};
+use crate::{
+    Board, EncodeError, Format, Frame, Frames, Mode, Simulate, Spec, SpecError, board, bytes,
+};
+use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading, Saturation};
 
 /// In the answer to SET_RATE: done; and the error for a code out of range.
@@ -12,8 +14,8 @@ const RANGE_ERROR: u8 = 2;
 
 /// The sensor's own side.
 #[derive(Debug)]
-pub struct RftBoard {
-    ids: Ids,
+struct RftBoard {
+    ids: RftIds,
     name: &'static str,
     divisors: [f64; 6],
     rate_code: u8,
@@ -25,29 +27,6 @@ pub struct RftBoard {
 }
 
 impl RftBoard {
-    /// A new sensor after power-on; in [`Mode::Listen`] another program has already set its rate
-    /// and started it.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an identifier or a rate out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        let rate_code = options.rate_code()?;
-        let mut this = Self {
-            ids: options.ids(spec)?,
-            name: (Model::NAMES.get(options.model as usize).copied()).unwrap_or_default(),
-            divisors: options.model.divisors(),
-            rate_code,
-            period: period(options.rate_hz),
-            streaming: spec.mode == Mode::Listen,
-            zero: [0; 6],
-            zeroing: false,
-        };
-        if !this.streaming {
-            this.set_rate(DEFAULT_RATE);
-        }
-        Ok(this)
-    }
-
     /// Returns whether there is such a rate.
     fn set_rate(&mut self, code: u8) -> bool {
         let meant = if code == 0 { DEFAULT_RATE } else { code };
@@ -75,6 +54,28 @@ impl RftBoard {
         let [a, b, c] = bytes;
         let _ = out.try_push(Frame::new(self.ids.first, &[a, b, c, 0, 0, 0, 0, 0]));
         let _ = out.try_push(Frame::new(self.ids.second, &[0; 8]));
+    }
+}
+
+impl Simulate for RobotousRftOptions {
+    /// A new sensor after power-on; in [`Mode::Listen`] another program has already set its rate
+    /// and started it.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        let rate_code = self.rate_code()?;
+        let mut this = RftBoard {
+            ids: self.ids(spec)?,
+            name: (RftModel::NAMES.get(self.model as usize).copied()).unwrap_or_default(),
+            divisors: self.model.divisors(),
+            rate_code,
+            period: period(self.rate_hz),
+            streaming: spec.mode == Mode::Listen,
+            zero: [0; 6],
+            zeroing: false,
+        };
+        if !this.streaming {
+            this.set_rate(DEFAULT_RATE);
+        }
+        Ok(Box::new(this))
     }
 }
 
@@ -114,17 +115,7 @@ impl Board for RftBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        let Reading::Wrench(wrench) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
-        let ([fx, fy, fz], [tx, ty, tz]) = (wrench.force, wrench.torque);
-        let values = [fx, fy, fz, tx, ty, tz];
-        if !values.iter().all(|value| value.is_finite()) {
-            return Err(EncodeError::NotFinite);
-        }
+        let values = board::axes(board::only_wrench(output, reading)?)?;
         let mut counts = [0; 6];
         let mut overload = 0;
         let axes = values.into_iter().zip(self.divisors);

@@ -1,25 +1,26 @@
 //! The host's side of a sensor. It sets the rate, starts the sensor, and combines the two halves of
 //! each response.
 
-use super::options::Options;
-use super::protocol::{DEFAULT_RATE, Ids, OVERLOAD_FX, SET, command, period, send};
+use super::options::RobotousRftOptions;
+use super::protocol::{DEFAULT_RATE, OVERLOAD_FX, RftIds, SET, command, period, send};
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry, Timing};
-use crate::family::{Family, Link, Supervised};
-use crate::pairing::{Limit, Order, Paired, Pairing};
+use crate::family::{Family, Supervised, Supervision};
+use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::wrench::{self, NewZero, TareCommand};
 use crate::{
-    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Id,
-    Mode, NotSent, Output, Spec, SpecError, bytes,
+    Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Driver, Frame,
+    Id, Mode, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
 };
 use alloc::boxed::Box;
-use proprio_topics::{Counter, Nanos, Quality, Reading, StampKind, Wrench};
+use alloc::vec::Vec;
+use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, StampKind, Wrench};
 
 /// A tare has taken effect within this time: it is not answered.
 const TARED: Nanos = Nanos::from_millis(100);
 
 /// The next step of [`Rate`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Step {
+enum RateStep {
     Stop,
     Get,
     Set,
@@ -32,9 +33,9 @@ pub(super) struct Rate {
     id: Id,
     code: u8,
     attempts: Attempts,
-    step: Step,
+    step: RateStep,
     /// The step of the last frame; its answer may have come since.
-    sent: Step,
+    sent: RateStep,
 }
 
 impl Rate {
@@ -45,35 +46,35 @@ impl Rate {
         }
         self.attempts.again();
         self.step = match code {
-            0 if self.code == DEFAULT_RATE => Step::Done,
-            _ if code == self.code => Step::Done,
+            0 if self.code == DEFAULT_RATE => RateStep::Done,
+            _ if code == self.code => RateStep::Done,
             _ if self.attempts.exhausted() => {
                 out.fault(Counter::Changed, 1, frame.id);
-                Step::Done
+                RateStep::Done
             }
-            _ => Step::Set,
+            _ => RateStep::Set,
         };
     }
 }
 
 impl Inquiry for Rate {
     fn begin(&mut self) {
-        self.step = Step::Stop;
+        self.step = RateStep::Stop;
         self.attempts.begin();
     }
 
     fn poll(&mut self, now: Nanos) -> Ask {
         self.sent = self.step;
         Ask::Send(match self.step {
-            Step::Stop => send(self.id, command::STOP, 0),
-            Step::Set => send(self.id, command::SET_RATE, self.code),
-            Step::Get if now < self.attempts.next() => return Ask::Wait,
-            Step::Get if !self.attempts.exhausted() => {
+            RateStep::Stop => send(self.id, command::STOP, 0),
+            RateStep::Set => send(self.id, command::SET_RATE, self.code),
+            RateStep::Get if now < self.attempts.next() => return Ask::Wait,
+            RateStep::Get if !self.attempts.exhausted() => {
                 self.attempts.ask(now);
                 send(self.id, command::GET_RATE, 0)
             }
-            Step::Get | Step::Done => {
-                self.step = Step::Done;
+            RateStep::Get | RateStep::Done => {
+                self.step = RateStep::Done;
                 return Ask::Done;
             }
         })
@@ -81,8 +82,8 @@ impl Inquiry for Rate {
 
     fn sent(&mut self, outcome: Result<Nanos, NotSent>) {
         match self.sent {
-            Step::Stop | Step::Set if outcome.is_ok() => self.step = Step::Get,
-            Step::Get => self.attempts.sent(outcome),
+            RateStep::Stop | RateStep::Set if outcome.is_ok() => self.step = RateStep::Get,
+            RateStep::Get => self.attempts.sent(outcome),
             _ => {}
         }
     }
@@ -95,7 +96,7 @@ impl Inquiry for Rate {
 /// The host's side of a sensor.
 #[derive(Debug)]
 pub(super) struct Rft {
-    ids: Ids,
+    ids: RftIds,
     divisors: [f64; 6],
     pairing: Pairing<[u8; 8]>,
     tare: TareCommand,
@@ -103,29 +104,6 @@ pub(super) struct Rft {
 }
 
 impl Rft {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let ids = options.ids(spec)?;
-        let rate = Rate {
-            id: ids.command,
-            code: options.rate_code()?,
-            attempts: Attempts::new(Timing::USUAL),
-            step: Step::Stop,
-            sent: Step::Stop,
-        };
-        let mut bringup = Bringup::new(spec, spec.mode, Timing::USUAL, ids.first);
-        bringup.start_with(ids.command, send(ids.command, command::START, 0).data());
-        bringup.stop_with(ids.command, send(ids.command, command::STOP, 0).data());
-        let claims = [ids.first, ids.second].map(Claim::exclusive);
-        let this = Self {
-            ids,
-            divisors: options.model.divisors(),
-            pairing: Pairing::new(Limit::of_period(period(options.rate_hz)), Order::Usual),
-            tare: TareCommand::default(),
-            zero: NewZero::default(),
-        };
-        Ok(Supervised::boxed(claims, bringup, rate, this))
-    }
-
     /// The reading of both frames' bytes.
     fn wrench(&self, first: [u8; 8], second: [u8; 8]) -> (Wrench, Quality) {
         let [_, fx, fx_low, fy, fy_low, fz, fz_low, tx] = first;
@@ -156,7 +134,7 @@ impl Rft {
         halves: [[u8; 8]; 2],
         first: (Nanos, StampKind),
         frame: &Frame,
-        link: &mut Link<Rate>,
+        link: &mut Supervision<Rate>,
         out: &mut Decoded,
     ) {
         let [a, b] = halves;
@@ -178,10 +156,42 @@ impl Rft {
     }
 }
 
+impl Driver for RobotousRftOptions {
+    const NAME: &'static str = "robotous_rft";
+    const ADDRESS: Option<u32> = Some(0x64);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Wrench)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let ids = self.ids(spec)?;
+        let rate = Rate {
+            id: ids.command,
+            code: self.rate_code()?,
+            attempts: Attempts::new(Timing::USUAL),
+            step: RateStep::Stop,
+            sent: RateStep::Stop,
+        };
+        let mut bringup = Bringup::new(spec, spec.mode, Timing::USUAL, ids.first);
+        bringup.start_with(ids.command, send(ids.command, command::START, 0).data());
+        bringup.stop_with(ids.command, send(ids.command, command::STOP, 0).data());
+        let claims = [ids.first, ids.second].map(Claim::exclusive);
+        let this = Rft {
+            ids,
+            divisors: self.model.divisors(),
+            pairing: Pairing::new(Limit::of_period(period(self.rate_hz)), HalfOrder::Usual),
+            tare: TareCommand::default(),
+            zero: NewZero::default(),
+        };
+        Ok(Supervised::boxed(claims, bringup, rate, this))
+    }
+}
+
 impl Family for Rft {
     type Questions = Rate;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<Rate>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<Rate>, out: &mut Decoded) {
         let second = frame.id == self.ids.second;
         if !second && frame.id != self.ids.first {
             return;
@@ -217,7 +227,12 @@ impl Family for Rft {
         self.pairing.reset();
     }
 
-    fn request(&mut self, now: Nanos, _link: &mut Link<Rate>, _out: &mut Decoded) -> Option<Frame> {
+    fn request(
+        &mut self,
+        now: Nanos,
+        _link: &mut Supervision<Rate>,
+        _out: &mut Decoded,
+    ) -> Option<Frame> {
         let due = self.tare.poll(now);
         due.then(|| send(self.ids.command, command::BIAS, SET))
     }
@@ -243,7 +258,7 @@ impl Family for Rft {
         &mut self,
         command: Command,
         now: Nanos,
-        link: &Link<Rate>,
+        link: &Supervision<Rate>,
     ) -> Result<(), CommandRefused> {
         if command != Command::Tare {
             return Err(CommandRefused::Unsupported);
@@ -256,7 +271,10 @@ impl Family for Rft {
         Ok(())
     }
 
-    fn outcome(&mut self, _link: &Link<Rate>) -> Option<Result<CommandOutcome, CommandFailed>> {
+    fn outcome(
+        &mut self,
+        _link: &Supervision<Rate>,
+    ) -> Option<Result<CommandOutcome, CommandFailed>> {
         self.tare.outcome()
     }
 }

@@ -1,13 +1,13 @@
 //! The keys of a sensor in gateway.toml, for both sides of the driver.
 
-use super::protocol::{Ids, RATES};
+use super::protocol::{RATES, RftIds};
 use crate::{Id, Spec, SpecError, keys};
 use serde::Deserialize;
 
 /// The models, which differ in their scales.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
-pub enum Model {
+pub enum RftModel {
     /// RFT40-SA01.
     #[default]
     #[serde(rename = "RFT40-SA01")]
@@ -38,7 +38,7 @@ pub enum Model {
     Rft80A03,
 }
 
-impl Model {
+impl RftModel {
     /// Their names, in the order of the variants.
     pub(super) const NAMES: [&'static str; 9] = [
         "RFT40-SA01",
@@ -71,9 +71,9 @@ impl Model {
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct RobotousRftOptions {
     /// The model; default RFT40-SA01.
-    pub model: Model,
+    pub model: RftModel,
     /// Readings per second \[Hz\], one of the sensor's; default 200.
     pub rate_hz: u32,
     /// Identifier of a response's first frame, 1 to 255; default 1.
@@ -82,10 +82,10 @@ pub struct Options {
     pub id_second: u16,
 }
 
-impl Default for Options {
+impl Default for RobotousRftOptions {
     fn default() -> Self {
         Self {
-            model: Model::default(),
+            model: RftModel::default(),
             rate_hz: 200,
             id_first: 1,
             id_second: 2,
@@ -93,10 +93,10 @@ impl Default for Options {
     }
 }
 
-impl Options {
-    pub(super) fn ids(&self, spec: &Spec) -> Result<Ids, SpecError> {
+impl RobotousRftOptions {
+    pub(super) fn ids(&self, spec: &Spec) -> Result<RftIds, SpecError> {
         let expected = "from 1 to 255";
-        let ids = Ids {
+        let ids = RftIds {
             command: Id::standard(keys::address(spec, 1..=255)?),
             first: keys::id("id_first", self.id_first, 1..=255, expected)?,
             second: keys::id("id_second", self.id_second, 1..=255, expected)?,

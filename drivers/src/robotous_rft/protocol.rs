@@ -36,7 +36,7 @@ pub(super) const OVERLOAD_FX: u32 = 5;
 
 /// The identifiers of a sensor.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Ids {
+pub(super) struct RftIds {
     pub(super) command: Id,
     pub(super) first: Id,
     pub(super) second: Id,

@@ -1,14 +1,14 @@
 //! Recognising a sensor with the identifiers that it is delivered with.
 
-use super::options::{Model, Options};
-use super::protocol::{Ids, RATES, command, send};
+use super::options::{RftModel, RobotousRftOptions};
+use super::protocol::{RATES, RftIds, command, send};
 use crate::recognise::{Evidence, Finding, Key, Traffic};
-use crate::{Driver, Frame, Id};
+use crate::{Driver, Frame, Id, Recognise};
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
 
-const IDS: Ids = Ids {
+const IDS: RftIds = RftIds {
     command: Id::standard(0x64),
     first: Id::standard(1),
     second: Id::standard(2),
@@ -25,7 +25,7 @@ const COMMANDS: [u8; 8] = [
 ];
 
 /// The sensor, if `seen` shows it.
-pub(super) fn sensor(seen: &Traffic) -> Option<Finding> {
+fn sensor(seen: &Traffic) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, 1);
     let first = evidence.sends(IDS.first, |frame| match *frame.data() {
         [command, _, _, _, _, _, _, _] => COMMANDS.contains(&command),
@@ -56,7 +56,7 @@ pub(super) fn sensor(seen: &Traffic) -> Option<Finding> {
     if let Some(name) = text(command::NAME) {
         // Fifteen letters, digits and signs.
         evidence.add(8.0);
-        if Model::NAMES.contains(&name.as_str()) {
+        if RftModel::NAMES.contains(&name.as_str()) {
             model = Key::new("model", format!("{name:?}"));
         }
         what = name;
@@ -72,14 +72,22 @@ pub(super) fn sensor(seen: &Traffic) -> Option<Finding> {
     let rate = RATES
         .iter()
         .find(|(rate, _)| measured.is_some_and(|hz| near(hz, *rate)));
-    let finding = evidence.finding(Options::NAME, IDS.command.raw(), what)?;
+    let finding = evidence.finding(RobotousRftOptions::NAME, IDS.command.raw(), what)?;
     let rate = rate.map(|(rate, _)| Key::new("rate_hz", rate));
     Some(finding.with_keys([model]).with_keys(rate))
 }
 
-/// A sensor that streams ignores them.
-pub(super) fn questions() -> Vec<Frame> {
-    [command::NAME, command::SERIAL, command::GET_RATE]
-        .map(|command| send(IDS.command, command, 0))
-        .to_vec()
+impl Recognise for RobotousRftOptions {
+    const ASKED_BY_NAME: bool = true;
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        sensor(seen).into_iter().collect()
+    }
+
+    /// A sensor that streams ignores them.
+    fn questions(_seen: &Traffic) -> Vec<Frame> {
+        [command::NAME, command::SERIAL, command::GET_RATE]
+            .map(|command| send(IDS.command, command, 0))
+            .to_vec()
+    }
 }

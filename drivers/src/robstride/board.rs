@@ -2,10 +2,11 @@
 //! commanded once a period.
 
 use super::frames::{
-    JOINT, LENGTH, MOTOR, OF_STATE, RUNNING, State, fault, id, kind, parameter, quality_of,
+    JOINT, LENGTH, MOTOR, OF_STATE, RUNNING, RobstrideState, fault, id, kind, parameter, quality_of,
 };
-use super::options::{Checked, Options, Protocol};
-use crate::{Board, EncodeError, Format, Frame, Frames, Id, Spec, SpecError, bytes, mit};
+use super::options::{RobstrideKeys, RobstrideOptions, RobstrideProtocol};
+use crate::{Board, EncodeError, Format, Frame, Frames, Id, Simulate, Spec, SpecError, bytes, mit};
+use alloc::boxed::Box;
 use proprio_topics::{JointState, Nanos, Quality, Reading};
 
 /// The number of a simulated motor's processor.
@@ -13,8 +14,8 @@ const UID: [u8; 8] = [0x36, 0x31, 0x30, 0x14, 0x0B, 0x33, 0x33, 0x31];
 
 /// A simulated motor.
 #[derive(Debug)]
-pub struct RobstrideBoard {
-    keys: Checked,
+struct RobstrideBoard {
+    keys: RobstrideKeys,
     joint: JointState,
     mode: u8,
     /// The six faults of a state, and those of a frame of their own.
@@ -25,52 +26,37 @@ pub struct RobstrideBoard {
 }
 
 impl RobstrideBoard {
-    /// A running motor at 25 degrees Celsius.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address outside 1 to 253, a key out of range, ranges that are not known.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        Ok(Self {
-            keys: Checked::new(spec, options)?,
-            joint: JointState {
-                position: 0.0,
-                velocity: 0.0,
-                ..JointState::ABSENT
-            },
-            mode: RUNNING,
-            of_state: 0,
-            faults: 0,
-            tenths: 250,
-        })
-    }
-
     /// The current state; an absent torque is 0.
     fn state(&self) -> Frame {
-        let Checked { address, host, .. } = self.keys;
-        let state = State {
+        let RobstrideKeys { address, host, .. } = self.keys;
+        let state = RobstrideState {
             told: None,
             raw: mit::raw(self.keys.scales, &self.joint),
             tenths: self.tenths,
         };
         match self.keys.protocol {
-            Protocol::Private => {
+            RobstrideProtocol::Private => {
                 let upper = self.mode << 6 | self.of_state;
                 Frame::new(id(kind::STATE, upper, address, host), &state.pack())
             }
-            Protocol::Mit => Frame::new(Id::standard(host.into()), &state.pack_mit(address)),
+            RobstrideProtocol::Mit => {
+                Frame::new(Id::standard(host.into()), &state.pack_mit(address))
+            }
         }
     }
 
     /// The frame about its faults.
     fn told_faults(&self) -> Frame {
-        let Checked { address, host, .. } = self.keys;
+        let RobstrideKeys { address, host, .. } = self.keys;
         let [a, b, c, d] = self.faults.to_le_bytes();
         match self.keys.protocol {
-            Protocol::Private => {
+            RobstrideProtocol::Private => {
                 let data = [a, b, c, d, 0, 0, 0, 0];
                 Frame::new(id(kind::FAULT, 0, address, host), &data)
             }
-            Protocol::Mit => Frame::new(Id::standard(host.into()), &[address, a, b, c, d, 0, 0, 0]),
+            RobstrideProtocol::Mit => {
+                Frame::new(Id::standard(host.into()), &[address, a, b, c, d, 0, 0, 0])
+            }
         }
     }
 
@@ -106,7 +92,7 @@ impl RobstrideBoard {
                         (encoder | set(Quality::DRIVE_FAULT, fault::OVER_TEMPERATURE)) as u8;
                     let was = self.faults;
                     self.faults = 0;
-                    if self.keys.protocol == Protocol::Mit {
+                    if self.keys.protocol == RobstrideProtocol::Mit {
                         if quality.contains(Quality::DEVICE_FAULT) {
                             self.faults |= fault::NOT_CALIBRATED;
                         }
@@ -139,12 +125,30 @@ impl RobstrideBoard {
     }
 }
 
+impl Simulate for RobstrideOptions {
+    /// A running motor at 25 degrees Celsius.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(RobstrideBoard {
+            keys: RobstrideKeys::new(spec, self)?,
+            joint: JointState {
+                position: 0.0,
+                velocity: 0.0,
+                ..JointState::ABSENT
+            },
+            mode: RUNNING,
+            of_state: 0,
+            faults: 0,
+            tenths: 250,
+        }))
+    }
+}
+
 impl Board for RobstrideBoard {
     /// Answers questions for its number and for parameters.
     #[allow(clippy::cast_possible_truncation)] // parameters have single precision
     fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        let Checked { address, .. } = self.keys;
-        if self.keys.protocol == Protocol::Mit
+        let RobstrideKeys { address, .. } = self.keys;
+        if self.keys.protocol == RobstrideProtocol::Mit
             || frame.format != Format::Classic
             || frame.len() != LENGTH
         {

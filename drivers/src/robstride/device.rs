@@ -1,61 +1,36 @@
 //! The host's side: takes the frames of one motor, and reads its parameters if it is told to.
 
 use super::frames::{
-    JOINT, LENGTH, MOTOR, Message, OF_STATE, RUNNING, State, claim, id, kind, parameter, quality_of,
+    JOINT, LENGTH, MOTOR, OF_STATE, RUNNING, RobstrideMessage, RobstrideState, claim, id, kind,
+    parameter, quality_of,
 };
-use super::options::{Checked, Options, Protocol};
+use super::options::{RobstrideKeys, RobstrideOptions, RobstrideProtocol};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Link, Rounds, Supervised, temperature};
-use crate::held::{Held, OnChange};
-use crate::{Claim, Decoded, Device, Frame, Id, Mode, Output, Spec, SpecError, bytes, mit};
+use crate::family::{Family, Rounds, Supervised, Supervision, temperature};
+use crate::held::{HeldValue, OnChange};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Id, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+    mit,
+};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading};
+use alloc::vec::Vec;
+use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
 
 /// The host's side of a motor.
 #[derive(Debug)]
-pub(super) struct Motor {
-    keys: Checked,
+pub(super) struct RobstrideMotor {
+    keys: RobstrideKeys,
     /// As they were told last: mode; faults of a frame of their own; those of a state.
     mode: u8,
     faults: u32,
     of_state: u32,
     told: OnChange<(u8, u32)>,
-    velocity: Held,
-    current: Held,
+    velocity: HeldValue,
+    current: HeldValue,
     questions: Rounds,
 }
 
-impl Motor {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, options)?;
-        let (mode, timing) = match keys.request_period {
-            Some(_) => (spec.mode, Timing::POLLED),
-            None => (Mode::Listen, Timing::LISTENED),
-        };
-        let (address, host) = (keys.address, keys.host);
-        let mut claims = match keys.protocol {
-            Protocol::Private => kind::READ.map(|kind| claim(kind, address, host)).to_vec(),
-            Protocol::Mit => [Claim::shared(Id::standard(host.into()))].to_vec(),
-        };
-        // What is watched is the first.
-        if keys.request_period.is_some() {
-            claims.swap(0, 1);
-        }
-        let watched = claims.first().map_or(Id::standard(0), |claim| claim.id);
-        let bringup = Bringup::new(spec, mode, timing, watched);
-        let this = Self {
-            keys,
-            mode: 0,
-            faults: 0,
-            of_state: 0,
-            told: OnChange::NOTHING,
-            velocity: Held::ABSENT,
-            current: Held::ABSENT,
-            questions: Rounds::new(keys.request_period),
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
+impl RobstrideMotor {
     /// Tells mode and faults if they are new, and now and then. Returns whether it did.
     fn tell(&mut self, frame: &Frame, out: &mut Decoded) -> bool {
         let faults = self.faults | self.of_state;
@@ -78,9 +53,9 @@ impl Motor {
 
     fn state(
         &mut self,
-        state: &State,
+        state: &RobstrideState,
         frame: &Frame,
-        link: &mut Link<NoInquiry>,
+        link: &mut Supervision<NoInquiry>,
         out: &mut Decoded,
     ) {
         if let Some((mode, faults)) = state.told {
@@ -104,7 +79,7 @@ impl Motor {
         &mut self,
         (parameter, value): (u16, f64),
         frame: &Frame,
-        link: &mut Link<NoInquiry>,
+        link: &mut Supervision<NoInquiry>,
         out: &mut Decoded,
     ) {
         // Answers to another program.
@@ -112,8 +87,8 @@ impl Motor {
             return;
         };
         match parameter {
-            parameter::VELOCITY => self.velocity = Held::new(frame, value),
-            parameter::CURRENT => self.current = Held::new(frame, value),
+            parameter::VELOCITY => self.velocity = HeldValue::new(frame, value),
+            parameter::CURRENT => self.current = HeldValue::new(frame, value),
             parameter::POSITION if value.is_finite() => {
                 let current = self.current.at(frame, period);
                 let state = JointState {
@@ -131,15 +106,15 @@ impl Motor {
     }
 
     /// What `frame` tells.
-    fn message(&self, frame: &Frame, out: &mut Decoded) -> Option<Message> {
+    fn message(&self, frame: &Frame, out: &mut Decoded) -> Option<RobstrideMessage> {
         let (address, host) = (self.keys.address, self.keys.host);
         let kind = match self.keys.protocol {
-            Protocol::Private => {
+            RobstrideProtocol::Private => {
                 let mut kinds = kind::READ.into_iter();
                 Some(kinds.find(|kind| claim(*kind, address, host).matches(frame.id))?)
             }
-            Protocol::Mit if frame.id == Id::standard(host.into()) => None,
-            Protocol::Mit => return None,
+            RobstrideProtocol::Mit if frame.id == Id::standard(host.into()) => None,
+            RobstrideProtocol::Mit => return None,
         };
         let data = bytes::payload(frame, out)?;
         if data.len() != LENGTH {
@@ -148,44 +123,85 @@ impl Motor {
         }
         let [_, _, upper, _] = frame.id.raw().to_le_bytes();
         match kind {
-            Some(kind) => Some(Message::of_private(kind, upper, data)),
-            None => Message::of_mit(address, data),
+            Some(kind) => Some(RobstrideMessage::of_private(kind, upper, data)),
+            None => RobstrideMessage::of_mit(address, data),
         }
     }
 }
 
-impl Family for Motor {
+impl Driver for RobstrideOptions {
+    const NAME: &'static str = "robstride";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let motor = OutputInfo::temperature(MOTOR, "motor");
+        [OutputInfo::new(JOINT, Kind::Joint), motor].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let keys = RobstrideKeys::new(spec, self)?;
+        let (mode, timing) = match keys.request_period {
+            Some(_) => (spec.mode, Timing::POLLED),
+            None => (Mode::Listen, Timing::LISTENED),
+        };
+        let (address, host) = (keys.address, keys.host);
+        let mut claims = match keys.protocol {
+            RobstrideProtocol::Private => {
+                kind::READ.map(|kind| claim(kind, address, host)).to_vec()
+            }
+            RobstrideProtocol::Mit => [Claim::shared(Id::standard(host.into()))].to_vec(),
+        };
+        // What is watched is the first.
+        if keys.request_period.is_some() {
+            claims.swap(0, 1);
+        }
+        let watched = claims.first().map_or(Id::standard(0), |claim| claim.id);
+        let bringup = Bringup::new(spec, mode, timing, watched);
+        let this = RobstrideMotor {
+            keys,
+            mode: 0,
+            faults: 0,
+            of_state: 0,
+            told: OnChange::NOTHING,
+            velocity: HeldValue::ABSENT,
+            current: HeldValue::ABSENT,
+            questions: Rounds::new(keys.request_period),
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+}
+
+impl Family for RobstrideMotor {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         match self.message(frame, out) {
-            Some(Message::State(state)) => self.state(&state, frame, link, out),
-            Some(Message::Faults(faults)) => {
+            Some(RobstrideMessage::State(state)) => self.state(&state, frame, link, out),
+            Some(RobstrideMessage::Faults(faults)) => {
                 self.faults = faults & ((1 << OF_STATE) - 1);
                 self.tell(frame, out);
             }
-            Some(Message::Parameter(parameter, Some(value))) => {
+            Some(RobstrideMessage::Parameter(parameter, Some(value))) => {
                 self.parameter((parameter, f64::from(value)), frame, link, out);
             }
-            Some(Message::Parameter(parameter, None))
+            Some(RobstrideMessage::Parameter(parameter, None))
                 if self.keys.request_period.is_some() && parameter::ASKED.contains(&parameter) =>
             {
                 out.fault(Counter::Value, 1, frame.id);
             }
-            Some(Message::Parameter(_, None)) | None => {}
+            Some(RobstrideMessage::Parameter(_, None)) | None => {}
         }
     }
 
     fn reset(&mut self) {
         (self.mode, self.faults, self.of_state) = (0, 0, 0);
         self.told = OnChange::NOTHING;
-        (self.velocity, self.current) = (Held::ABSENT, Held::ABSENT);
+        (self.velocity, self.current) = (HeldValue::ABSENT, HeldValue::ABSENT);
     }
 
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Link<NoInquiry>,
+        _link: &mut Supervision<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         let [low, high] = (self.questions.ask(&parameter::ASKED, now)?).to_le_bytes();

@@ -73,8 +73,8 @@ pub(super) fn claim(kind: u8, address: u8, host: u8) -> Claim {
 
 /// What a motor sends.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Message {
-    State(State),
+pub(super) enum RobstrideMessage {
+    State(RobstrideState),
     /// Faults, bits 0 to 16.
     Faults(u32),
     /// The value of a parameter; `None`: it can not be read.
@@ -83,7 +83,7 @@ pub(super) enum Message {
 
 /// A motor's state.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct State {
+pub(super) struct RobstrideState {
     /// Mode and six faults, if they are told.
     pub(super) told: Option<(u8, u8)>,
     /// Position, velocity, torque.
@@ -92,7 +92,7 @@ pub(super) struct State {
     pub(super) tenths: u16,
 }
 
-impl Message {
+impl RobstrideMessage {
     /// A frame of the private protocol; `data` has 8 bytes.
     pub(super) fn of_private(kind: u8, upper: u8, data: &[u8]) -> Self {
         match kind {
@@ -101,7 +101,7 @@ impl Message {
                 let value = f32::from_bits(u32_le(data, 4));
                 Self::Parameter(u16_le(data, 0), (upper == 0).then_some(value))
             }
-            _ => Self::State(State {
+            _ => Self::State(RobstrideState {
                 told: Some((upper >> 6, upper & 0x3F)),
                 raw: [0, 2, 4].map(|at| i64::from(u16_be(data, at))),
                 tenths: u16_be(data, 6),
@@ -118,7 +118,7 @@ impl Message {
         let (raw, &[high, low]) = mit::unpack(rest)? else {
             return None;
         };
-        Some(Self::State(State {
+        Some(Self::State(RobstrideState {
             told: None,
             raw,
             tenths: u16::from_be_bytes([high, low]),
@@ -126,7 +126,7 @@ impl Message {
     }
 }
 
-impl State {
+impl RobstrideState {
     /// The payload in the private protocol.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // within their ranges
     pub(super) fn pack(&self) -> [u8; 8] {

@@ -12,7 +12,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum Protocol {
+pub enum RobstrideProtocol {
     /// Extended identifiers.
     #[default]
     Private,
@@ -24,7 +24,7 @@ pub enum Protocol {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[allow(missing_docs)] // the names say it
-pub enum Model {
+pub enum RobstrideModel {
     RS00,
     RS01,
     RS02,
@@ -36,7 +36,7 @@ pub enum Model {
     CyberGear,
 }
 
-impl Model {
+impl RobstrideModel {
     /// Ends of the ranges of velocity \[rad/s\], in the private and the MIT protocol, and of torque
     /// \[Nm\].
     const fn ranges(self) -> (f64, f64, f64) {
@@ -58,11 +58,11 @@ impl Model {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct RobstrideOptions {
     /// Its model, for the defaults of other keys.
-    pub model: Option<Model>,
+    pub model: Option<RobstrideModel>,
     /// Its protocol; default the private one.
-    pub protocol: Protocol,
+    pub protocol: RobstrideProtocol,
     /// The host to which it answers; default 0xFD.
     pub host_id: u8,
     /// End of the range of positions \[rad\]; default 4 pi.
@@ -79,11 +79,11 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for RobstrideOptions {
     fn default() -> Self {
         Self {
             model: None,
-            protocol: Protocol::Private,
+            protocol: RobstrideProtocol::Private,
             host_id: 0xFD,
             position_max: 2.0 * TAU,
             velocity_max: None,
@@ -97,10 +97,10 @@ impl Default for Options {
 
 /// The keys of a motor, checked.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Checked {
+pub(super) struct RobstrideKeys {
     pub(super) address: u8,
     pub(super) host: u8,
-    pub(super) protocol: Protocol,
+    pub(super) protocol: RobstrideProtocol,
     /// Position, velocity, torque.
     pub(super) scales: [Scale; 3],
     /// The faults that concern the position.
@@ -110,8 +110,8 @@ pub(super) struct Checked {
     pub(super) period: Nanos,
 }
 
-impl Checked {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+impl RobstrideKeys {
+    pub(super) fn new(spec: &Spec, options: &RobstrideOptions) -> Result<Self, SpecError> {
         let [address, _] = address(spec, 1..=0xFD)?.to_le_bytes();
         let (protocol, host) = (options.protocol, options.host_id);
         if host == address {
@@ -121,29 +121,29 @@ impl Checked {
                 expected: "0 to 255, and not the motor's address",
             });
         }
-        if options.request_period_ms.is_some() && protocol == Protocol::Mit {
+        if options.request_period_ms.is_some() && protocol == RobstrideProtocol::Mit {
             return Err(SpecError::Keys {
                 key: "request_period_ms",
                 expected: "left out with protocol = \"mit\": it has no question that is no command",
             });
         }
-        let ranges = options.model.map(Model::ranges);
+        let ranges = options.model.map(RobstrideModel::ranges);
         let of_model = ranges.map(|(private, mit, _)| match protocol {
-            Protocol::Private => private,
-            Protocol::Mit => mit,
+            RobstrideProtocol::Private => private,
+            RobstrideProtocol::Mit => mit,
         });
         let position = above_zero("position_max", options.position_max)?;
         let velocity = known("velocity_max", options.velocity_max, of_model)?;
         let of_model = ranges.map(|(.., torque)| torque);
         let torque = known("torque_max", options.torque_max, of_model)?;
         let bits = match protocol {
-            Protocol::Private => 16,
-            Protocol::Mit => 12,
+            RobstrideProtocol::Private => 16,
+            RobstrideProtocol::Mit => 12,
         };
         let encoder = fault::NOT_CALIBRATED | fault::MAGNETIC_ENCODER | fault::STATE_NOT_CALIBRATED;
         let encoder = encoder
             | match options.model {
-                Some(Model::CyberGear) => fault::HALL_ENCODER,
+                Some(RobstrideModel::CyberGear) => fault::HALL_ENCODER,
                 _ => fault::NOT_INITIALISED,
             };
         Ok(Self {

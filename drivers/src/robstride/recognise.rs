@@ -1,10 +1,10 @@
 //! Recognising motors by their states, by parameters that they tell, and by their number.
 
-use super::frames::{LENGTH, Message, id, kind};
-use super::options::Options;
+use super::frames::{LENGTH, RobstrideMessage, id, kind};
+use super::options::RobstrideOptions;
 use crate::bytes::{u16_be, u16_le};
-use crate::recognise::{Evidence, Finding, Key, Part, Stream, Traffic};
-use crate::{Driver, Frame, Id};
+use crate::recognise::{Evidence, Finding, IdUse, Key, Stream, Traffic};
+use crate::{Driver, Frame, Id, Recognise};
 use alloc::vec::Vec;
 
 /// The highest number that people give, and the hosts that programs are.
@@ -29,38 +29,47 @@ fn is_parameter(frame: &Frame) -> bool {
     data.len() == LENGTH && is_known && u16_le(data, 2) == 0
 }
 
-/// The motors that `seen` shows.
-pub(super) fn motors(seen: &Traffic) -> Vec<Finding> {
-    let mut found: Vec<(u8, u8)> = Vec::new();
-    for stream in seen.streams().filter(|stream| stream.frames > 0) {
-        let Id::Extended(raw) = stream.id else {
-            continue;
-        };
-        let [host, address, upper, kind] = raw.to_le_bytes();
-        let pair = match kind {
-            kind::STATE | kind::REPORT if upper >> 6 < 3 => (address, host),
-            kind::PARAMETER if upper < 2 && HOSTS.contains(&host) => (address, host),
-            // Whoever asks, it tells its number to all.
-            kind::DEVICE if (upper, host) == (0, 0xFE) => (address, 0xFD),
-            _ => continue,
-        };
-        let is_known = |known: &&(u8, u8)| known.0 == pair.0;
-        let is_new = found.iter().find(is_known).is_none();
-        if (1..=NUMBERS).contains(&address) && is_new {
-            found.push(pair);
+impl Recognise for RobstrideOptions {
+    const ASKED_BY_NAME: bool = true;
+
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let mut found: Vec<(u8, u8)> = Vec::new();
+        for stream in seen.streams().filter(|stream| stream.frames > 0) {
+            let Id::Extended(raw) = stream.id else {
+                continue;
+            };
+            let [host, address, upper, kind] = raw.to_le_bytes();
+            let pair = match kind {
+                kind::STATE | kind::REPORT if upper >> 6 < 3 => (address, host),
+                kind::PARAMETER if upper < 2 && HOSTS.contains(&host) => (address, host),
+                // Whoever asks, it tells its number to all.
+                kind::DEVICE if (upper, host) == (0, 0xFE) => (address, 0xFD),
+                _ => continue,
+            };
+            let is_known = |known: &&(u8, u8)| known.0 == pair.0;
+            let is_new = found.iter().find(is_known).is_none();
+            if (1..=NUMBERS).contains(&address) && is_new {
+                found.push(pair);
+            }
         }
+        let private = found
+            .iter()
+            .filter_map(|(address, host)| private(seen, *address, *host));
+        let mit = seen.stream(Id::standard(MIT_HOST)).into_iter();
+        private
+            .chain(mit.flat_map(|stream| mit_motors(seen, stream)))
+            .collect()
     }
-    let private = found
-        .iter()
-        .filter_map(|(address, host)| private(seen, *address, *host));
-    let mit = seen.stream(Id::standard(MIT_HOST)).into_iter();
-    private
-        .chain(mit.flat_map(|stream| mit_motors(seen, stream)))
-        .collect()
+
+    /// The numbers of all motors, of the host as it is delivered.
+    fn questions(_seen: &Traffic) -> Vec<Frame> {
+        let question = |address| Frame::new(id(kind::DEVICE, 0, 0xFD, address), &[0; LENGTH]);
+        (1..=NUMBERS).map(question).collect()
+    }
 }
 
 fn finding(evidence: Evidence<'_>, address: u8) -> Option<Finding> {
-    let finding = evidence.finding(Options::NAME, address.into(), "RobStride motor")?;
+    let finding = evidence.finding(RobstrideOptions::NAME, address.into(), "RobStride motor")?;
     let model = Key::fill_in("model", "\"RS03\"", "its ranges depend on it");
     Some(finding.with_keys([model]).with_joints([0]))
 }
@@ -142,13 +151,13 @@ fn mit_motors(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
         if numbers.len() > 1 {
             evidence.add(-3.0);
         }
-        evidence.sends_as(Part::Sends(Some(*address)), stream.id, |frame| {
+        evidence.sends_as(IdUse::Sends(Some(*address)), stream.id, |frame| {
             let first = frame.data().first();
             let is_own = first.is_some_and(|first| numbers.contains(first));
             is_own && is_state(frame)
         })?;
-        let read = |frame: &Frame| match Message::of_mit(*address, frame.data()) {
-            Some(Message::State(state)) => Some(state.raw),
+        let read = |frame: &Frame| match RobstrideMessage::of_mit(*address, frame.data()) {
+            Some(RobstrideMessage::State(state)) => Some(state.raw),
             _ => None,
         };
         evidence.moves(stream, |frame| {
@@ -170,10 +179,4 @@ fn mit_motors(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
         .filter(|_| are_few)
         .filter_map(find)
         .collect()
-}
-
-/// The numbers of all motors, of the host as it is delivered.
-pub(super) fn questions() -> Vec<Frame> {
-    let question = |address| Frame::new(id(kind::DEVICE, 0, 0xFD, address), &[0; LENGTH]);
-    (1..=NUMBERS).map(question).collect()
 }

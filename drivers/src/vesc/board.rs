@@ -3,15 +3,16 @@
 use super::frames::{
     AMPERE_PER_STEP, DUTY_PER_STEP, FET, JOINT, KELVIN_PER_STEP, MOTOR, STEPS_PER_TURN, command,
 };
-use super::options::{Checked, Options, Position};
+use super::options::{VescKeys, VescOptions, VescPosition};
 use crate::bytes::{quantise, quantise_i16};
-use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board};
+use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading};
 
 /// A simulated controller.
 #[derive(Debug)]
-pub struct VescBoard {
-    keys: Checked,
+struct VescBoard {
+    keys: VescKeys,
     /// The duty cycle that it was told.
     duty: f64,
     /// Of FETs and motor \[degrees Celsius\].
@@ -19,18 +20,6 @@ pub struct VescBoard {
 }
 
 impl VescBoard {
-    /// A controller at 25 degrees Celsius.
-    ///
-    /// # Errors
-    /// [`SpecError`]: an address above 254, a key out of range or missing.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        Ok(Self {
-            keys: Checked::new(spec, options)?,
-            duty: 0.0,
-            temperatures: [25.0; 2],
-        })
-    }
-
     fn status(&self, velocity: f64, amperes: f64) -> [u8; 8] {
         let most = i64::from(i32::MAX);
         #[allow(clippy::cast_possible_truncation)] // limited
@@ -60,6 +49,17 @@ impl VescBoard {
     }
 }
 
+impl Simulate for VescOptions {
+    /// A controller at 25 degrees Celsius.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(VescBoard {
+            keys: VescKeys::new(spec, self)?,
+            duty: 0.0,
+            temperatures: [25.0; 2],
+        }))
+    }
+}
+
 impl Board for VescBoard {
     fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
 
@@ -84,18 +84,16 @@ impl Board for VescBoard {
                 };
                 let amperes = if amperes.is_nan() { 0.0 } else { amperes };
                 let values = [joint.position, joint.velocity, amperes];
-                if values.iter().any(|value| !value.is_finite()) {
-                    return Err(EncodeError::NotFinite);
-                }
+                board::finite(&values)?;
                 self.send(command::STATUS, self.status(joint.velocity, amperes), out);
                 let (step, most) = (self.keys.position_step, i64::from(i32::MAX));
                 match self.keys.position {
-                    Position::Pid => {
+                    VescPosition::Pid => {
                         let steps = quantise(joint.position, step, i64::MIN, i64::MAX);
                         let data = self.status_4(steps.rem_euclid(STEPS_PER_TURN));
                         self.send(command::STATUS_4, data, out);
                     }
-                    Position::Tachometer => {
+                    VescPosition::Tachometer => {
                         #[allow(clippy::cast_possible_truncation)] // limited
                         let count = quantise(joint.position, step, -most, most) as i32;
                         let [t0, t1, t2, t3] = count.to_be_bytes();
@@ -105,12 +103,10 @@ impl Board for VescBoard {
             }
             (JOINT, Reading::Actuator(actuator)) => self.duty = actuator.duty,
             (MOTOR | FET, Reading::Temperature(temperature)) => {
-                if !temperature.celsius.is_finite() {
-                    return Err(EncodeError::NotFinite);
-                }
+                board::finite(&[temperature.celsius])?;
                 let [fet, motor] = &mut self.temperatures;
                 *(if output == MOTOR { motor } else { fet }) = temperature.celsius;
-                if self.keys.position == Position::Tachometer {
+                if self.keys.position == VescPosition::Tachometer {
                     self.send(command::STATUS_4, self.status_4(0), out);
                 }
             }

@@ -3,49 +3,36 @@
 use super::frames::{
     AMPERE_PER_STEP, COLDEST, DUTY_PER_STEP, FET, JOINT, KELVIN_PER_STEP, LENGTH, MOTOR, command,
 };
-use super::options::{Checked, Options, Position};
+use super::options::{VescKeys, VescOptions, VescPosition};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes::{self, i16_be, u32_be};
-use crate::family::{Family, Link, Supervised, temperature};
-use crate::held::Held;
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
+use crate::family::{Family, Supervised, Supervision, temperature};
+use crate::held::HeldValue;
+use crate::{Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
-use proprio_topics::{Actuator, Counter, JointState, Quality, Reading};
+use alloc::vec::Vec;
+use proprio_topics::{Actuator, Counter, JointState, Kind, Quality, Reading};
 
 /// The host's side of a controller.
 #[derive(Debug)]
-pub(super) struct Controller {
-    keys: Checked,
-    velocity: Held,
+pub(super) struct VescController {
+    keys: VescKeys,
+    velocity: HeldValue,
     /// Positive along the shaft's axis.
-    current: Held,
+    current: HeldValue,
 }
 
-impl Controller {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let keys = Checked::new(spec, options)?;
-        let watched = keys.id(keys.with_position());
-        let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, watched);
-        let commands = [command::STATUS, command::STATUS_4, command::STATUS_5];
-        let claims = commands.map(|command| Claim::exclusive(keys.id(command)));
-        let this = Self {
-            keys,
-            velocity: Held::ABSENT,
-            current: Held::ABSENT,
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
+impl VescController {
     fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
         let [current, duty] = [4, 6].map(|at| i16_be(data, at));
         let velocity = f64::from(u32_be(data, 0).cast_signed()) * self.keys.velocity_step;
-        self.velocity = Held::new(frame, velocity);
+        self.velocity = HeldValue::new(frame, velocity);
         let amperes = match (current, duty) {
             (0, _) => 0.0,
             (_, 0) => f64::NAN,
             _ => f64::from(current) * f64::from(duty.signum()) * AMPERE_PER_STEP,
         };
-        self.current = Held::new(frame, amperes);
+        self.current = HeldValue::new(frame, amperes);
         let actuator = Reading::Actuator(Actuator {
             duty: f64::from(duty) * DUTY_PER_STEP,
             mode: 0,
@@ -56,7 +43,13 @@ impl Controller {
         out.push(output, frame.id);
     }
 
-    fn position(&self, raw: i32, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn position(
+        &self,
+        raw: i32,
+        frame: &Frame,
+        link: &mut Supervision<NoInquiry>,
+        out: &mut Decoded,
+    ) {
         let hold = self.keys.hold;
         let current = self.current.at(frame, hold);
         let constant = self.keys.torque_constant.unwrap_or(f64::NAN);
@@ -71,10 +64,34 @@ impl Controller {
     }
 }
 
-impl Family for Controller {
+impl Driver for VescOptions {
+    const NAME: &'static str = "vesc";
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        let temperature = OutputInfo::temperature;
+        let joint = OutputInfo::new(JOINT, Kind::Joint);
+        [joint, temperature(MOTOR, "motor"), temperature(FET, "fet")].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let keys = VescKeys::new(spec, self)?;
+        let watched = keys.id(keys.with_position());
+        let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, watched);
+        let commands = [command::STATUS, command::STATUS_4, command::STATUS_5];
+        let claims = commands.map(|command| Claim::exclusive(keys.id(command)));
+        let this = VescController {
+            keys,
+            velocity: HeldValue::ABSENT,
+            current: HeldValue::ABSENT,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+}
+
+impl Family for VescController {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let commands = [command::STATUS, command::STATUS_4, command::STATUS_5];
         let is_its = |command: &u8| self.keys.id(*command) == frame.id;
         let Some(command) = commands.into_iter().find(is_its) else {
@@ -95,11 +112,11 @@ impl Family for Controller {
                         temperature(output, celsius, frame, out);
                     }
                 }
-                if position == Position::Pid {
+                if position == VescPosition::Pid {
                     self.position(i32::from(i16_be(data, 6)), frame, link, out);
                 }
             }
-            (_, Position::Tachometer) => {
+            (_, VescPosition::Tachometer) => {
                 self.position(u32_be(data, 0).cast_signed(), frame, link, out);
             }
             _ => {}
@@ -107,6 +124,6 @@ impl Family for Controller {
     }
 
     fn reset(&mut self) {
-        (self.velocity, self.current) = (Held::ABSENT, Held::ABSENT);
+        (self.velocity, self.current) = (HeldValue::ABSENT, HeldValue::ABSENT);
     }
 }

@@ -10,7 +10,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum Position {
+pub enum VescPosition {
     /// The PID position in status 4.
     #[default]
     Pid,
@@ -22,9 +22,9 @@ pub enum Position {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct VescOptions {
     /// Where the position is taken from; default the PID position.
-    pub position: Position,
+    pub position: VescPosition,
     /// Pairs of the motor's poles.
     pub pole_pairs: Option<u32>,
     /// Turns of the motor per turn of the shaft whose position is read; default 1.
@@ -37,10 +37,10 @@ pub struct Options {
     pub period_ms: u32,
 }
 
-impl Default for Options {
+impl Default for VescOptions {
     fn default() -> Self {
         Self {
-            position: Position::Pid,
+            position: VescPosition::Pid,
             pole_pairs: None,
             gear_ratio: 1.0,
             torque_constant: None,
@@ -52,9 +52,9 @@ impl Default for Options {
 
 /// The keys of a controller, checked.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Checked {
+pub(super) struct VescKeys {
     address: u16,
-    pub(super) position: Position,
+    pub(super) position: VescPosition,
     /// A step of the position \[rad\], and of the speed \[rad/s\].
     pub(super) position_step: f64,
     pub(super) velocity_step: f64,
@@ -63,8 +63,8 @@ pub(super) struct Checked {
     pub(super) period: Nanos,
 }
 
-impl Checked {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+impl VescKeys {
+    pub(super) fn new(spec: &Spec, options: &VescOptions) -> Result<Self, SpecError> {
         let address = address(spec, 0..=ADDRESS_MOST)?;
         let Some(pairs) = options.pole_pairs else {
             return Err(SpecError::Keys {
@@ -81,8 +81,8 @@ impl Checked {
             address,
             position: options.position,
             position_step: match options.position {
-                Position::Pid => RAD_PER_STEP,
-                Position::Tachometer => RAD_PER_COUNT / electrical,
+                VescPosition::Pid => RAD_PER_STEP,
+                VescPosition::Tachometer => RAD_PER_COUNT / electrical,
             },
             velocity_step: RAD_PER_S_PER_RPM / electrical,
             torque_constant,
@@ -98,8 +98,8 @@ impl Checked {
     /// The message with the position.
     pub(super) const fn with_position(&self) -> u8 {
         match self.position {
-            Position::Pid => command::STATUS_4,
-            Position::Tachometer => command::STATUS_5,
+            VescPosition::Pid => command::STATUS_4,
+            VescPosition::Tachometer => command::STATUS_5,
         }
     }
 }

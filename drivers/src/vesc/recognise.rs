@@ -1,10 +1,10 @@
 //! Recognising controllers by their status messages.
 
 use super::frames::{ADDRESS_MOST, LENGTH, STEPS_PER_TURN, command};
-use super::options::Options;
+use super::options::VescOptions;
 use crate::bytes::{i16_be, u32_be};
 use crate::recognise::{Evidence, Finding, Key, Traffic};
-use crate::{Driver, Frame, Id};
+use crate::{Driver, Frame, Id, Recognise};
 use alloc::vec::Vec;
 
 /// The other status messages: charge, energy, inputs.
@@ -40,10 +40,11 @@ fn is_status_5(frame: &Frame) -> bool {
     data.len() == LENGTH && (0..=SUPPLY).contains(&i16_be(data, 4)) && i16_be(data, 6) == 0
 }
 
-/// The controllers that `seen` shows.
-pub(super) fn controllers(seen: &Traffic) -> Vec<Finding> {
-    let find = |address| controller(seen, address);
-    (0..=ADDRESS_MOST).filter_map(find).collect()
+impl Recognise for VescOptions {
+    fn recognise(seen: &Traffic) -> Vec<Finding> {
+        let find = |address| controller(seen, address);
+        (0..=ADDRESS_MOST).filter_map(find).collect()
+    }
 }
 
 fn controller(seen: &Traffic, address: u16) -> Option<Finding> {
@@ -57,7 +58,7 @@ fn controller(seen: &Traffic, address: u16) -> Option<Finding> {
     for command in OTHERS {
         evidence.sends_length(id(address, command), LENGTH);
     }
-    let finding = evidence.finding(Options::NAME, address.into(), "VESC motor controller")?;
+    let finding = evidence.finding(VescOptions::NAME, address.into(), "VESC motor controller")?;
     let pairs = Key::fill_in("pole_pairs", 7, "of the motor");
     let with_position = pid.or(tachometer);
     let position =

@@ -1,33 +1,21 @@
 //! The sensor's own side.
 
-use super::frames::{ACCELERATION_LSB, Message, RATE_LSB, status};
-use super::options::{Options, Plan};
-use crate::bytes;
-use crate::{Board, EncodeError, Frame, Frames, Spec, SpecError};
+use super::frames::{ACCELERATION_LSB, MtiMessage, RATE_LSB, status};
+use super::options::{MtiKeys, XsensMtiOptions};
+use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board, bytes};
+use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading, Saturation};
 
 /// The sensor's own side. It streams from power-on, as it was configured over its serial port.
 #[derive(Debug)]
-pub struct MtiBoard {
-    plan: Plan,
+struct MtiBoard {
+    plan: MtiKeys,
     /// The sensor's clock at the next sample.
     clock: Nanos,
     counter: u16,
 }
 
 impl MtiBoard {
-    /// A sensor that streams at once.
-    ///
-    /// # Errors
-    /// [`SpecError`]: identifiers or keys out of range.
-    pub fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
-        Ok(Self {
-            plan: Plan::new(spec, options)?,
-            clock: Nanos::ZERO,
-            counter: 0,
-        })
-    }
-
     /// The status word of a sample with `quality`.
     fn status(quality: Quality) -> u32 {
         let mut word = status::SELF_TEST | status::FILTER_VALID;
@@ -46,6 +34,17 @@ impl MtiBoard {
     }
 }
 
+impl Simulate for XsensMtiOptions {
+    /// A sensor that streams at once.
+    fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        Ok(Box::new(MtiBoard {
+            plan: MtiKeys::new(spec, self)?,
+            clock: Nanos::ZERO,
+            counter: 0,
+        }))
+    }
+}
+
 impl Board for MtiBoard {
     fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
 
@@ -60,34 +59,27 @@ impl Board for MtiBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        let Reading::Imu(imu) = reading else {
-            return Err(EncodeError::Kind);
-        };
-        if output != 0 {
-            return Err(EncodeError::Output(output));
-        }
+        let imu = board::only_imu(output, reading)?;
         let mut sent = Frames::new();
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // it overflows
         let ticks = (self.clock.0 / self.plan.tick.0) as u32;
         for &(id, message) in &self.plan.messages {
             let (values, lsb): (&[f64], f64) = match message {
-                Message::Orientation => (&imu.orientation, self.plan.quaternion_lsb),
-                Message::AngularVelocity => (&imu.angular_velocity, RATE_LSB),
-                Message::Acceleration => (&imu.proper_acceleration, ACCELERATION_LSB),
-                Message::MagneticField => (&imu.magnetic_field, self.plan.field_lsb),
+                MtiMessage::Orientation => (&imu.orientation, self.plan.quaternion_lsb),
+                MtiMessage::AngularVelocity => (&imu.angular_velocity, RATE_LSB),
+                MtiMessage::Acceleration => (&imu.proper_acceleration, ACCELERATION_LSB),
+                MtiMessage::MagneticField => (&imu.magnetic_field, self.plan.field_lsb),
                 _ => (&[], 1.0),
             };
-            if !values.iter().all(|value| value.is_finite()) {
-                return Err(EncodeError::NotFinite);
-            }
+            board::finite(values)?;
             let mut counts = [[0; 2]; 4];
             for (count, value) in counts.iter_mut().zip(values) {
                 *count = bytes::quantise_i16(*value, lsb).to_be_bytes();
             }
             let frame = match message {
-                Message::SampleTime => Frame::new(id, &ticks.to_be_bytes()),
-                Message::GroupCounter => Frame::new(id, &self.counter.to_be_bytes()),
-                Message::Status => Frame::new(id, &Self::status(quality).to_be_bytes()),
+                MtiMessage::SampleTime => Frame::new(id, &ticks.to_be_bytes()),
+                MtiMessage::GroupCounter => Frame::new(id, &self.counter.to_be_bytes()),
+                MtiMessage::Status => Frame::new(id, &Self::status(quality).to_be_bytes()),
                 _ => Frame::new(
                     id,
                     counts.as_flattened().get(..message.length()).unwrap_or(&[]),

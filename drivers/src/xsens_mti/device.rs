@@ -1,16 +1,17 @@
 //! The host's side of an MTi. It combines the messages of each sample into a reading.
 
-use super::frames::{ACCELERATION_LSB, BUFFER_OVERFLOW, Message, RATE_LSB, status};
-use super::options::{Options, Plan};
+use super::frames::{ACCELERATION_LSB, BUFFER_OVERFLOW, MtiMessage, RATE_LSB, status};
+use super::options::{MtiKeys, XsensMtiOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::bytes;
-use crate::family::{Family, Link, Supervised};
-use crate::group::{Group, Part};
+use crate::family::{Family, Supervised, Supervision};
+use crate::group::{FrameGroup, PartialReading};
 use crate::pairing::Limit;
-use crate::{Claim, Decoded, Device, Frame, Mode, Output, Spec, SpecError};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use proprio_topics::{Counter, Imu, Nanos, Quality, Reading, Saturation};
+use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Saturation};
 
 /// Only the watching counts: nothing is sent. A sensor that was never heard is silent after a
 /// second and a half.
@@ -27,14 +28,14 @@ const TIMING: Timing = Timing {
 
 /// What the messages of a sample hold.
 #[derive(Debug, Clone, Copy)]
-struct Sample {
+struct MtiSample {
     ticks: u32,
     counter: u16,
     status: u32,
     imu: Imu,
 }
 
-impl Sample {
+impl MtiSample {
     const EMPTY: Self = Self {
         ticks: 0,
         counter: 0,
@@ -43,39 +44,39 @@ impl Sample {
     };
 
     /// Adds what `message` holds.
-    fn add(&mut self, plan: &Plan, message: Message, data: &[u8]) {
+    fn add(&mut self, plan: &MtiKeys, message: MtiMessage, data: &[u8]) {
         let vector = |lsb: f64| [0, 2, 4].map(|at| f64::from(bytes::i16_be(data, at)) * lsb);
         let imu = &mut self.imu;
         match message {
-            Message::Error => {}
-            Message::SampleTime => self.ticks = bytes::u32_be(data, 0),
-            Message::GroupCounter => self.counter = bytes::u16_be(data, 0),
-            Message::Status => self.status = bytes::u32_be(data, 0),
-            Message::Orientation => {
+            MtiMessage::Error => {}
+            MtiMessage::SampleTime => self.ticks = bytes::u32_be(data, 0),
+            MtiMessage::GroupCounter => self.counter = bytes::u16_be(data, 0),
+            MtiMessage::Status => self.status = bytes::u32_be(data, 0),
+            MtiMessage::Orientation => {
                 imu.orientation =
                     [0, 2, 4, 6].map(|at| f64::from(bytes::i16_be(data, at)) * plan.quaternion_lsb);
             }
-            Message::AngularVelocity => imu.angular_velocity = vector(RATE_LSB),
-            Message::Acceleration => imu.proper_acceleration = vector(ACCELERATION_LSB),
-            Message::MagneticField => imu.magnetic_field = vector(plan.field_lsb),
+            MtiMessage::AngularVelocity => imu.angular_velocity = vector(RATE_LSB),
+            MtiMessage::Acceleration => imu.proper_acceleration = vector(ACCELERATION_LSB),
+            MtiMessage::MagneticField => imu.magnetic_field = vector(plan.field_lsb),
         }
     }
 
     /// What the status word says of the sensors in use.
-    fn quality(&self, plan: &Plan) -> Quality {
+    fn quality(&self, plan: &MtiKeys) -> Quality {
         let mut quality = Quality::GOOD;
-        if !plan.wants(Message::Status) {
+        if !plan.wants(MtiMessage::Status) {
             return quality;
         }
         let word = self.status;
-        let invalid = word & status::FILTER_VALID == 0 && plan.wants(Message::Orientation);
+        let invalid = word & status::FILTER_VALID == 0 && plan.wants(MtiMessage::Orientation);
         if word & status::SELF_TEST == 0 || invalid {
             quality |= Quality::DEVICE_FAULT;
         }
         let accelerometer = self.imu.proper_acceleration.into_iter();
         let gyroscope = self.imu.angular_velocity.into_iter();
-        let axes = (accelerometer.map(|value| (Message::Acceleration, value)))
-            .chain(gyroscope.map(|value| (Message::AngularVelocity, value)));
+        let axes = (accelerometer.map(|value| (MtiMessage::Acceleration, value)))
+            .chain(gyroscope.map(|value| (MtiMessage::AngularVelocity, value)));
         for (axis, (sensor, value)) in (0..).zip(axes) {
             if plan.wants(sensor) && word >> (status::FIRST_AXIS + axis) & 1 != 0 {
                 let low = value < 0.0;
@@ -87,7 +88,8 @@ impl Sample {
                 quality = quality.with_saturation(axis, end);
             }
         }
-        let magnetometer = word & status::MAGNETOMETER != 0 && plan.wants(Message::MagneticField);
+        let magnetometer =
+            word & status::MAGNETOMETER != 0 && plan.wants(MtiMessage::MagneticField);
         if magnetometer || (word & status::CLIPPED != 0 && word & status::AXES == 0) {
             quality |= Quality::SATURATED;
         }
@@ -98,8 +100,8 @@ impl Sample {
 /// The host's side of an MTi.
 #[derive(Debug)]
 pub(super) struct Mti {
-    plan: Plan,
-    group: Group<Sample>,
+    plan: MtiKeys,
+    group: FrameGroup<MtiSample>,
     /// The last reading's sample time as sent, and without overflow.
     clock: Option<(u32, Nanos)>,
     /// The last reading's counter.
@@ -107,23 +109,6 @@ pub(super) struct Mti {
 }
 
 impl Mti {
-    pub(super) fn device(spec: &Spec, options: &Options) -> Result<Box<dyn Device>, SpecError> {
-        let plan = Plan::new(spec, options)?;
-        let watched = plan.messages.first().map_or(plan.error, |(id, _)| *id);
-        let bringup = Bringup::new(spec, Mode::Listen, TIMING, watched);
-        let streams = plan.messages.iter().map(|(id, _)| *id);
-        let claims: Vec<Claim> = (streams.chain([plan.error]))
-            .map(Claim::exclusive)
-            .collect();
-        let this = Self {
-            group: Group::new(plan.messages.len(), Limit::of_period(plan.period)),
-            clock: None,
-            counter: None,
-            plan,
-        };
-        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
-    }
-
     /// The sample time in ns, without overflow. A clock that goes back has started again.
     fn time(&mut self, ticks: u32) -> Nanos {
         let since = |earlier: u32| ticks.wrapping_sub(earlier);
@@ -139,14 +124,14 @@ impl Mti {
     /// Outputs a complete sample.
     fn give(
         &mut self,
-        whole: &Part<Sample>,
+        whole: &PartialReading<MtiSample>,
         frame: &Frame,
-        link: &mut Link<NoInquiry>,
+        link: &mut Supervision<NoInquiry>,
         out: &mut Decoded,
     ) {
         let sample = &whole.content;
         let mut quality = sample.quality(&self.plan);
-        if self.plan.wants(Message::GroupCounter) {
+        if self.plan.wants(MtiMessage::GroupCounter) {
             quality |= Quality::DEVICE_COUNTER;
             let last = self.counter.replace(sample.counter);
             match last.map(|last| sample.counter.wrapping_sub(last)) {
@@ -169,7 +154,7 @@ impl Mti {
         if link.bringup.reading(frame.t) {
             quality |= Quality::GAP_BEFORE;
         }
-        let device_time = if self.plan.wants(Message::SampleTime) {
+        let device_time = if self.plan.wants(MtiMessage::SampleTime) {
             self.time(sample.ticks)
         } else {
             Nanos::MIN
@@ -185,15 +170,41 @@ impl Mti {
     }
 }
 
+impl Driver for XsensMtiOptions {
+    const NAME: &'static str = "xsens_mti";
+    const ADDRESS: Option<u32> = Some(0);
+
+    fn outputs(&self) -> Vec<OutputInfo> {
+        [OutputInfo::new(0, Kind::Imu)].to_vec()
+    }
+
+    fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
+        let plan = MtiKeys::new(spec, self)?;
+        let watched = plan.messages.first().map_or(plan.error, |(id, _)| *id);
+        let bringup = Bringup::new(spec, Mode::Listen, TIMING, watched);
+        let streams = plan.messages.iter().map(|(id, _)| *id);
+        let claims: Vec<Claim> = (streams.chain([plan.error]))
+            .map(Claim::exclusive)
+            .collect();
+        let this = Mti {
+            group: FrameGroup::new(plan.messages.len(), Limit::of_period(plan.period)),
+            clock: None,
+            counter: None,
+            plan,
+        };
+        Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
+    }
+}
+
 impl Family for Mti {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Link<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
         let mut numbered = (0..).zip(&self.plan.messages);
         let found = numbered.find(|(_, (id, _))| *id == frame.id);
         let (position, message) = match found {
             Some((position, (_, message))) => (position, *message),
-            None if frame.id == self.plan.error => (0, Message::Error),
+            None if frame.id == self.plan.error => (0, MtiMessage::Error),
             None => return,
         };
         let Some(data) = bytes::payload(frame, out) else {
@@ -202,7 +213,7 @@ impl Family for Mti {
         if data.len() != message.length() {
             return out.fault(Counter::Length, 1, frame.id);
         }
-        if message == Message::Error {
+        if message == MtiMessage::Error {
             if data.first() != Some(&BUFFER_OVERFLOW) {
                 return out.fault(Counter::Value, 1, frame.id);
             }
@@ -210,8 +221,8 @@ impl Family for Mti {
             return out.fault(Counter::DeviceFault, 1, frame.id);
         }
         let mut dropped = 0;
-        let add = |sample: &mut Sample| sample.add(&self.plan, message, data);
-        let whole = (self.group).push(position, frame, Sample::EMPTY, add, &mut dropped);
+        let add = |sample: &mut MtiSample| sample.add(&self.plan, message, data);
+        let whole = (self.group).push(position, frame, MtiSample::EMPTY, add, &mut dropped);
         if dropped > 0 {
             link.bringup.lost();
             out.fault(Counter::Unpaired, dropped, frame.id);

@@ -29,7 +29,7 @@ pub(super) mod status {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum Message {
+pub enum MtiMessage {
     /// Error.
     Error,
     /// Time of the sample.
@@ -48,7 +48,7 @@ pub enum Message {
     MagneticField,
 }
 
-impl Message {
+impl MtiMessage {
     /// What a sensor measures, in order.
     pub(super) const MEASURED: [Self; 4] = [
         Self::Orientation,

@@ -1,6 +1,6 @@
 //! The keys of an MTi in gateway.toml, and what they mean to both sides of the driver.
 
-use super::frames::{FIELD_LSB, HighRate, Message};
+use super::frames::{FIELD_LSB, HighRate, MtiMessage};
 use crate::{Id, Spec, SpecError};
 use alloc::collections::BTreeMap;
 use alloc::vec::Vec;
@@ -11,9 +11,9 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Options {
+pub struct XsensMtiOptions {
     /// The messages of a reading; default sample time, angular velocity, acceleration.
-    pub quantities: Vec<Message>,
+    pub quantities: Vec<MtiMessage>,
     /// Period of the samples \[ms\], 0.5 to 1000; default 10.
     pub period_ms: f64,
     /// Unit of the sample time \[us\], 1 or 100; default 100.
@@ -27,16 +27,16 @@ pub struct Options {
     /// The magnetic field at the sensor's calibration \[T\].
     pub magnetic_unit: Option<f64>,
     /// Identifiers that differ from those of delivery.
-    pub identifiers: BTreeMap<Message, u32>,
+    pub identifiers: BTreeMap<MtiMessage, u32>,
 }
 
-impl Default for Options {
+impl Default for XsensMtiOptions {
     fn default() -> Self {
         Self {
             quantities: [
-                Message::SampleTime,
-                Message::AngularVelocity,
-                Message::Acceleration,
+                MtiMessage::SampleTime,
+                MtiMessage::AngularVelocity,
+                MtiMessage::Acceleration,
             ]
             .to_vec(),
             period_ms: 10.0,
@@ -52,9 +52,9 @@ impl Default for Options {
 
 /// What the keys mean.
 #[derive(Debug)]
-pub(super) struct Plan {
+pub(super) struct MtiKeys {
     /// The messages of a reading in the order in which they come.
-    pub(super) messages: Vec<(Id, Message)>,
+    pub(super) messages: Vec<(Id, MtiMessage)>,
     pub(super) error: Id,
     pub(super) period: Nanos,
     /// The unit of the sample time.
@@ -64,8 +64,8 @@ pub(super) struct Plan {
     pub(super) field_lsb: f64,
 }
 
-impl Plan {
-    pub(super) fn new(spec: &Spec, options: &Options) -> Result<Self, SpecError> {
+impl MtiKeys {
+    pub(super) fn new(spec: &Spec, options: &XsensMtiOptions) -> Result<Self, SpecError> {
         let key = |key, value, expected| SpecError::Key {
             key,
             value,
@@ -74,8 +74,8 @@ impl Plan {
         let mut wanted = options.quantities.clone();
         wanted.sort_unstable();
         wanted.dedup();
-        let wants = |message: &Message| wanted.contains(message);
-        if wants(&Message::Error) || !Message::MEASURED.iter().any(wants) {
+        let wants = |message: &MtiMessage| wanted.contains(message);
+        if wants(&MtiMessage::Error) || !MtiMessage::MEASURED.iter().any(wants) {
             return Err(SpecError::Keys {
                 key: "quantities",
                 expected: "a list with at least one of orientation, angular_velocity, \
@@ -96,7 +96,7 @@ impl Plan {
         let unit_field = match options.magnetic_unit {
             Some(unit) if unit > 0.0 && unit <= 1.0 => unit,
             Some(unit) => return Err(key("magnetic_unit", unit, "above 0, at most 1")),
-            None if wants(&Message::MagneticField) => {
+            None if wants(&MtiMessage::MagneticField) => {
                 return Err(SpecError::Incomplete {
                     given: "magnetic_field",
                     missing: "magnetic_unit",
@@ -106,7 +106,7 @@ impl Plan {
         };
         let most = if options.extended { 0x1FFF_FFFF } else { 0x7FF };
         let mut messages = Vec::new();
-        for message in wanted.into_iter().chain([Message::Error]) {
+        for message in wanted.into_iter().chain([MtiMessage::Error]) {
             let delivered = message.identifier(options.high_rate);
             let identifier = *options.identifiers.get(&message).unwrap_or(&delivered);
             if identifier > most {
@@ -146,7 +146,7 @@ impl Plan {
         })
     }
 
-    pub(super) fn wants(&self, message: Message) -> bool {
+    pub(super) fn wants(&self, message: MtiMessage) -> bool {
         self.messages.iter().any(|(_, wanted)| *wanted == message)
     }
 }

@@ -2,7 +2,7 @@
 //! start-up against the boards, cycles of SYNC, and what nodes say of themselves.
 
 use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, spec};
-use proprio_drivers::objects::{Entry, Objects};
+use proprio_drivers::objects::{ObjectEntry, Objects};
 use proprio_drivers::{Board, Decoded, Device, Frame, Frames, Mode, Output, SpecError, State};
 use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Refusal, StampKind};
 use proptest::prelude::*;
@@ -988,7 +988,7 @@ fn the_status_word_is_told_and_judged() {
 fn scales_that_a_drive_does_not_tell_are_those_of_its_file() {
     let keys = "pdos = [{ number = 1, objects = [0x6064, 0x6077, 0x6078] }]";
     for own in [true, false] {
-        let entry = |number| Entry {
+        let entry = |number| ObjectEntry {
             number,
             plus_node: false,
             own,

@@ -1,7 +1,7 @@
 //! What EDS and DCF files say of CANopen encoders and drives: scales, and where process data are.
 
 use crate::rig::{decode, frame, options, spec};
-use proprio_drivers::objects::{Entry, Objects};
+use proprio_drivers::objects::{ObjectEntry, Objects};
 use proprio_drivers::{Device, Mode, Options, Output, SpecError, State};
 use proprio_topics::{Reading, Refusal};
 use std::f64::consts::TAU;
@@ -10,7 +10,7 @@ use std::f64::consts::TAU;
 fn file(entries: &[(u16, u8, u32)]) -> Objects {
     let entry = |&(index, sub, number): &(u16, u8, u32)| {
         let plus_node = matches!(index, 0x1800..=0x1803) && sub == 1;
-        let entry = Entry {
+        let entry = ObjectEntry {
             number,
             plus_node,
             own: true,
@@ -614,7 +614,7 @@ fn positions_and_velocities_are_in_the_units_that_the_drive_states() {
         objects.entries.extend(more.map(|(at, entry)| {
             (
                 at,
-                Entry {
+                ObjectEntry {
                     own: false,
                     ..entry
                 },

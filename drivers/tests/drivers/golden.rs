@@ -763,7 +763,8 @@ fn the_faults_of_a_motor_board_are_those_of_the_document() {
         [0, 1],
         "the emergency button does not move the joint"
     );
-    let faults = fault::CAN_INVALID_PROTOCOL | fault::EXTERNAL | fault::SETPOINT_EXPIRED | 1 << 31;
+    // Beside it: an invalid command, an expired setpoint, and a state of the bus.
+    let faults = fault::EXTERNAL | 1 | 1 << 14 | 1 << 31;
     let encoder = encoder::NOT_CALIBRATED;
     assert_eq!(
         actuator,

@@ -3,8 +3,8 @@
 
 use crate::rig::{FD, options, spec};
 use proprio_drivers::{
-    ASKED_BY_NAME, Board, Certainty, Claim, DRIVERS, Decoded, Finding, Format, Frame, Frames, Id,
-    Mode, Options, Traffic, questions, recognise,
+    Board, Certainty, Claim, DRIVERS, Decoded, Finding, Format, Frame, Frames, Id, Mode, Options,
+    Traffic, asked_by_name, questions, recognise,
 };
 use proprio_topics::{
     Actuator, Imu, JointState, Nanos, Quality, Reading, Skin, StampKind, Temperature, Wrench,
@@ -590,10 +590,7 @@ fn families_whose_questions_are_commands_are_asked_by_name_alone() {
     for question in &safe {
         assert!(!commands(question.id), "{question}");
     }
-    let by_name: Vec<&str> = (ASKED_BY_NAME.iter())
-        .filter(|(_, by_name)| *by_name)
-        .map(|(driver, _)| *driver)
-        .collect();
+    let by_name: Vec<&str> = asked_by_name().collect();
     assert_eq!(
         by_name,
         [

@@ -2,7 +2,7 @@
 //! read by other parts of Proprio, too.
 
 use crate::rig::{FD, frame};
-use proprio_drivers::objects::{Entry, Objects};
+use proprio_drivers::objects::{ObjectEntry, Objects};
 use proprio_drivers::recognise::Stream;
 use proprio_drivers::{Format, Frame, Id, Traffic};
 use proprio_topics::{Nanos, StampKind};
@@ -110,7 +110,7 @@ fn one_frame_of_each_beginning_is_kept() {
 /// An object may be stated for each node, or relative to the node's number.
 #[test]
 fn an_object_has_the_value_that_its_file_states() {
-    let entry = |number, plus_node, own| Entry {
+    let entry = |number, plus_node, own| ObjectEntry {
         number,
         plus_node,
         own,
