@@ -214,13 +214,13 @@ impl Mc4 {
     }
 
     fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
-        let &[faults0, mode0, faults1, mode1, _, board, ..] = data else {
+        let &[faults0, mode0, faults1, mode1, _, shared, ..] = data else {
             return;
         };
         let told = [(faults0, mode0), (faults1, mode1)];
         let joints = self.joints.iter_mut().zip(told).zip(fault::BOARD);
         for (((joint, (faults, mode)), mask), output) in joints.zip(0_u8..) {
-            let faults = u32::from(faults) | u32::from(board) << 8 & mask;
+            let faults = u32::from(faults) | u32::from(shared) << 8 & mask;
             let mode = u32::from(mode);
             joint.status = quality_of(faults, mode);
             let reading = Reading::Actuator(Actuator {

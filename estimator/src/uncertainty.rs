@@ -7,7 +7,7 @@
 //! | error | covariance | through |
 //! |---|---|---|
 //! | F/T noise | of the sensor's data sheet | [`Solver::update_deviations`] |
-//! | inertial parameters, offsets, gains, drift | of identification, or of the URDF | [`Propagation`] |
+//! | parameters, offsets, gains, drift | of identification, or of the URDF | [`Propagation`] |
 //! | accelerations, positions, motion of the base | of differentiation, and typical | `motion` |
 //! | places of declared and touched contacts | as declared | [`PlaceErrors`] |
 //!
@@ -18,32 +18,14 @@
 mod motion;
 pub mod propagation;
 
+pub(crate) use motion::Solution;
+
 use crate::inertial::InertialState;
-use motion::MotionErrors;
+use motion::{MotionErrors, sum_of_squares};
 use nalgebra::Matrix6;
 use propagation::Propagation;
-use proprio_dynamics::model::Model;
-use proprio_dynamics::spatial::{Pose, Wrench};
-use proprio_dynamics::{
-    ContactSet, DynamicsError, FrameMotion, JointState, Kinematics, PlaceErrors, PlaceStd, Solver,
-    Structure,
-};
-use proprio_topics::{Nanos, Source};
-
-/// A solution, with all that it was computed from: the point of linearisation.
-pub(crate) struct Solution<'a> {
-    pub(crate) t: Nanos,
-    pub(crate) model: &'a Model,
-    pub(crate) structure: &'a Structure,
-    pub(crate) state: JointState<'a>,
-    /// Motion of the base link; if an IMU measures it, the IMU's motion and its pose in the link.
-    pub(crate) base: &'a FrameMotion,
-    pub(crate) imu: Option<&'a (FrameMotion, Pose)>,
-    pub(crate) readings: &'a [Wrench],
-    pub(crate) active: &'a ContactSet,
-    pub(crate) kinematics: &'a Kinematics,
-    pub(crate) solver: &'a Solver,
-}
+use proprio_dynamics::{DynamicsError, Kinematics, PlaceErrors, PlaceStd, Solver, Structure};
+use proprio_topics::Source;
 
 /// The standard deviations of the last solution, with all the memory to compute them.
 pub(crate) struct Uncertainty {
@@ -160,9 +142,4 @@ impl Uncertainty {
             share(Source::Place, at.0, variance);
         }
     }
-}
-
-/// The variance of a sum of independent errors.
-fn sum_of_squares<const N: usize>(deviations: [f64; N]) -> f64 {
-    deviations.iter().map(|x| x * x).sum()
 }

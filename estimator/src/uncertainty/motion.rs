@@ -19,9 +19,9 @@
 //! those of the stamps, so that a replay which begins elsewhere gives the same. Errors of
 //! velocities are smaller by an order of magnitude and are neglected.
 
-use super::{Solution, sum_of_squares};
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::model::Model;
+use proprio_dynamics::spatial::{Pose, Wrench};
 use proprio_dynamics::{
     ContactKind, ContactSet, ContactSpec, DynamicsError, FrameMotion, JointState, Kinematics,
     Solver, Structure,
@@ -46,6 +46,21 @@ const STEP: f64 = 1e-4;
 /// A contact that moves less than this \[m\], or turns less \[rad\], within a tenth of a second
 /// does not change S more than the motion of the robot does in that time.
 const JUMP: [f64; 2] = [0.01, 0.1];
+
+/// A solution, with all that it was computed from: the point of linearisation.
+pub(crate) struct Solution<'a> {
+    pub(crate) t: Nanos,
+    pub(crate) model: &'a Model,
+    pub(crate) structure: &'a Structure,
+    pub(crate) state: JointState<'a>,
+    /// Motion of the base link; if an IMU measures it, the IMU's motion and its pose in the link.
+    pub(crate) base: &'a FrameMotion,
+    pub(crate) imu: Option<&'a (FrameMotion, Pose)>,
+    pub(crate) readings: &'a [Wrench],
+    pub(crate) active: &'a ContactSet,
+    pub(crate) kinematics: &'a Kinematics,
+    pub(crate) solver: &'a Solver,
+}
 
 /// Adds the squares of each column's first numbers, times its sigma.
 struct AddSquares<'a> {
@@ -327,4 +342,9 @@ impl MotionErrors {
         }
         covariance
     }
+}
+
+/// The variance of a sum of independent errors.
+pub(super) fn sum_of_squares<const N: usize>(deviations: [f64; N]) -> f64 {
+    deviations.iter().map(|x| x * x).sum()
 }
