@@ -112,6 +112,14 @@ pub(crate) fn finite(values: &[f64]) -> Result<(), EncodeError> {
     }
 }
 
+/// That none of these is infinite: what is not measured is not a number.
+pub(crate) fn finite_or_absent(values: &[f64]) -> Result<(), EncodeError> {
+    match values.iter().any(|value| value.is_infinite()) {
+        true => Err(EncodeError::NotFinite),
+        false => Ok(()),
+    }
+}
+
 /// fx fy fz tx ty tz of a wrench \[N, Nm\], all of them finite.
 pub(crate) fn axes(wrench: &Wrench) -> Result<[f64; 6], EncodeError> {
     let ([fx, fy, fz], [tx, ty, tz]) = (wrench.force, wrench.torque);

@@ -32,7 +32,7 @@ mod management;
 mod recognise;
 
 #[cfg(feature = "boards")]
-pub(crate) use management::{answer_management, command_for};
+pub(crate) use management::answer_management;
 #[cfg(feature = "recognise")]
 pub(crate) use recognise::{questions, recognise};
 
@@ -258,6 +258,11 @@ pub(crate) fn period_ms(key: &'static str, ms: u32) -> Result<u8, SpecError> {
             expected: "an integer from 1 to 255",
         }),
     }
+}
+
+/// As [`period_ms`], of the key of this name, in the unit of stamps.
+pub(crate) fn period(ms: u32) -> Result<Nanos, SpecError> {
+    period_ms("period_ms", ms).map(|ms| Nanos::from_millis(i64::from(ms)))
 }
 
 /// The type of a frame of streaming class `class` of board `address`, if it is one.

@@ -31,10 +31,8 @@ impl DamiaoBoard {
     }
 
     fn measure(&mut self, joint: &JointState, quality: Quality) -> Result<(), EncodeError> {
-        let values = [joint.position, joint.velocity];
-        if values.iter().any(|value| !value.is_finite()) || joint.torque.is_infinite() {
-            return Err(EncodeError::NotFinite);
-        }
+        board::finite(&[joint.position, joint.velocity])?;
+        board::finite_or_absent(&[joint.torque])?;
         let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
         if quality_of(self.state.state).0 != quality.0 & told.0 {
             self.state.state = if quality.contains(Quality::DEVICE_FAULT) {

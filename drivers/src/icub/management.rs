@@ -5,7 +5,7 @@ use crate::{Format, Frame, Frames};
 
 /// The bytes of a command of class `class` to board `address` in `frame`, starting with the command
 /// byte.
-pub(crate) fn command_for(frame: &Frame, class: u16, address: u8) -> Option<&[u8]> {
+fn command_for(frame: &Frame, class: u16, address: u8) -> Option<&[u8]> {
     let broadcast = to_board(class, BROADCAST);
     let ours = frame.id == to_board(class, address) || frame.id == broadcast;
     (ours && frame.format == Format::Classic && !frame.is_empty()).then(|| frame.data())
@@ -15,14 +15,14 @@ pub(crate) fn command_for(frame: &Frame, class: u16, address: u8) -> Option<&[u8
 const INFO: &[u8; 32] = b"simulated board\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0";
 
 /// Answers the management requests: board type and firmware version (a plausible one: 2.0.8,
-/// protocol 2.0).
-pub(crate) fn answer_management(
-    frame: &Frame,
+/// protocol 2.0). Returns the bytes of the command that the frame is, if it is one to this board.
+pub(crate) fn answer_management<'f>(
+    frame: &'f Frame,
     class: u16,
     address: u8,
     board: u8,
     out: &mut Frames,
-) {
+) -> Option<&'f [u8]> {
     const FIRMWARE: [u8; 3] = [2, 0, 8];
     let [major, minor, build] = FIRMWARE;
     if let Some([command::DISCOVER]) = command_for(frame, class::MANAGEMENT, address) {
@@ -44,8 +44,9 @@ pub(crate) fn answer_management(
     } else {
         command::GET_FIRMWARE_VERSION
     };
-    if let Some(&[command, want_major, want_minor]) = command_for(frame, class, address)
-        && command == version
+    let command = command_for(frame, class, address);
+    if let Some(&[asked, want_major, want_minor]) = command
+        && asked == version
     {
         let fits = u8::from(want_major == 2 && want_minor == 0);
         let _ = out.try_push(Frame::new(
@@ -53,4 +54,5 @@ pub(crate) fn answer_management(
             &[version, board, major, minor, build, 2, 0, fits],
         ));
     }
+    command
 }

@@ -78,8 +78,8 @@ impl Board for ImuBoard {
         } else {
             icub::board::STRAIN2
         };
-        icub::answer_management(frame, class::POLLING_ANALOG, self.plan.address, board, out);
-        let Some(bytes) = icub::command_for(frame, class::POLLING_ANALOG, self.plan.address) else {
+        let (class, address) = (class::POLLING_ANALOG, self.plan.address);
+        let Some(bytes) = icub::answer_management(frame, class, address, board, out) else {
             return;
         };
         match *bytes {
@@ -130,13 +130,16 @@ impl Board for ImuBoard {
         let imu = board::only_imu(output, reading)?;
         let mask = self.mask();
         let sends = |quantity: ImuQuantity| mask & quantity.bit() != 0;
-        let finite = |values: &[f64]| values.iter().all(|value| value.is_finite());
-        if (sends(ImuQuantity::Acceleration) && !finite(&imu.proper_acceleration))
-            || (sends(ImuQuantity::AngularVelocity) && !finite(&imu.angular_velocity))
-            || (sends(ImuQuantity::MagneticField) && !finite(&imu.magnetic_field))
-            || (sends(ImuQuantity::Orientation) && !finite(&imu.orientation))
-        {
-            return Err(EncodeError::NotFinite);
+        let values: [(ImuQuantity, &[f64]); 4] = [
+            (ImuQuantity::Acceleration, &imu.proper_acceleration),
+            (ImuQuantity::AngularVelocity, &imu.angular_velocity),
+            (ImuQuantity::MagneticField, &imu.magnetic_field),
+            (ImuQuantity::Orientation, &imu.orientation),
+        ];
+        for (quantity, values) in values {
+            if sends(quantity) {
+                board::finite(values)?;
+            }
         }
         let bytes = |values: [f64; 3], lsb: f64| {
             let [[a, b], [c, d], [e, f]] =

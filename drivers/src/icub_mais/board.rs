@@ -21,10 +21,10 @@ struct MaisBoard {
 impl Simulate for IcubMaisOptions {
     /// A board after power-on; in [`Mode::Listen`] another program has already started it.
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        let ms = icub::period_ms("period_ms", self.period_ms)?;
+        let period = icub::period(self.period_ms)?;
         Ok(Box::new(MaisBoard {
             address: icub::address(spec)?,
-            period: Nanos::from_millis(i64::from(ms)),
+            period,
             streaming: spec.mode == Mode::Listen,
             counts: [0; SENSORS as usize],
             joints: spec
@@ -39,14 +39,8 @@ impl Simulate for IcubMaisOptions {
 
 impl Board for MaisBoard {
     fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        icub::answer_management(
-            frame,
-            class::POLLING_ANALOG,
-            self.address,
-            icub::board::MAIS,
-            out,
-        );
-        match icub::command_for(frame, class::POLLING_ANALOG, self.address) {
+        let (class, board) = (class::POLLING_ANALOG, icub::board::MAIS);
+        match icub::answer_management(frame, class, self.address, board, out) {
             Some(&[command::SET_CANDATARATE, ms]) if ms > 0 => {
                 self.period = Nanos::from_millis(i64::from(ms));
             }

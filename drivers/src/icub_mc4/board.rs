@@ -48,10 +48,10 @@ impl Mc4Board {
 impl Simulate for IcubMc4Options {
     /// A board that streams at once.
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        let period = icub::period_ms("period_ms", self.period_ms)?;
+        let period = icub::period(self.period_ms)?;
         Ok(Box::new(Mc4Board {
             address: icub::address(spec)?,
-            period: Nanos::from_millis(i64::from(period)),
+            period,
             joints: self.scales()?.map(|scale| SimulatedJoint {
                 scale,
                 ticks: 0,

@@ -38,7 +38,7 @@ impl MotorBoard {
 impl Simulate for IcubMotorOptions {
     /// A board that streams at once.
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
-        let period = Nanos::from_millis(i64::from(icub::period_ms("period_ms", self.period_ms)?));
+        let period = icub::period(self.period_ms)?;
         Ok(Box::new(MotorBoard {
             address: icub::address(spec)?,
             period,
@@ -76,9 +76,7 @@ impl Board for MotorBoard {
         match reading {
             Reading::Joint(joint) => {
                 let velocity = if self.velocity { joint.velocity } else { 0.0 };
-                if !joint.position.is_finite() || !velocity.is_finite() {
-                    return Err(EncodeError::NotFinite);
-                }
+                board::finite(&[joint.position, velocity])?;
                 let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT | Quality::NOT_CALIBRATED;
                 if self.status.0 & told.0 != quality.0 & told.0 {
                     let mut actuator = Actuator {

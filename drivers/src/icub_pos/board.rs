@@ -22,7 +22,7 @@ impl Simulate for IcubPosOptions {
     /// A board after power-on; in [`Mode::Listen`] another program has already started it.
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         self.configuration()?;
-        let period = Nanos::from_millis(i64::from(icub::period_ms("period_ms", self.period_ms)?));
+        let period = icub::period(self.period_ms)?;
         Ok(Box::new(PosBoard {
             address: icub::address(spec)?,
             period,
@@ -35,14 +35,8 @@ impl Simulate for IcubPosOptions {
 
 impl Board for PosBoard {
     fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        icub::answer_management(
-            frame,
-            class::POLLING_ANALOG,
-            self.address,
-            icub::board::PSC,
-            out,
-        );
-        match icub::command_for(frame, class::POLLING_ANALOG, self.address) {
+        let (class, board) = (class::POLLING_ANALOG, icub::board::PSC);
+        match icub::answer_management(frame, class, self.address, board, out) {
             Some(&[command::POS_CONFIG_SET, a, b, c, d, e, f, g]) => {
                 // As in the firmware, a new configuration stops the stream.
                 self.streaming = false;

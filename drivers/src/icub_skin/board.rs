@@ -27,10 +27,10 @@ impl Simulate for IcubSkinOptions {
     /// A board after power-on; in [`Mode::Listen`] another program has already started it.
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         self.check()?;
-        let ms = icub::period_ms("period_ms", self.period_ms)?;
+        let period = icub::period(self.period_ms)?;
         Ok(Box::new(SkinBoard {
             address: icub::address(spec)?,
-            period: Nanos::from_millis(i64::from(ms)),
+            period,
             no_load: self.no_load,
             triangles: self.triangles,
             streaming: spec.mode == Mode::Listen,
@@ -40,14 +40,8 @@ impl Simulate for IcubSkinOptions {
 
 impl Board for SkinBoard {
     fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        icub::answer_management(
-            frame,
-            class::POLLING_ANALOG,
-            self.address,
-            icub::board::MTB,
-            out,
-        );
-        match icub::command_for(frame, class::POLLING_ANALOG, self.address) {
+        let (class, board) = (class::POLLING_ANALOG, icub::board::MTB);
+        match icub::answer_management(frame, class, self.address, board, out) {
             Some(&[command::SKIN_CONFIG, _, ms, no_load]) if ms > 0 => {
                 self.period = Nanos::from_millis(i64::from(ms));
                 self.no_load = no_load;

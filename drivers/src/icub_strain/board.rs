@@ -69,7 +69,7 @@ impl Simulate for IcubStrainOptions {
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         let address = icub::address(spec)?;
         let configured = self.full_scale(true)?;
-        let period = Nanos::from_millis(i64::from(icub::period_ms("period_ms", self.period_ms)?));
+        let period = icub::period(self.period_ms)?;
         Ok(Box::new(StrainBoard {
             address,
             full_scale: configured.unwrap_or(USUAL_FULL_SCALE),
@@ -88,14 +88,8 @@ impl Simulate for IcubStrainOptions {
 
 impl Board for StrainBoard {
     fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
-        icub::answer_management(
-            frame,
-            class::POLLING_ANALOG,
-            self.address,
-            icub::board::STRAIN2,
-            out,
-        );
-        match icub::command_for(frame, class::POLLING_ANALOG, self.address) {
+        let (class, board) = (class::POLLING_ANALOG, icub::board::STRAIN2);
+        match icub::answer_management(frame, class, self.address, board, out) {
             Some(&[command::GET_FULL_SCALES, channel]) => {
                 let Some(&full_scale) = self.full_scale.get(usize::from(channel & 0xF)) else {
                     return;

@@ -7,7 +7,7 @@ use super::frames::{
 };
 use super::options::{MyactuatorKeys, MyactuatorOptions, MyactuatorPosition};
 use crate::bytes::{quantise, quantise_i16};
-use crate::{Board, EncodeError, Format, Frame, Frames, Simulate, Spec, SpecError, mit};
+use crate::{Board, EncodeError, Format, Frame, Frames, Simulate, Spec, SpecError, board, mit};
 use alloc::boxed::Box;
 use proprio_topics::{JointState, Nanos, Quality, Reading};
 
@@ -102,13 +102,8 @@ impl MyactuatorBoard {
         let mut sent = false;
         match (output, reading) {
             (JOINT, Reading::Joint(joint)) => {
-                let values = [joint.position, joint.velocity];
-                let others = [joint.torque, joint.current];
-                if values.iter().any(|value| !value.is_finite())
-                    || others.iter().any(|value| value.is_infinite())
-                {
-                    return Err(EncodeError::NotFinite);
-                }
+                board::finite(&[joint.position, joint.velocity])?;
+                board::finite_or_absent(&[joint.torque, joint.current])?;
                 self.joint = *joint;
                 let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
                 if self.keys.quality(errors).0 != quality.0 & told.0 {

@@ -40,26 +40,22 @@ impl OpenImuBoard {
             merit::NOT_KNOWN
         };
         let merits = |bits: &[u8]| bits.iter().fold(0, |all, bit| all | said << bit);
-        let finite = |values: &[f64]| {
-            let all = values.iter().all(|value| value.is_finite());
-            all.then_some(()).ok_or(EncodeError::NotFinite)
-        };
         let [a, b, c, d, e, f, merits] = match quantity {
             OpenImuQuantity::Orientation => {
-                finite(&imu.orientation)?;
+                board::finite(&imu.orientation)?;
                 let [[a, b, c, _], [d, e, f, _]] =
                     pitch_and_roll(imu.orientation).map(|angle| ANGLE.count(angle).to_le_bytes());
                 [a, b, c, d, e, f, merits(&merit::OF_ANGLES)]
             }
             OpenImuQuantity::Acceleration => {
-                finite(&imu.proper_acceleration)?;
+                board::finite(&imu.proper_acceleration)?;
                 let turned = self.plan.upright.turn(imu.proper_acceleration);
                 let counts = turned.map(|value| ACCELERATION.count(value));
                 let [a, b, c, d, e, f] = self.six(counts);
                 [a, b, c, d, e, f, merits(&merit::OF_AXES) | REPETITION]
             }
             OpenImuQuantity::AngularVelocity => {
-                finite(&imu.angular_velocity)?;
+                board::finite(&imu.angular_velocity)?;
                 let mut counts = imu
                     .angular_velocity
                     .map(|value| RATE.count(value).min(RATE_LIMIT));

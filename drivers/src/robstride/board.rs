@@ -5,7 +5,9 @@ use super::frames::{
     JOINT, LENGTH, MOTOR, OF_STATE, RUNNING, RobstrideState, fault, id, kind, parameter, quality_of,
 };
 use super::options::{RobstrideKeys, RobstrideOptions, RobstrideProtocol};
-use crate::{Board, EncodeError, Format, Frame, Frames, Id, Simulate, Spec, SpecError, bytes, mit};
+use crate::{
+    Board, EncodeError, Format, Frame, Frames, Id, Simulate, Spec, SpecError, board, bytes, mit,
+};
 use alloc::boxed::Box;
 use proprio_topics::{JointState, Nanos, Quality, Reading};
 
@@ -72,10 +74,8 @@ impl RobstrideBoard {
         let [first, second] = &mut frames;
         match (output, reading) {
             (JOINT, Reading::Joint(joint)) => {
-                let values = [joint.position, joint.velocity];
-                if values.iter().any(|value| !value.is_finite()) || joint.torque.is_infinite() {
-                    return Err(EncodeError::NotFinite);
-                }
+                board::finite(&[joint.position, joint.velocity])?;
+                board::finite_or_absent(&[joint.torque])?;
                 self.joint = *joint;
                 let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
                 let all = u32::from(self.of_state) << OF_STATE | self.faults;

@@ -85,15 +85,10 @@ impl Inputs {
                 (ChannelBuffer::Joint(history, window), ChannelRole::Joint(dof)) => {
                     self.joint(&mut at, dof, history, window)
                 }
-                (ChannelBuffer::Sensor(history, temperatures, predictor), role) => {
-                    let temperature = temperature_at(temperatures, at.t, at.setup.max_wait);
-                    match role {
-                        ChannelRole::Sensor(sensor) => {
-                            self.wrench(&mut at, sensor, (history, predictor), temperature)
-                        }
-                        _ => None,
-                    }
-                }
+                (
+                    ChannelBuffer::Sensor(history, temperatures, predictor),
+                    ChannelRole::Sensor(sensor),
+                ) => self.wrench(&mut at, sensor, history, temperatures, predictor),
                 (ChannelBuffer::Imu(history, window, predictor), ChannelRole::Base) => {
                     self.imu(&mut at, history, window, predictor)
                 }
@@ -138,16 +133,18 @@ impl Inputs {
         Some(Reason::of_quality(sample.quality, Quality::UNTRUSTED_ENCODER).or(reason))
     }
 
-    /// Evaluates F/T sensor number `sensor`, whose board has this temperature \[degrees Celsius\],
-    /// measured so long before. Returns why its reading is not valid; none without a sample.
+    /// Evaluates F/T sensor number `sensor`. Returns why its reading is not valid; none without a
+    /// sample.
     fn wrench(
         &mut self,
         at: &mut At<'_>,
         sensor: usize,
-        (history, predictor): (&History<6>, &Option<Predictor<6>>),
-        (celsius, age): (f64, Option<Nanos>),
+        history: &History<6>,
+        temperatures: &History<1>,
+        predictor: &Option<Predictor<6>>,
     ) -> Option<Reason> {
         let sample = history.at(at.t, at.until)?;
+        let (celsius, age) = temperature_at(temperatures, at.t, at.setup.max_wait);
         let (predicted, starting) = predicted(at.t, &sample, predictor, &mut self.grid);
         let raw = predicted.unwrap_or(Extrapolated {
             value: sample.value,

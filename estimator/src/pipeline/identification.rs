@@ -393,14 +393,8 @@ impl OnlineIdentification {
             _ => [exact(0), exact(1), fit[0]],
         };
         let errors = self.current.errors.chunks_exact_mut(3).nth(dof);
-        let held = [&mut *q, dq, ddq]
-            .into_iter()
-            .zip(errors.unwrap_or_default());
-        for ((value, error), (held, held_error)) in values.into_iter().zip(held) {
-            if has_moved((*held, *held_error), (value, error)) {
-                self.moved.insert(dof);
-            }
-            (*held, *held_error) = (value, error);
+        if replace([&mut *q, dq, ddq], errors.into_iter().flatten(), values) {
+            self.moved.insert(dof);
         }
         if !(q.is_finite() && dq.is_finite() && ddq.is_finite()) {
             [*q, *dq, *ddq] = [0.0; 3];
@@ -474,13 +468,7 @@ impl OnlineIdentification {
                 &mut measured.angular_velocity[axis],
                 &mut measured.angular_acceleration[axis],
             ];
-            let values = [acceleration, gyro[0], alpha];
-            for ((value, error), (held, held_error)) in
-                values.into_iter().zip(held.into_iter().zip(errors))
-            {
-                has_base_moved |= has_moved((*held, *held_error), (value, error));
-                (*held, *held_error) = (value, error);
-            }
+            has_base_moved |= replace(held, errors, [acceleration, gyro[0], alpha]);
         }
         let numbers = [
             &measured.proper_acceleration,
@@ -594,9 +582,20 @@ impl OnlineIdentification {
 /// Standard errors by which a value must differ from the held one to count as motion.
 const SIGNIFICANT_CHANGE: f64 = 6.0;
 
-fn has_moved((held, error): (f64, f64), (value, new_error): (f64, f64)) -> bool {
-    let apart = (value - held).abs();
-    apart.is_nan() || apart > SIGNIFICANT_CHANGE * error.hypot(new_error)
+/// Replaces values and their standard errors by new ones, in pairs. Returns whether one differs
+/// from its new one by more than both errors explain: motion.
+fn replace<'a>(
+    held: [&mut f64; 3],
+    errors: impl Iterator<Item = &'a mut f64>,
+    new: [(f64, f64); 3],
+) -> bool {
+    let mut has_moved = false;
+    for ((held, held_error), (value, error)) in held.into_iter().zip(errors).zip(new) {
+        let apart = (value - *held).abs();
+        has_moved |= apart.is_nan() || apart > SIGNIFICANT_CHANGE * held_error.hypot(error);
+        (*held, *held_error) = (value, error);
+    }
+    has_moved
 }
 
 /// The motion used in observations. It is held until one of its values differs from the held one by

@@ -121,8 +121,8 @@ impl Pipeline {
         let covariance = |number: usize| {
             let dependence = self.dependences.subtrees.get(number)?;
             let (reason, _) = validity.reason_and_cause(dependence);
-            let covariance = self.uncertainty.imbalance(number)?;
-            (reason == Reason::None).then_some(covariance)
+            let has_no_fault = reason == Reason::None;
+            has_no_fault.then(|| self.uncertainty.imbalance(number))?
         };
         self.residuals.update(&solved, covariance);
     }

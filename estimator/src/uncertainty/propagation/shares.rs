@@ -6,9 +6,10 @@
 //! is the covariance of its error with that of the torque. The shares sum to the variance. That of
 //! a part that is correlated with others may be negative: its error cancels a part of theirs.
 
+use super::Propagation;
+use super::subtree::SubtreeRoot;
 use super::vectors::{ColumnBlock, Covariance6, LANES, Member, Six};
 use super::vectors::{add_reading, dot, numbers, times};
-use super::{Propagation, SubtreeRoot};
 use proprio_dynamics::regressor::{LINK_PARAMETERS, link_rows};
 use proprio_dynamics::spatial::{Motion, Pose};
 use proprio_dynamics::{Kinematics, Solver, Structure};
