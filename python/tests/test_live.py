@@ -48,17 +48,22 @@ def test_before_anybody_is_there(tmp_path):
 
 
 def test_ctrl_c_ends_a_wait(tmp_path):
+    # A shell that starts the tests in the background has made them ignore Ctrl-C.
     program = """
-import proprio, sys
+import proprio, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
 with proprio.RobotReader("nobody", runtime_dir=sys.argv[1]) as robot:
     print("waits", flush=True)
     robot.wait_for_estimate(1e9)
 """
     command = [sys.executable, "-c", program, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as waiting:
-        waiting.stdout.readline()
-        waiting.send_signal(signal.SIGINT)
-        assert b"KeyboardInterrupt" in waiting.communicate(timeout=60)[1]
+        try:
+            waiting.stdout.readline()
+            waiting.send_signal(signal.SIGINT)
+            assert b"KeyboardInterrupt" in waiting.communicate(timeout=60)[1]
+        finally:
+            waiting.kill()
 
 
 def test_values_and_reasons(arm):
