@@ -6,7 +6,7 @@ use crate::identifiable::{short, torque_of, unit, without};
 use crate::identify::progress_bar;
 use anyhow::Context;
 use proprio_dynamics::model::{Frame, Limits};
-use proprio_dynamics::regressor::identifiable::Column;
+use proprio_dynamics::regressor::identifiable::ParameterColumn;
 use proprio_dynamics::spatial::Pose;
 use proprio_estimator::config::{Base, Config, ConfigError};
 use proprio_estimator::daemon;
@@ -159,7 +159,7 @@ fn applied(file: &Path, setup: &mut Setup) -> anyhow::Result<(CovarianceRoot, Ve
     let robot = &setup.robot;
     let mut columns = Vec::new();
     for link in parameters.identified() {
-        columns.extend((0..10).map(|parameter| Column::Inertial { link, parameter }));
+        columns.extend((0..10).map(|parameter| ParameterColumn::Inertial { link, parameter }));
     }
     let mut noise = SensorNoise::stated(robot);
     let mut calibrations = Vec::new();
@@ -167,7 +167,7 @@ fn applied(file: &Path, setup: &mut Setup) -> anyhow::Result<(CovarianceRoot, Ve
         let Some(sensor) = robot.sensor(&offset.sensor) else {
             continue;
         };
-        columns.extend((0..6).map(|component| Column::Offset { sensor, component }));
+        columns.extend((0..6).map(|component| ParameterColumn::Offset { sensor, component }));
         if let Some(found) = &offset.calibrated {
             calibrations.extend(found.kind.unknowns().map(|unknown| (sensor, unknown)));
         }

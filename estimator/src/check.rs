@@ -23,7 +23,7 @@ use crate::setup::{Setup, gravity_loads, nearest};
 use proprio_dynamics::model::Limits;
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{
-    Certainty, ContactKind, DynamicsError, FrameMotion, InverseDynamics, JointState, Kinematics,
+    ContactKind, Determinacy, DynamicsError, FrameMotion, InverseDynamics, JointState, Kinematics,
     Solver,
 };
 use proprio_identification::robot::BaseMotion;
@@ -282,7 +282,9 @@ impl Check {
         let is_measured =
             |dof| subtree_of(dof).is_some_and(|number| !subtrees[number].sensors.is_empty());
         let lost: Vec<usize> = (0..model.dof_count())
-            .filter(|&dof| setup.robot.locked[dof].is_nan() && certainty[dof] == Certainty::Assumed)
+            .filter(|&dof| {
+                setup.robot.locked[dof].is_nan() && certainty[dof] == Determinacy::Assumed
+            })
             .filter(|&dof| is_measured(dof))
             .collect();
         let hiding = subtrees.iter().enumerate();

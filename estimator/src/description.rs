@@ -4,7 +4,7 @@
 use crate::setup::Setup;
 use proprio_dynamics::ContactKind;
 use proprio_dynamics::calibration::Gain;
-use proprio_dynamics::regressor::identifiable::{Identifiable, Measured, Offsets, Scope};
+use proprio_dynamics::regressor::identifiable::{Identifiable, Measurement, Offsets, Scope};
 use proprio_identification::robot::BaseMotion;
 use proprio_topics::{Description, Entry, Kind, Name, Publisher, Role, TRIGGER};
 use std::fmt;
@@ -169,7 +169,7 @@ impl Setup {
                 &self.robot.model,
                 scope,
                 &self.robot.regime(),
-                Measured::Wrench,
+                Measurement::Wrench,
                 offsets,
             )
             .ok()

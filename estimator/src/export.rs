@@ -6,7 +6,7 @@ use crate::parameters::{
 };
 use nalgebra::DMatrix;
 use proprio_dynamics::calibration::Unknown;
-use proprio_dynamics::regressor::identifiable::Column;
+use proprio_dynamics::regressor::identifiable::ParameterColumn;
 use proprio_dynamics::spatial::Wrench;
 use proprio_identification::Robot;
 use proprio_identification::robot::{AXES, ChannelRole};
@@ -40,12 +40,12 @@ pub fn parameters(
     let mut parameters = Parameters::new(robot, provenance);
 
     let columns = &outcome.covariance.columns;
-    let place = |unknown: Column| columns.iter().position(|column| *column == unknown);
+    let place = |unknown: ParameterColumn| columns.iter().position(|column| *column == unknown);
     let (mut inertias, mut offsets, mut places, mut calibrations) =
         (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for link in &outcome.links {
         let of_link = (0..10).filter_map(|parameter| {
-            place(Column::Inertial {
+            place(ParameterColumn::Inertial {
                 link: link.link,
                 parameter,
             })
@@ -60,7 +60,8 @@ pub fn parameters(
         let ChannelRole::Sensor(sensor) = channel.role else {
             continue;
         };
-        let of_sensor = (0..6).filter_map(|component| place(Column::Offset { sensor, component }));
+        let of_sensor =
+            (0..6).filter_map(|component| place(ParameterColumn::Offset { sensor, component }));
         let of_sensor: Vec<usize> = of_sensor.collect();
         let last = trained()
             .rev()
@@ -212,14 +213,14 @@ mod tests {
             });
         // Offsets before links, and the later link before the earlier one: only the columns
         // determine the places.
-        let mut columns: Vec<Column> = (0..6)
-            .map(|component| Column::Offset {
+        let mut columns: Vec<ParameterColumn> = (0..6)
+            .map(|component| ParameterColumn::Offset {
                 sensor: 0,
                 component,
             })
             .collect();
         for link in [5, 3] {
-            columns.extend((0..10).map(|parameter| Column::Inertial { link, parameter }));
+            columns.extend((0..10).map(|parameter| ParameterColumn::Inertial { link, parameter }));
         }
         let root = DMatrix::from_fn(26, 26, |i, j| {
             if i <= j {

@@ -7,7 +7,7 @@ use nix::unistd::Pid;
 use proprio_dynamics::calibration::{Calibration, Gain, Kind, Unknown};
 use proprio_dynamics::model::{Frame, Model};
 use proprio_dynamics::regressor::Regressor;
-use proprio_dynamics::regressor::identifiable::Column;
+use proprio_dynamics::regressor::identifiable::ParameterColumn;
 use proprio_dynamics::spatial::{Mat3, Pose, RigidInertia, Vec3, Wrench};
 use proprio_dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
 use proprio_estimator::assessment::Assessor;
@@ -1163,8 +1163,8 @@ fn torque_errors(
         .iter()
         .enumerate()
         .filter_map(|(row, c)| match c {
-            Column::Inertial { link, parameter } => Some((row, *link, *parameter)),
-            Column::Offset { .. } => None,
+            ParameterColumn::Inertial { link, parameter } => Some((row, *link, *parameter)),
+            ParameterColumn::Offset { .. } => None,
         })
         .collect();
     for i in 0..200 {
@@ -1632,7 +1632,7 @@ fn the_offset_of_a_sensor_is_of_the_last_log_that_reads_it() {
     assert!(named(1).is_empty(), "{:?}", named(1));
     let covariance = &outcome.covariance;
     for (row, column) in covariance.columns.iter().enumerate() {
-        if let Column::Offset { sensor, component } = column {
+        if let ParameterColumn::Offset { sensor, component } = column {
             let deviation = covariance.root.row(row).norm();
             assert!(deviation < 1.0, "{sensor} {component}: {deviation}");
         }

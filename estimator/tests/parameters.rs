@@ -9,8 +9,8 @@ use common::{Random, RandomRobot, State, contact, gap, humanoid, motion, size};
 use nalgebra::{DMatrix, DVector, Matrix4, Matrix6, SMatrix};
 use proprio_dynamics::calibration::{Calibration, Gain, Kind, Unknown};
 use proprio_dynamics::model::{Frame, Model, ModelError};
-use proprio_dynamics::regressor::EstimateRows;
-use proprio_dynamics::spatial::{Mat3, Pose, RigidInertia, Vec3, Wrench};
+use proprio_dynamics::regressor::{EstimateRows, link_rows};
+use proprio_dynamics::spatial::{Mat3, Motion, Pose, RigidInertia, Vec3, Wrench};
 use proprio_dynamics::{
     ContactKind, ContactSet, ContactSpec, DynamicsError, FrameMotion, Kinematics, Noise, SensorCut,
     Solver, Structure,
@@ -67,6 +67,43 @@ fn covariance(structure: &Structure, random: &mut Random) -> Covariance {
     covariance
 }
 
+/// The row of a component of a contact's wrench over `[10 N_B | 6 per sensor]`: the power along
+/// `motion` of every link's wrench, and of every offset's on the contact's sub-tree.
+fn contact_row(
+    structure: &Structure,
+    kinematics: &Kinematics,
+    solver: &Solver,
+    contact: usize,
+    motion: &Motion,
+) -> Vec<f64> {
+    let number = structure
+        .subtree_of(structure.contacts()[contact].frame.link)
+        .unwrap();
+    let offsets = 10 * structure.link_count();
+    let mut row = vec![0.0; offsets + 6 * structure.sensors().len()];
+    for link in structure.links_of(number) {
+        let rows = link_rows(kinematics.pose(link), kinematics.motion(link));
+        for column in 0..10 {
+            let wrench = Wrench::from_torque_first(rows.map(|row| row[column]));
+            row[10 * link + column] = motion.dot(&wrench);
+        }
+    }
+    for sensor in structure.subtrees()[number].sensors.iter() {
+        let cut = &structure.sensors()[sensor];
+        let is_above = structure.subtree_of(cut.joint() + 1) == Some(number);
+        let side = cut.sign() * if is_above { 1.0 } else { -1.0 };
+        for component in 0..6 {
+            let mut unit = [0.0; 6];
+            unit[component] = side;
+            let wrench = solver
+                .sensor_pose(sensor)
+                .wrench(&Wrench::from_torque_first(unit));
+            row[offsets + 6 * sensor + component] = motion.dot(&wrench);
+        }
+    }
+    row
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
@@ -104,22 +141,16 @@ proptest! {
         propagation.update(&structure, &solver, &kinematics, Nanos::from_seconds(3.0)).unwrap();
 
         let rows = EstimateRows::new(&structure, &solver, &kinematics).unwrap();
-        let deviation = |subtree: usize, write: &dyn Fn(&mut [f64])| {
-            let (mut own, mut row) = (
-                vec![0.0; rows.column_count(subtree).unwrap()],
-                vec![0.0; rows.stacked_column_count()],
-            );
-            write(&mut own);
-            rows.expand(subtree, &own, &mut row).unwrap();
-            let row = DVector::from_vec(row);
+        let deviation = |row: &[f64]| {
+            let row = DVector::from_column_slice(row);
             // The rounding error of a sum that vanishes.
             let scale = row.abs().dot(&(all.abs() * row.abs()));
             (row.dot(&(&all * &row)), scale)
         };
         for dof in 0..model.dof_count() {
-            let (variance, scale) = deviation(rows.torque_subtree(dof).unwrap(), &|own| {
-                rows.torque_row(dof, own).unwrap();
-            });
+            let mut row = vec![0.0; rows.column_count()];
+            rows.torque_row(dof, &mut row).unwrap();
+            let (variance, scale) = deviation(&row);
             let got = propagation.torque_std()[dof].powi(2);
             // The deviation has single precision.
             prop_assert!(
@@ -127,11 +158,6 @@ proptest! {
                 "dof {}: {} not {}", dof, got, variance
             );
             // The share of an input is the covariance of its error with that of the torque.
-            let mut row = vec![0.0; rows.stacked_column_count()];
-            let subtree = rows.torque_subtree(dof).unwrap();
-            let mut own = vec![0.0; rows.column_count(subtree).unwrap()];
-            rows.torque_row(dof, &mut own).unwrap();
-            rows.expand(subtree, &own, &mut row).unwrap();
             let with_all = &all * DVector::from_column_slice(&row);
             let links = 10 * model.link_count();
             let mut shares = vec![0.0; model.link_count() + sensors.len()];
@@ -153,12 +179,10 @@ proptest! {
             }
         }
         for contact in 0..contacts.len() {
-            let components = [3, 4, 5, 0, 1, 2];
-            for (component, got) in components.into_iter().zip(propagation.contact_std()[contact]) {
-                let (variance, scale) =
-                    deviation(rows.contact_subtree(contact).unwrap(), &|own| {
-                        rows.contact_row(contact, component, own).unwrap();
-                    });
+            let motions = solver.contact_rows(contact).iter().enumerate();
+            for ((component, motion), got) in motions.zip(propagation.contact_std()[contact]) {
+                let row = contact_row(&structure, &kinematics, &solver, contact, motion);
+                let (variance, scale) = deviation(&row);
                 let square = got.powi(2);
                 prop_assert!(
                     (square - variance).abs() < 1e-5 * variance + 1e-10 * (1.0 + scale),

@@ -91,7 +91,7 @@ def equation_cases(bench, random, bases, frames, each, whole=(), products=False)
 
     All cases have the products of the regressor with the vectors; the first case of each base named
     in `whole` also has the regressor itself. With `products`, cases have products of the mass
-    matrix with random vectors instead of the mass matrix and the Jacobians.
+    matrix with random vectors instead of the mass matrix.
     """
     robot, pin = bench.robot, bench.pinocchio
     size = 10 * len(robot.bodies)
@@ -177,9 +177,9 @@ def equation_cases(bench, random, bases, frames, each, whole=(), products=False)
             bias = change.T @ np.concatenate([slow["base"], slow["torque"]])
             omega = root[3:6]
             blocks = {
-                "pinocchio": pin.blocks(q, dq, omega, frames),
-                "mujoco": bench.mujoco.blocks(q, dq, omega, frames + [base]),
-                "idyntree": bench.idyntree.blocks(base, q, dq, motion[3:6], frames),
+                "pinocchio": pin.blocks(q, dq, omega),
+                "mujoco": bench.mujoco.blocks(q, dq, omega, base),
+                "idyntree": bench.idyntree.blocks(base, q, dq, motion[3:6]),
             }
             by_pin, by_mujoco, by_idyn = (
                 blocks[name] for name in ("pinocchio", "mujoco", "idyntree")
@@ -204,7 +204,7 @@ def equation_cases(bench, random, bases, frames, each, whole=(), products=False)
                 change.T @ np.concatenate([slow["base"], slow["torque"]]),
             )
             bench.agree(what, "bias: pinocchio and idyntree", bias, by_idyn["bias"])
-            own_change = base_change(by_mujoco["jacobian"][base])
+            own_change = base_change(by_mujoco["jacobian"])
             mass = change.T @ by_pin["mass"] @ change
             bench.agree(
                 what,
@@ -213,21 +213,6 @@ def equation_cases(bench, random, bases, frames, each, whole=(), products=False)
                 own_change.T @ by_mujoco["mass"] @ own_change,
             )
             bench.agree(what, "mass matrix: pinocchio and idyntree", mass, by_idyn["mass"])
-            jacobians = {}
-            for frame in frames:
-                jacobian = by_pin["jacobian"][frame] @ change
-                bench.agree(
-                    what,
-                    "jacobian: pinocchio and mujoco",
-                    jacobian,
-                    by_mujoco["jacobian"][frame] @ own_change,
-                )
-                bench.agree(
-                    what, "jacobian: pinocchio and idyntree", jacobian, by_idyn["jacobian"][frame]
-                )
-                # Columns of joints that are not between base and frame are zero, but the products
-                # leave rounding errors there.
-                jacobians[frame] = np.where(np.abs(jacobian) < 1e-14, 0.0, jacobian)
 
             case = {
                 "base": base,
@@ -249,7 +234,6 @@ def equation_cases(bench, random, bases, frames, each, whole=(), products=False)
                 case["mass_matrix_products"] = [plain(mass @ vector) for vector in motions]
             else:
                 case["mass_matrix"] = plain(mass[np.tril_indices(len(mass))])
-                case["jacobian"] = {frame: plain(jacobian) for frame, jacobian in jacobians.items()}
             if number == 0 and base in whole:
                 case["regressor"] = [
                     plain(np.where(np.abs(row) < 1e-13, 0.0, row)) for row in regressor
@@ -314,7 +298,7 @@ def contact_case(bench, random, what, scenario):
     if closing is None:
         # In flight: the contacts accelerate the root.
         at = np.concatenate([np.zeros(3), at[3:6], np.zeros(3)])
-        root_inertia = pin.blocks(q, dq, at[3:6], [])["mass"][:6, :6]
+        root_inertia = pin.blocks(q, dq, at[3:6])["mass"][:6, :6]
         acceleration = -np.linalg.solve(root_inertia, need(list(zip(links, wrenches)), at)["base"])
         at = np.concatenate([acceleration[:3], at[3:6], acceleration[3:]])
     else:

@@ -265,8 +265,8 @@ class MuJoCo:
             answer["base"] = total[:6]
         return answer
 
-    def blocks(self, q, dq, omega, frames):
-        """Mass matrix, bias and Jacobians of links, for a floating root with its origin at rest.
+    def blocks(self, q, dq, omega, base):
+        """Mass matrix, bias and Jacobian of a link, for a floating root with its origin at rest.
 
         The bias is the generalised force due to the velocities, without gravity or acceleration.
         """
@@ -283,16 +283,13 @@ class MuJoCo:
         to_own[self.v_index, 6 + np.arange(len(q))] = 1.0
         mass = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, mass)
-        jacobians = {}
-        for frame in frames:
-            linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-            mujoco.mj_jacBody(model, data, linear, angular, model.body(frame).id)
-            turn = data.body(frame).xmat.reshape(3, 3)
-            jacobians[frame] = np.vstack([turn.T @ linear, turn.T @ angular]) @ to_own
+        linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+        mujoco.mj_jacBody(model, data, linear, angular, model.body(base).id)
+        turn = data.body(base).xmat.reshape(3, 3)
         return {
             "mass": to_own.T @ mass @ to_own,
             "bias": to_own.T @ data.qfrc_bias,
-            "jacobian": jacobians,
+            "jacobian": np.vstack([turn.T @ linear, turn.T @ angular]) @ to_own,
         }
 
 
@@ -436,7 +433,7 @@ class Pinocchio:
             of_body[body] = whole[:, 10 * (frame.parentJoint - 1) + order]
         return np.hstack([of_body[body] for body in self.robot.bodies])
 
-    def blocks(self, q, dq, omega, frames):
+    def blocks(self, q, dq, omega):
         zeros = np.zeros(len(q))
         x, v, a = self._state(
             q, dq, zeros, (np.eye(3), np.zeros(3), np.zeros(3), omega, np.zeros(3))
@@ -448,7 +445,6 @@ class Pinocchio:
         return {
             "mass": mass[np.ix_(self.kept, self.kept)],
             "bias": bias,
-            "jacobian": {frame: self.jacobian(x, frame) for frame in frames},
         }
 
 
@@ -686,7 +682,7 @@ class IDynTree:
             [rows[:, 10 * self.model.getLinkIndex(body) :][:, :10] for body in self.robot.bodies]
         )
 
-    def blocks(self, base, q, dq, omega, frames):
+    def blocks(self, base, q, dq, omega):
         """As the others', but for any base: velocities are [linear, angular part of it; joints]."""
         self._set(
             base,
@@ -706,20 +702,11 @@ class IDynTree:
         bias = idyntree.FreeFloatingGeneralizedTorques(self.model)
         must(self.kindyn[base].generalizedBiasForces(bias), "iDynTree: cannot compute the bias")
         wrench = [bias.baseWrench().getVal(i) for i in range(6)]
-        jacobians = {}
-        for frame in frames:
-            jacobian = idyntree.MatrixDynSize(6, count)
-            must(
-                self.kindyn[base].getFrameFreeFloatingJacobian(frame, jacobian),
-                f"iDynTree: no Jacobian of {frame}",
-            )
-            jacobians[frame] = jacobian.toNumPy()[:, order]
         return {
             "mass": mass.toNumPy()[np.ix_(order, order)],
             "bias": np.array(
                 wrench + [bias.jointTorques().getVal(offset) for offset in self.offsets]
             ),
-            "jacobian": jacobians,
         }
 
 

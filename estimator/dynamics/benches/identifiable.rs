@@ -16,9 +16,9 @@ use common::humanoid;
 use divan::{Bencher, black_box};
 use proprio_dynamics::model::{MeasurementDirection, MeasurementFrame, Model};
 use proprio_dynamics::regressor::identifiable::{
-    BaseRegime, Body, Freedom, Identifiable, JointMotion, Measured, Offsets, Regime, Scope,
+    Identifiable, Measurement, Offsets, Regime, Scope,
 };
-use proprio_dynamics::spatial::{Motion, Pose, Vec3};
+use proprio_dynamics::spatial::{Pose, Vec3};
 use proprio_dynamics::{Noise, SensorCut, Structure};
 
 fn main() {
@@ -72,7 +72,7 @@ fn whole_tree(bencher: Bencher<'_, '_>, is_fixed: bool) {
             black_box(&model),
             Scope::Tree,
             &regime,
-            Measured::Wrench,
+            Measurement::Wrench,
             Offsets::Known,
         )
     });
@@ -82,41 +82,39 @@ fn whole_tree(bencher: Bencher<'_, '_>, is_fixed: bool) {
 fn all_subtrees(bencher: Bencher<'_, '_>, offsets: Offsets) {
     let (model, structure) = robot();
     let (regime, scope) = (Regime::free(&model), Scope::SubTrees(&structure));
-    bencher
-        .bench(|| Identifiable::new(black_box(&model), scope, &regime, Measured::Wrench, offsets));
-}
-
-fn mechanism(bencher: Bencher<'_, '_>, links: usize, parent: impl Fn(usize) -> usize) {
-    let joint = vec![Freedom {
-        twist: Motion::rotation(&Vec3::y(), &Vec3::zeros()),
-        motion: JointMotion::Moving,
-    }];
-    let bodies: Vec<Body> = (0..links)
-        .map(|link| Body {
-            parent: link.checked_sub(1).map(&parent),
-            placement: Pose::from_xyz_rpy([0.1, 0.2, 0.1], [0.3 * link as f64, 0.4, 0.0]),
-            joint: joint.clone(),
-        })
-        .collect();
     bencher.bench(|| {
-        Identifiable::of_mechanism(
-            black_box(&bodies),
-            &BaseRegime::Free,
-            Measured::Wrench,
-            Offsets::Known,
-            Regime::TOLERANCE,
+        Identifiable::new(
+            black_box(&model),
+            scope,
+            &regime,
+            Measurement::Wrench,
+            offsets,
         )
     });
+}
+
+fn generated(bencher: Bencher<'_, '_>, links: usize, parent: impl Fn(usize) -> usize) {
+    let mut text = String::from("<robot name=\"generated\">");
+    for link in 0..links {
+        let at = [1.0, 2.0, 3.0].map(|factor| 0.1 * (factor * link as f64).sin());
+        let parent = link.checked_sub(1).map(&parent);
+        common::write_link(&mut text, link, parent, "revolute", at);
+    }
+    let model = Model::from_urdf(&(text + "</robot>"), &[]).expect("a robot");
+    let regime = Regime::free(&model);
+    let (scope, measured) = (Scope::Tree, Measurement::Wrench);
+    bencher
+        .bench(|| Identifiable::new(black_box(&model), scope, &regime, measured, Offsets::Known));
 }
 
 /// Every link is a child of the base.
 #[divan::bench(args = [39, 78, 156])]
 fn star(bencher: Bencher<'_, '_>, links: usize) {
-    mechanism(bencher, links, |_| 0);
+    generated(bencher, links, |_| 0);
 }
 
 /// Every link is the child of the previous one.
 #[divan::bench(args = [39, 78, 156])]
 fn chain(bencher: Bencher<'_, '_>, links: usize) {
-    mechanism(bencher, links, |before| before);
+    generated(bencher, links, |before| before);
 }

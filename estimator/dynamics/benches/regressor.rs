@@ -18,9 +18,7 @@ use robot::Bench;
 use robot::common;
 
 use divan::{Bencher, black_box};
-use proprio_dynamics::regressor::{
-    Actuator, EstimateRows, MotorRegressor, Regressor, StackedRegressor, Transmission, Weighting,
-};
+use proprio_dynamics::regressor::{EstimateRows, Regressor, StackedRegressor, Weighting};
 use proprio_dynamics::{ContactSet, Solver};
 
 fn main() {
@@ -128,46 +126,9 @@ fn f_rows_of_all_torques(bencher: Bencher<'_, '_>) {
             .expect("finite input");
         let rows = EstimateRows::new(structure, &solver, kinematics).expect("the same structure");
         for dof in 0..dofs {
-            let columns = rows
-                .torque_subtree(dof)
-                .and_then(|subtree| rows.column_count(subtree));
-            let row = &mut row[..columns.expect("a joint's sub-tree")];
-            rows.torque_row(dof, row).expect("a row");
-            black_box(row);
+            rows.torque_row(dof, &mut row).expect("a row");
+            black_box(&row);
         }
-    });
-}
-
-/// Kinematics, the whole tree's regressor, and all motors' rows with all their terms.
-#[divan::bench]
-fn g_motors(bencher: Bencher<'_, '_>) {
-    let mut bench = Bench::new(true);
-    let mut regressor = Regressor::new(&bench.model);
-    let dofs = bench.model.dof_count();
-    let actuator = Actuator {
-        rotor_inertia: true,
-        coulomb: Some(0.05),
-        viscous: true,
-        offset: true,
-    };
-    let mut motors = MotorRegressor::new(
-        regressor.column_count(),
-        Transmission::direct(dofs),
-        &vec![actuator; dofs],
-    )
-    .expect("positive speeds");
-    bencher.bench_local(|| {
-        bench.next();
-        regressor
-            .update(&bench.model, &bench.kinematics)
-            .expect("the same model");
-        motors
-            .update(
-                |dof| regressor.joint_row(dof),
-                bench.states[bench.turn].get(),
-            )
-            .expect("the same model");
-        black_box(&motors);
     });
 }
 

@@ -2,7 +2,9 @@
 
 use proprio_dynamics::model::Model;
 use proprio_dynamics::regressor::Regressor;
-use proprio_dynamics::regressor::identifiable::{Identifiable, Measured, Offsets, Regime, Scope};
+use proprio_dynamics::regressor::identifiable::{
+    Identifiable, Measurement, Offsets, Regime, Scope,
+};
 use proprio_dynamics::spatial::{RigidInertia, Vec3};
 use proprio_dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
 
@@ -43,7 +45,7 @@ pub fn main() -> Result<(), Box<dyn std::error::Error>> {
         &model,
         Scope::Tree,
         &regime,
-        Measured::Torques,
+        Measurement::Torques,
         Offsets::Known,
     )?;
     seen.base_parameters()

@@ -30,14 +30,6 @@ pub enum DynamicsError {
         /// Which one.
         index: usize,
     },
-    /// A rotation matrix is not orthonormal, or is a reflection.
-    #[error("{what} {index} has a rotation matrix that is not a rotation")]
-    NoRotation {
-        /// What it belongs to.
-        what: &'static str,
-        /// Which one.
-        index: usize,
-    },
     /// A present contact with fewer than six unknowns, or one beside measured torques, at a place
     /// where the identifiable subspace has no closed form ([`crate::regressor::identifiable`]).
     #[error("the identifiable subspace with contact {0} is not known in closed form")]

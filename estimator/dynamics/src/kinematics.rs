@@ -18,7 +18,7 @@
 use wide::f64x4;
 
 use crate::error::{DynamicsError, check_size};
-use crate::model::{Axis, Frame, Joint, JointKind, Model};
+use crate::model::{Frame, Joint, JointAxis, JointKind, Model};
 use crate::spatial::{Motion, Pose, Vec3, Wrench};
 
 /// Angles beyond this [rad] are computed by the standard library: their reduction to one turn needs
@@ -93,7 +93,7 @@ pub struct JointState<'a> {
 
 /// State of one link.
 #[derive(Clone, Copy, Debug)]
-struct LinkState {
+struct LinkKinematics {
     /// Pose in the base, `x_bl`.
     pose: Pose,
     /// Motion of the link's frame, in link axes.
@@ -102,7 +102,7 @@ struct LinkState {
 
 /// One step of the pass: across a joint, from a link whose state is known to its neighbour.
 #[derive(Clone, Copy, Debug)]
-struct Step {
+struct Crossing {
     from: usize,
     to: usize,
     joint: usize,
@@ -116,17 +116,16 @@ pub struct Kinematics {
     base: usize,
     /// First the joints from the base to the model's root, crossed from child to parent; then every
     /// other link in the model's order.
-    steps: Vec<Step>,
+    steps: Vec<Crossing>,
     /// Whether joint `j` is crossed from child to parent: the base lies beyond it.
     reversed: Vec<bool>,
     /// Position of each joint, and its sine and cosine; zero for a fixed one.
     positions: Vec<f64>,
     sines: Vec<(f64, f64)>,
-    /// Velocities of the degrees of freedom at the last update, for users of its poses and motions.
-    velocity: Vec<f64>,
+    dofs: usize,
     /// Pose of each joint's child in its parent, `x_pc`.
     local: Vec<Pose>,
-    links: Vec<LinkState>,
+    links: Vec<LinkKinematics>,
     /// Net wrench of each link in base coordinates.
     net: Vec<Wrench>,
 }
@@ -145,10 +144,10 @@ impl Kinematics {
             reversed: vec![false; model.joint_count()],
             positions: vec![0.0; model.joint_count()],
             sines: vec![(0.0, 1.0); model.joint_count()],
-            velocity: vec![0.0; model.dof_count()],
+            dofs: model.dof_count(),
             local: vec![Pose::identity(); model.joint_count()],
             links: vec![
-                LinkState {
+                LinkKinematics {
                     pose: Pose::identity(),
                     motion: rest
                 };
@@ -192,7 +191,7 @@ impl Kinematics {
         while link > 0 {
             let joint = link - 1;
             let parent = model.joints()[joint].parent;
-            self.steps.push(Step {
+            self.steps.push(Crossing {
                 from: link,
                 to: parent,
                 joint,
@@ -203,7 +202,7 @@ impl Kinematics {
         }
         for (number, joint) in model.joints().iter().enumerate() {
             if !self.reversed[number] {
-                self.steps.push(Step {
+                self.steps.push(Crossing {
                     from: joint.parent,
                     to: joint.child,
                     joint: number,
@@ -219,7 +218,7 @@ impl Kinematics {
         check_size(
             "degrees of freedom of the model",
             model.dof_count(),
-            self.velocity.len(),
+            self.dofs,
         )
     }
 
@@ -269,8 +268,7 @@ impl Kinematics {
                 index: self.base,
             });
         }
-        self.velocity.copy_from_slice(state.velocity);
-        self.links[self.base] = LinkState {
+        self.links[self.base] = LinkKinematics {
             pose: Pose::identity(),
             motion: *base,
         };
@@ -350,15 +348,9 @@ impl Kinematics {
         &self.net
     }
 
-    /// Joint velocities of the last update [rad/s or m/s], by degree of freedom; zero before the
-    /// first update.
-    pub fn joint_velocity(&self) -> &[f64] {
-        &self.velocity
-    }
-
     /// Whether a joint is between the base and the model's root, so that it is crossed from child
     /// to parent.
-    pub fn is_reversed(&self, joint: usize) -> bool {
+    pub(crate) fn is_reversed(&self, joint: usize) -> bool {
         self.reversed[joint]
     }
 
@@ -368,7 +360,7 @@ impl Kinematics {
     #[inline(always)]
     pub fn joint_axis(&self, joint: &Joint) -> Option<Motion> {
         let pose = &self.links[joint.child].pose;
-        let along = |axis: &Axis| pose.rotation * axis.vector * joint.ratio;
+        let along = |axis: &JointAxis| pose.rotation * axis.vector * joint.ratio;
         match &joint.kind {
             JointKind::Revolute(axis) => Some(Motion::rotation(&along(axis), &pose.translation)),
             JointKind::Prismatic(axis) => Some(Motion::translation(&along(axis))),
@@ -431,7 +423,13 @@ fn up_to_child(parent: &FrameMotion, joint: &Joint, x_pc: &Pose, dq: f64, ddq: f
 
 /// State of a joint's parent from that of its child.
 #[inline]
-fn down_to_parent(child: &LinkState, joint: &Joint, x_pc: &Pose, dq: f64, ddq: f64) -> LinkState {
+fn down_to_parent(
+    child: &LinkKinematics,
+    joint: &Joint,
+    x_pc: &Pose,
+    dq: f64,
+    ddq: f64,
+) -> LinkKinematics {
     let x_cp = x_pc.inverse();
     let mut motion = child.motion;
     // First the motion of the child with the joint at rest, then the rigid transform.
@@ -447,7 +445,7 @@ fn down_to_parent(child: &LinkState, joint: &Joint, x_pc: &Pose, dq: f64, ddq: f
         }
         JointKind::Fixed => {}
     }
-    LinkState {
+    LinkKinematics {
         pose: child.pose * x_cp,
         motion: motion.at(&x_cp),
     }

@@ -12,19 +12,15 @@
 //!    link. The base stands still or carries an IMU; it may change at run time.
 //! 4. [`Solver::solve`]: F/T readings become joint torques and unknown contact wrenches. The net
 //!    wrench of a sub-tree's links, minus what its F/T sensors measure, is the wrench of its
-//!    contacts ([`LeastSquares`]). Every joint torque follows, from either side of its joint where
-//!    both sides determine it ([`Solver::sides`]). [`Solver::update_deviations`] adds the standard
-//!    deviations due to noise.
+//!    contacts ([`LeastSquares`]). Every joint torque follows. [`Solver::update_deviations`] adds
+//!    the standard deviations due to noise.
 //! 5. [`regressor`]: the same wrenches and torques as linear functions of the inertial parameters
 //!    and the F/T offsets.
 //! 6. [`regressor::identifiable::Identifiable::new`]: which combinations of parameters and offsets
 //!    are identifiable, the *base parameters*.
 //!
 //! Without F/T sensors, [`InverseDynamics::update`] takes the place of 2 and 4 (recursive
-//! Newton-Euler with known external wrenches), and [`EquationOfMotion::update`] has its matrices.
-//! [`calibration`] is the calibration of an F/T sensor. [`EquationOfMotion`],
-//! [`regressor::MotorRegressor`] and [`regressor::EstimateRows`] are for other programs: nothing in
-//! this workspace but tests and benchmarks calls them.
+//! Newton-Euler with known external wrenches). [`calibration`] is the calibration of an F/T sensor.
 //!
 //! # Notation
 //! ```text
@@ -38,7 +34,6 @@
 //! docs/book/src/figures/speed.md.
 
 pub mod calibration;
-mod equation;
 mod error;
 mod kinematics;
 mod least_squares;
@@ -49,14 +44,11 @@ mod solver;
 pub mod spatial;
 mod structure;
 
-pub use equation::EquationOfMotion;
 pub use error::{DynamicsError, check_size};
 pub use kinematics::{ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics};
 pub use least_squares::{LeastSquares, noise_factor};
 pub use place_errors::{PlaceErrors, PlaceStd};
-pub use solver::{
-    Balance, Certainty, ContactEstimate, Disagreement, SideTorque, Sides, Solver, unknowns,
-};
+pub use solver::{Balance, ContactSolution, Determinacy, Solver, unknowns};
 pub use structure::{
     BitSet, ContactKind, ContactSet, ContactSpec, Dependence, DofSet, LinkSet, Noise, Route,
     SensorCut, SensorSet, Structure, StructureError, SubTree,

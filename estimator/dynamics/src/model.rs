@@ -36,7 +36,7 @@ use crate::spatial::{Mat3, Pose, RigidInertia, Vec3};
 /// The axis of a joint: a unit vector in the axes of the child, which at position zero are also
 /// those of the joint's placement, and its kind, which allows short cuts.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Axis {
+pub struct JointAxis {
     /// The unit vector.
     pub vector: Vec3,
     /// The coordinate axis that it is along, if any. Most joints have one, and rotation about it is
@@ -57,7 +57,7 @@ pub enum AxisKind {
     Any,
 }
 
-impl Axis {
+impl JointAxis {
     /// The axis along `direction`, normalised; `None` if its length is zero or not finite.
     /// Components of the size of rounding errors are set to zero.
     pub fn new(direction: Vec3) -> Option<Self> {
@@ -78,13 +78,8 @@ impl Axis {
         Some(Self { vector, kind })
     }
 
-    /// `r * Rot(axis, angle)`: `r` rotated by `angle` [rad] about this axis, given in the rotated
-    /// axes.
-    pub fn turn(&self, r: &Mat3, angle: f64) -> Mat3 {
-        self.turn_by(r, angle.sin_cos())
-    }
-
-    /// The same from the angle's sine and cosine.
+    /// `r * Rot(axis, angle)`: `r` rotated about this axis, given in the rotated axes, by an angle
+    /// of this sine and cosine.
     #[inline(always)]
     fn turn_by(&self, r: &Mat3, (sin, c): (f64, f64)) -> Mat3 {
         let columns = |i: usize| r.column(i).into_owned();
@@ -121,9 +116,9 @@ impl Axis {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum JointKind {
     /// Rotation about the axis: the URDF's `revolute` and `continuous`.
-    Revolute(Axis),
+    Revolute(JointAxis),
     /// Translation along the axis.
-    Prismatic(Axis),
+    Prismatic(JointAxis),
     /// None: a joint that was kept because it carries an F/T sensor.
     Fixed,
 }
@@ -492,14 +487,14 @@ impl Model {
 
 /// A place in a URDF: `line 8: joint turn`.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Place {
+pub struct Location {
     /// The line, from 1.
     pub line: usize,
     /// The element that is there, such as `link chest`.
     pub owner: String,
 }
 
-impl fmt::Display for Place {
+impl fmt::Display for Location {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "line {}: {}", self.line, self.owner)
     }
@@ -538,7 +533,7 @@ pub enum ModelError {
     #[error("{place}: the {kind} on line {first} has the same name; rename one of them")]
     Duplicate {
         /// The second one.
-        place: Place,
+        place: Location,
         /// `link` or `joint`.
         kind: &'static str,
         /// The line of the first one.
@@ -548,7 +543,7 @@ pub enum ModelError {
     #[error("{place}: {what} has no {missing}{}; {remedy}", instead(.there))]
     Missing {
         /// The link or joint.
-        place: Place,
+        place: Location,
         /// The element that lacks it, such as `<axis>`.
         what: String,
         /// What it lacks: `xyz`, or `<mass>`.
@@ -562,7 +557,7 @@ pub enum ModelError {
     #[error("{place}: {what} has an empty {attribute}; {remedy}")]
     Empty {
         /// The link or joint.
-        place: Place,
+        place: Location,
         /// Its element, such as `its <axis>`.
         what: String,
         /// The attribute.
@@ -577,7 +572,7 @@ pub enum ModelError {
     )]
     Unexpanded {
         /// The link, the joint or the robot, at the element's line.
-        place: Place,
+        place: Location,
         /// The element, with the attribute if it is one.
         what: String,
     },
@@ -585,7 +580,7 @@ pub enum ModelError {
     #[error("{place}: its {role} link {link} is not in the URDF; correct the name or add the link")]
     UnknownLink {
         /// The joint.
-        place: Place,
+        place: Location,
         /// `parent` or `child`.
         role: &'static str,
         /// The name that no link has.
@@ -598,7 +593,7 @@ pub enum ModelError {
     )]
     TwoParents {
         /// The second joint.
-        place: Place,
+        place: Location,
         /// The link.
         link: String,
         /// The first joint.
@@ -615,12 +610,12 @@ pub enum ModelError {
     SeveralRoots(Vec<String>),
     /// Joints that form a loop.
     #[error("{0}: the joints above it form a loop; only trees can be described: remove a joint")]
-    Loop(Place),
+    Loop(Location),
     /// A number that cannot be parsed.
     #[error("{place}: {element} {attribute}=\"{value}\" is not {expected}")]
     Number {
         /// The owner of the element, at the element's line.
-        place: Place,
+        place: Location,
         /// The element, such as `<origin>`.
         element: String,
         /// The attribute.
@@ -636,7 +631,7 @@ pub enum ModelError {
     )]
     NotFinite {
         /// The owner of the element, at the element's line.
-        place: Place,
+        place: Location,
         /// The element, such as `<origin>`.
         element: String,
         /// The attribute.
@@ -646,12 +641,12 @@ pub enum ModelError {
     },
     /// The axis of a moving joint has no direction.
     #[error("{0}: its <axis> xyz is zero; write a direction, such as xyz=\"0 0 1\"")]
-    ZeroAxis(Place),
+    ZeroAxis(Location),
     /// A joint of a type that is not supported.
     #[error("{place}: type=\"{kind}\" {}", unsupported(.kind))]
     UnsupportedJoint {
         /// The joint.
-        place: Place,
+        place: Location,
         /// Its type.
         kind: String,
     },
@@ -659,7 +654,7 @@ pub enum ModelError {
     #[error("{place}: its <mimic> joint=\"{follows}\" {reason}")]
     Mimic {
         /// The joint.
-        place: Place,
+        place: Location,
         /// The joint that it should follow.
         follows: String,
         /// Why it cannot, and what to do.
@@ -672,7 +667,7 @@ pub enum ModelError {
     )]
     NegativeMass {
         /// The link with the least mass, at its `<inertial>`.
-        place: Place,
+        place: Location,
         /// The mass of the body.
         mass: f64,
         /// The links that are fixed to it.
@@ -687,7 +682,7 @@ pub enum ModelError {
     )]
     InertiaNotPositive {
         /// The link with the least moment of its own, at its `<inertial>`.
-        place: Place,
+        place: Location,
         /// The least eigenvalue of the body's tensor [kg m^2].
         least: f64,
         /// The links that are fixed to it.
@@ -700,7 +695,7 @@ pub enum ModelError {
         .0.iter().map(|(place, joint)| format!("{place}, beyond joint {joint}"))
             .collect::<Vec<_>>().join("; ")
     )]
-    MissingInertial(Vec<(Place, String)>),
+    MissingInertial(Vec<(Location, String)>),
     /// A joint to be kept that the URDF does not have.
     #[error(
         "joint {joint}, named as the joint of an F/T sensor, is not in the URDF; any of its \
@@ -800,24 +795,24 @@ mod tests {
             [0.0, 0.0, -1.0],
             [0.2, -0.5, 0.9],
         ] {
-            let axis = Axis::new(Vec3::from(direction)).expect("not zero");
+            let axis = JointAxis::new(Vec3::from(direction)).expect("not zero");
             let expected =
                 r * Rotation3::from_axis_angle(&Unit::new_normalize(Vec3::from(direction)), 0.7)
                     .matrix();
             assert!(
-                (axis.turn(&r, 0.7) - expected).amax() < 1e-15,
+                (axis.turn_by(&r, 0.7_f64.sin_cos()) - expected).amax() < 1e-15,
                 "{direction:?}"
             );
         }
         let almost =
-            Axis::new(Vec3::new(-2.2e-16, -0.999_999_999_999_999_8, 0.0)).expect("not zero");
+            JointAxis::new(Vec3::new(-2.2e-16, -0.999_999_999_999_999_8, 0.0)).expect("not zero");
         assert_eq!(
             (almost.vector, almost.kind),
             (-Vec3::y(), AxisKind::Y(-1.0))
         );
-        let oblique = Axis::new(Vec3::new(1e-12, 1.0, 0.0)).expect("not zero");
+        let oblique = JointAxis::new(Vec3::new(1e-12, 1.0, 0.0)).expect("not zero");
         assert_eq!(oblique.kind, AxisKind::Any);
-        assert_eq!(Axis::new(Vec3::zeros()), None);
-        assert_eq!(Axis::new(Vec3::new(f64::NAN, 0.0, 0.0)), None);
+        assert_eq!(JointAxis::new(Vec3::zeros()), None);
+        assert_eq!(JointAxis::new(Vec3::new(f64::NAN, 0.0, 0.0)), None);
     }
 }

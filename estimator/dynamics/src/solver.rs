@@ -25,8 +25,8 @@
 //! So the two sides of a joint give the same torque, and the noise of a torque is that of
 //! `s_j . F_j - h_j . b`: a sensor at `k` enters with the motion `h_j - [k below j] s_j`.
 //!
-//! Where both sides are usable, [`Sides`] has the two values; its documentation explains in what
-//! sense the fused torque is better than their mean.
+//! Fused, it is the component along the axis of the mean of the two sides' *wrenches*, weighted by
+//! inverse covariance: of all `s_j . F_j - h . b` the one of least variance (Gauss-Markov).
 //!
 //! One full unknown wrench in a sub-tree, the paper's case, needs no linear solve: it is `b`, moved
 //! to the contact.
@@ -34,7 +34,7 @@
 mod estimates;
 mod unknowns;
 
-pub use estimates::{Balance, Certainty, ContactEstimate, Disagreement, SideTorque, Sides};
+pub use estimates::{Balance, ContactSolution, Determinacy};
 pub use unknowns::unknowns;
 
 use unknowns::contact_pose;
@@ -47,7 +47,7 @@ use crate::kinematics::{check_external, check_readings};
 use crate::least_squares::{LeastSquares, noise_factor, scale_factor};
 use crate::model::Model;
 use crate::spatial::{Mat3, Motion, Pose, Vec3, Wrench, stack};
-use crate::structure::{ContactKind, ContactSet, Route, SensorSet, Structure};
+use crate::structure::{ContactKind, ContactSet, Route, Structure};
 
 /// A value counts as determined if at most this fraction of it comes from the least-norm choice.
 const UNDETERMINED: f64 = 1e-9;
@@ -58,10 +58,10 @@ pub struct Solver {
     // Results.
     torque: Vec<f64>,
     torque_deviation: Vec<f64>,
-    torque_certainty: Vec<Certainty>,
-    contacts: Vec<ContactEstimate>,
+    torque_certainty: Vec<Determinacy>,
+    contacts: Vec<ContactSolution>,
     balances: Vec<Balance>,
-    // From `solve`, for `update_deviations` and `sides`, in base coordinates.
+    // From `solve`, for `update_deviations`, in base coordinates.
     /// The contacts that were present; `None` before the first solution.
     active: Option<ContactSet>,
     /// Per link: `F_j`, the net wrench of it and of the links below it in its sub-tree, minus the
@@ -81,6 +81,24 @@ pub struct Solver {
     starts: Vec<usize>,
 }
 
+/// What is solved.
+#[derive(Clone, Copy)]
+struct Given<'a> {
+    model: &'a Model,
+    structure: &'a Structure,
+    kinematics: &'a Kinematics,
+    active: &'a ContactSet,
+}
+
+/// How the part of a sub-tree's imbalance that no contact explains is distributed; a single full
+/// wrench leaves none.
+struct ResidualWeight {
+    /// The point about which the six equations are written.
+    point: Vec3,
+    /// `P`; none without sensors.
+    weight: Option<Matrix6<f64>>,
+}
+
 impl Solver {
     /// For a structure.
     pub fn new(structure: &Structure) -> Self {
@@ -89,8 +107,8 @@ impl Solver {
         Self {
             torque: vec![0.0; dofs],
             torque_deviation: vec![0.0; dofs],
-            torque_certainty: vec![Certainty::Assumed; dofs],
-            contacts: vec![ContactEstimate::ABSENT; contacts],
+            torque_certainty: vec![Determinacy::Assumed; dofs],
+            contacts: vec![ContactSolution::ABSENT; contacts],
             balances: vec![
                 Balance {
                     residual: Wrench::zero(),
@@ -117,7 +135,7 @@ impl Solver {
     /// absent; `external` wrenches are known.
     ///
     /// Every set of contacts has a solution: least squares with fewer unknowns than equations,
-    /// least norm with more. [`Certainty`] states which values depend on the least-norm choice.
+    /// least norm with more. [`Determinacy`] states which values depend on the least-norm choice.
     /// [`Balance`] has the part of the readings that no wrenches of the declared kinds explain.
     /// Results are finite unless a number overflows (beyond about 1e100).
     ///
@@ -174,9 +192,15 @@ impl Solver {
         }
         // Of several joints with one degree of freedom, the torques add up.
         self.torque.fill(0.0);
-        self.torque_certainty.fill(Certainty::Determined);
+        self.torque_certainty.fill(Determinacy::Determined);
+        let given = Given {
+            model,
+            structure,
+            kinematics,
+            active,
+        };
         for number in 0..structure.subtrees().len() {
-            self.solve_subtree(number, model, structure, kinematics, active);
+            self.solve_subtree(number, &given);
         }
         Ok(())
     }
@@ -213,58 +237,26 @@ impl Solver {
         )
     }
 
-    fn solve_subtree(
-        &mut self,
-        number: usize,
-        model: &Model,
-        structure: &Structure,
-        kinematics: &Kinematics,
-        active: &ContactSet,
-    ) {
+    fn solve_subtree(&mut self, number: usize, given: &Given<'_>) {
+        let Given {
+            model,
+            structure,
+            kinematics,
+            active,
+        } = *given;
         let subtree = &structure.subtrees()[number];
         let present = subtree.contacts.intersection(active);
         for contact in subtree.contacts.difference(active).iter() {
-            self.contacts[contact] = ContactEstimate::ABSENT;
+            self.contacts[contact] = ContactSolution::ABSENT;
             self.contact_rows[contact] = [Motion::zero(); 6];
         }
         let b = self.wrenches[subtree.top];
-        let single = match (present.iter().next(), present.len()) {
+        let residual = match (present.iter().next(), present.len()) {
             (Some(contact), 1) if structure.contacts()[contact].kind == ContactKind::Wrench => {
-                Some(contact)
+                self.solve_single(number, contact, given)
             }
-            _ => None,
+            _ => self.solve_unknowns(number, &present, given),
         };
-        // The weight of the residual, and the point about which the six equations are written; a
-        // single full wrench needs neither.
-        let mut unexplained = None;
-        let mut point = Vec3::zeros();
-        if let Some(contact) = single {
-            let spec = &structure.contacts()[contact];
-            let x_bf = contact_pose(spec, kinematics);
-            self.contacts[contact] = ContactEstimate {
-                wrench: x_bf.wrench_back(&b),
-                deviation: [0.0; 6],
-                certainty: Certainty::Determined,
-            };
-            for axis in 0..3 {
-                let direction = x_bf.rotation.column(axis).into_owned();
-                self.contact_rows[contact][axis] = Motion::translation(&direction);
-                self.contact_rows[contact][axis + 3] =
-                    Motion::rotation(&direction, &x_bf.translation);
-            }
-            self.balances[number] = Balance {
-                residual: Wrench::zero(),
-                chi_square: None,
-                degrees: 0,
-            };
-            if !subtree.sensors.is_empty() {
-                self.balances[number].chi_square = Some(0.0);
-            }
-        } else {
-            point = self.reference_point(structure, kinematics, &subtree.sensors, &present);
-            unexplained = self.solve_unknowns(number, structure, kinematics, &present, &point);
-        }
-
         for link in structure.links_of(number) {
             if link == subtree.top {
                 continue;
@@ -274,68 +266,100 @@ impl Solver {
                 continue;
             };
             let route = structure.route_above(link, active);
-            let mut certainty = Certainty::Determined;
-            let response = match route {
+            let (response, is_determined) = match route {
                 Route::Child => {
-                    if present.is_empty() && subtree.sensors.is_empty() {
-                        certainty = Certainty::Assumed;
-                    }
-                    Motion::zero()
+                    let is_unmeasured = present.is_empty() && subtree.sensors.is_empty();
+                    (Motion::zero(), !is_unmeasured)
                 }
-                Route::Parent => axis,
-                Route::Fused | Route::Whole => {
-                    let place = &structure.places[link];
-                    let about_point = Motion {
-                        angular: axis.angular,
-                        linear: axis.linear - point.cross(&axis.angular),
-                    };
-                    let s = stack(&about_point.angular, &about_point.linear);
-                    let mut h = Vector6::zeros();
-                    if let Some(weight) = &unexplained {
-                        let mut noise = Wrench::zero();
-                        for sensor in place.sensors_below.iter() {
-                            let x_bm = &self.sensor_poses[sensor];
-                            let scaled = structure.sensors()[sensor]
-                                .covariance_times(&x_bm.twist_back(&axis));
-                            noise += x_bm.wrench(&scaled);
-                        }
-                        let noise = noise.about(&point);
-                        h += weight * stack(&noise.torque, &noise.force);
-                    }
-                    if route == Route::Whole {
-                        let below = |j: usize| place.contacts_below.contains(self.owners[j]);
-                        for (j, column) in self.columns.iter().enumerate() {
-                            if below(j) {
-                                h += self.least.gain(j) * column.dot(&s);
-                            }
-                        }
-                        let gradient = |j: usize| {
-                            let column = &self.columns[j];
-                            if below(j) {
-                                (column.dot(&s), column.abs().dot(&s.abs()))
-                            } else {
-                                (0.0, 0.0)
-                            }
-                        };
-                        let balanced = self.least.rank() == 6 || unexplained.is_some();
-                        if !(balanced && self.least.determines(gradient, UNDETERMINED)) {
-                            certainty = Certainty::Assumed;
-                        }
-                    }
-                    about_origin(&h, &point)
-                }
+                Route::Parent => (axis, true),
+                Route::Fused => (
+                    self.response(structure, link, &axis, &residual, false).0,
+                    true,
+                ),
+                Route::Whole => self.response(structure, link, &axis, &residual, true),
             };
             self.torque[dof] += match route {
                 Route::Child => axis.dot(&self.wrenches[link]),
                 Route::Parent => axis.dot(&(self.wrenches[link] - b)),
                 _ => axis.dot(&self.wrenches[link]) - response.dot(&b),
             };
-            if certainty == Certainty::Assumed {
-                self.torque_certainty[dof] = certainty;
+            if !is_determined {
+                self.torque_certainty[dof] = Determinacy::Assumed;
             }
             self.axes[link] = axis;
             self.torque_rows[link] = response;
         }
+    }
+
+    /// One full unknown wrench: it is the imbalance, moved to the contact.
+    fn solve_single(&mut self, number: usize, contact: usize, given: &Given<'_>) -> ResidualWeight {
+        let subtree = &given.structure.subtrees()[number];
+        let x_bf = contact_pose(&given.structure.contacts()[contact], given.kinematics);
+        self.contacts[contact] = ContactSolution {
+            wrench: x_bf.wrench_back(&self.wrenches[subtree.top]),
+            deviation: [0.0; 6],
+            certainty: Determinacy::Determined,
+        };
+        for axis in 0..3 {
+            let direction = x_bf.rotation.column(axis).into_owned();
+            self.contact_rows[contact][axis] = Motion::translation(&direction);
+            self.contact_rows[contact][axis + 3] = Motion::rotation(&direction, &x_bf.translation);
+        }
+        self.balances[number] = Balance {
+            residual: Wrench::zero(),
+            chi_square: (!subtree.sensors.is_empty()).then_some(0.0),
+            degrees: 0,
+        };
+        ResidualWeight {
+            point: Vec3::zeros(),
+            weight: None,
+        }
+    }
+
+    /// `h_j` of the joint above a link from the residual and, if contacts are on both sides of it
+    /// (`is_whole`), from those below; and whether measurements determine the torque.
+    fn response(
+        &self,
+        structure: &Structure,
+        link: usize,
+        axis: &Motion,
+        ResidualWeight { point, weight }: &ResidualWeight,
+        is_whole: bool,
+    ) -> (Motion, bool) {
+        let place = &structure.places[link];
+        let about_point = axis.linear - point.cross(&axis.angular);
+        let s = stack(&axis.angular, &about_point);
+        let mut h = Vector6::zeros();
+        if let Some(weight) = weight {
+            let mut noise = Wrench::zero();
+            for sensor in place.sensors_below.iter() {
+                let x_bm = &self.sensor_poses[sensor];
+                let scaled = structure.sensors()[sensor].covariance_times(&x_bm.twist_back(axis));
+                noise += x_bm.wrench(&scaled);
+            }
+            let noise = noise.about(point);
+            h += weight * stack(&noise.torque, &noise.force);
+        }
+        let mut is_determined = true;
+        if is_whole {
+            let below = |j: usize| place.contacts_below.contains(self.owners[j]);
+            for (j, column) in self.columns.iter().enumerate() {
+                if below(j) {
+                    h += self.least.gain(j) * column.dot(&s);
+                }
+            }
+            let gradient = |j: usize| {
+                let column = &self.columns[j];
+                if below(j) {
+                    (column.dot(&s), column.abs().dot(&s.abs()))
+                } else {
+                    (0.0, 0.0)
+                }
+            };
+            let balanced = self.least.rank() == 6 || weight.is_some();
+            is_determined = balanced && self.least.determines(gradient, UNDETERMINED);
+        }
+        (about_origin(&h, point), is_determined)
     }
 
     /// Mean position of the sensors, or of the contacts if there is no sensor: near them the
@@ -364,17 +388,15 @@ impl Solver {
         }
     }
 
-    /// Solves any set of contacts: least squares of least norm. Returns the weight of the residual,
-    /// if there are sensors over which to distribute it.
-    fn solve_unknowns(
-        &mut self,
-        number: usize,
-        structure: &Structure,
-        kinematics: &Kinematics,
-        present: &ContactSet,
-        point: &Vec3,
-    ) -> Option<Matrix6<f64>> {
-        let subtree = &structure.subtrees()[number];
+    /// Writes the columns of the unknowns of the present contacts, and factorises them.
+    fn load_unknowns(&mut self, number: usize, present: &ContactSet, given: &Given<'_>) -> Vec3 {
+        let Given {
+            structure,
+            kinematics,
+            ..
+        } = *given;
+        let sensors = &structure.subtrees()[number].sensors;
+        let point = self.reference_point(structure, kinematics, sensors, present);
         let length = structure.length_scale;
         self.least.clear();
         self.columns.clear();
@@ -382,21 +404,40 @@ impl Solver {
         for contact in present.iter() {
             let spec = &structure.contacts()[contact];
             self.starts[contact] = self.columns.len();
-            for (column, weight) in unknowns(spec, kinematics, point, length) {
+            for (column, weight) in unknowns(spec, kinematics, &point, length) {
                 self.columns.push(column);
                 self.owners.push(contact);
                 self.least.push(column, weight);
             }
         }
-
-        let measured = !subtree.sensors.is_empty();
-        let lower = measured.then(|| noise_factor(self.noise(structure, number, point)));
         // Without sensors there is no covariance: the equations are weighted by the length scale,
         // about the contacts.
-        let lower = lower.unwrap_or_else(|| scale_factor(length));
+        let lower = if sensors.is_empty() {
+            scale_factor(length)
+        } else {
+            noise_factor(self.noise(structure, number, &point))
+        };
         self.least.factorise(&lower);
+        point
+    }
 
-        let b = self.wrenches[subtree.top].about(point);
+    /// Solves any set of contacts: least squares of least norm. The residual has a weight if there
+    /// are sensors over which to distribute it.
+    fn solve_unknowns(
+        &mut self,
+        number: usize,
+        present: &ContactSet,
+        given: &Given<'_>,
+    ) -> ResidualWeight {
+        let Given {
+            structure,
+            kinematics,
+            ..
+        } = *given;
+        let point = self.load_unknowns(number, present, given);
+        let subtree = &structure.subtrees()[number];
+        let measured = !subtree.sensors.is_empty();
+        let b = self.wrenches[subtree.top].about(&point);
         let b = stack(&b.torque, &b.force);
         let mut residual = b;
         for contact in present.iter() {
@@ -409,16 +450,8 @@ impl Solver {
             for i in 0..spec.kind.unknowns() {
                 let gain = self.least.gain(start + i);
                 residual -= self.columns[start + i] * gain.dot(&b);
-                determined &= self.least.determines(
-                    |j| {
-                        if j == start + i {
-                            (1.0, 1.0)
-                        } else {
-                            (0.0, 0.0)
-                        }
-                    },
-                    UNDETERMINED,
-                );
+                let one = |j| if j == start + i { 1.0 } else { 0.0 };
+                determined &= self.least.determines(|j| (one(j), one(j)), UNDETERMINED);
                 if let ContactKind::ForceAlong(direction) = spec.kind {
                     (0..3).for_each(|axis| rows[axis] = gain * direction[axis]);
                 } else {
@@ -433,19 +466,19 @@ impl Solver {
                 rows[axis + 3] += force[last] * p[next] - force[next] * p[last];
             }
             let value = rows.map(|row| row.dot(&b));
-            self.contacts[contact] = ContactEstimate {
+            self.contacts[contact] = ContactSolution {
                 wrench: Wrench::from_parts(
                     [value[0], value[1], value[2]],
                     [value[3], value[4], value[5]],
                 ),
                 deviation: [0.0; 6],
                 certainty: if determined {
-                    Certainty::Determined
+                    Determinacy::Determined
                 } else {
-                    Certainty::Assumed
+                    Determinacy::Assumed
                 },
             };
-            self.contact_rows[contact] = rows.map(|row| about_origin(&row, point));
+            self.contact_rows[contact] = rows.map(|row| about_origin(&row, &point));
         }
 
         let weight = self.least.unexplained();
@@ -463,7 +496,10 @@ impl Solver {
             chi_square,
             degrees: 6 - self.least.rank(),
         };
-        measured.then_some(weight)
+        ResidualWeight {
+            point,
+            weight: measured.then_some(weight),
+        }
     }
 
     /// Computes the standard deviations of torques and contact wrenches that F/T noise causes, for
@@ -533,49 +569,6 @@ impl Solver {
         })
     }
 
-    /// The torque of a degree of freedom from either side of its joint, in the last solution:
-    /// `s . F_j` and `s . (F_j - b)`, each with the standard deviation from F/T noise. Where
-    /// [`Route`] is `Child` or `Parent`, that side's torque equals [`Solver::torque`] to the last
-    /// bit. Where it is `Fused`, both sides exist and the torque is a weighted mean (see
-    /// [`Sides`]). Neither side exists before the first solution, or if there is no such degree of
-    /// freedom, or if several joints have it ([`crate::model::Joint::ratio`]).
-    ///
-    /// All cost is in the call. It does not need [`Solver::update_deviations`].
-    ///
-    /// # Errors
-    /// The structure is not the one that was solved.
-    pub fn sides(&self, structure: &Structure, dof: usize) -> Result<Sides, DynamicsError> {
-        self.check_structure(structure)?;
-        let (Some(active), &[link]) = (&self.active, structure.moved_by(dof)) else {
-            return Ok(Sides::default());
-        };
-        let place = &structure.places[link];
-        let subtree = &structure.subtrees()[place.subtree];
-        let (axis, below) = (&self.axes[link], self.wrenches[link]);
-        let side = |contacts: &ContactSet, sensors: SensorSet, wrench: Wrench| {
-            contacts
-                .intersection(active)
-                .is_empty()
-                .then(|| SideTorque {
-                    torque: axis.dot(&wrench),
-                    deviation: sensors
-                        .iter()
-                        .map(|sensor| variance(structure, sensor, &self.sensor_poses[sensor], axis))
-                        .sum::<f64>()
-                        .sqrt(),
-                    sensors,
-                })
-        };
-        Ok(Sides {
-            child: side(&place.contacts_below, place.sensors_below, below),
-            parent: side(
-                &subtree.contacts.difference(&place.contacts_below),
-                subtree.sensors.difference(&place.sensors_below),
-                below - self.wrenches[subtree.top],
-            ),
-        })
-    }
-
     /// `s_j` and `h_j` of the joint above a link in the last solution, in base coordinates:
     /// `tau_j = s_j . F_j - h_j . b` (see the top of this file). The torque of a degree of freedom
     /// is the sum over its joints; `s_j` includes the joint's ratio.
@@ -641,12 +634,12 @@ impl Solver {
     }
 
     /// The basis of each torque.
-    pub fn torque_certainty(&self) -> &[Certainty] {
+    pub fn torque_certainty(&self) -> &[Determinacy] {
         &self.torque_certainty
     }
 
     /// The contact estimates, in the order of the structure's contacts.
-    pub fn contacts(&self) -> &[ContactEstimate] {
+    pub fn contacts(&self) -> &[ContactSolution] {
         &self.contacts
     }
 

@@ -33,10 +33,7 @@
 //! **Gravity** is always part of the acceleration. Accelerations are *proper*: `a - g`, with `g`
 //! the physical gravity, pointing down. This is what an accelerometer reads; a link at rest has
 //! `-g`, upwards. (Eq. (9) and (10) of the paper add `I a_g`, which is correct with `a_g = -g`.)
-//! There is one exception, the bias of the equation of motion: [`crate::EquationOfMotion`] includes
-//! the weight in the bias if it is given gravity, and the acceleration of the base that goes with
-//! this bias is `a`, not `a - g`. Other functions that take gravity, for a base at rest, convert it
-//! to `-g` at once.
+//! Functions that take gravity, for a base at rest, convert it to `-g` at once.
 //!
 //! **Inertia.** `I` is about the link's *origin*, in link axes; `h = m c` is the first moment, `c`
 //! the centre of mass. The ten parameters are, in this order,
@@ -103,7 +100,7 @@
 //! | net wrench | [`RigidInertia::net_wrench`] | [3; 3] | link | origin of the link | Nm, N |
 //! | net wrenches | [`Kinematics`] | `L` of them | base | origin of the base | Nm, N |
 //! | joint torques | [`InverseDynamics`], [`Solver`] | n | joint axis | | Nm or N |
-//! | contact wrench | [`ContactEstimate`] | [3; 3] | contact's frame | its origin | Nm, N |
+//! | contact wrench | [`ContactSolution`] | [3; 3] | contact's frame | its origin | Nm, N |
 //! | F/T reading, offset | [`SensorCut`] | [3; 3] | measurement frame | its origin | Nm, N |
 //!
 //! Sources: Featherstone 2008, ch. 2 (pose), eq. 2.31 (twist, joint axis), eq. 2.32 (wrench) and
@@ -114,7 +111,6 @@
 //!
 //! | quantity | where | shape | axes | about | source |
 //! |---|---|---|---|---|---|
-//! | mass matrix, bias | [`EquationOfMotion`] | 6 + n square | base; joints | base | (3) |
 //! | regressor of a link | [`link_regressor`] | 6 x 10 | link | link | (8) to (10) |
 //! | regressor of the robot | [`Regressor`] | (6 + n) x 10 L | base; joints | base | (11), (12) |
 //! | identifiable basis `B` | [`Identifiable`] | columns x rank | | | (6), (7) |
@@ -126,9 +122,8 @@
 //! [`Kinematics`]: crate::Kinematics
 //! [`InverseDynamics`]: crate::InverseDynamics
 //! [`Solver`]: crate::Solver
-//! [`ContactEstimate`]: crate::ContactEstimate
+//! [`ContactSolution`]: crate::ContactSolution
 //! [`SensorCut`]: crate::SensorCut
-//! [`EquationOfMotion`]: crate::EquationOfMotion
 //! [`link_regressor`]: crate::regressor::link_regressor
 //! [`Regressor`]: crate::regressor::Regressor
 //! [`Identifiable`]: crate::regressor::identifiable::Identifiable
@@ -191,22 +186,6 @@ impl Motion {
     #[inline]
     pub fn dot(&self, wrench: &Wrench) -> f64 {
         self.angular.dot(&wrench.torque) + self.linear.dot(&wrench.force)
-    }
-
-    /// Cross product of motions, `self x other` (Featherstone 2008, eq. 2.31).
-    pub fn cross(&self, other: &Self) -> Self {
-        Self {
-            angular: self.angular.cross(&other.angular),
-            linear: self.angular.cross(&other.linear) + self.linear.cross(&other.angular),
-        }
-    }
-
-    /// Cross product with a wrench or a momentum, `self x* wrench` (Featherstone 2008, eq. 2.32).
-    pub fn cross_wrench(&self, wrench: &Wrench) -> Wrench {
-        Wrench {
-            torque: self.angular.cross(&wrench.torque) + self.linear.cross(&wrench.force),
-            force: self.angular.cross(&wrench.force),
-        }
     }
 }
 
@@ -560,6 +539,15 @@ mod tests {
         prop::array::uniform10(-2.0..2.0_f64).prop_map(|p| RigidInertia::from_parameters(&p))
     }
 
+    /// Momentum about the origin of a body that moves with `twist`.
+    fn momentum(body: &RigidInertia, twist: &Motion) -> Wrench {
+        let (h, Motion { angular, linear }) = (&body.first_moment, twist);
+        Wrench {
+            torque: body.inertia * angular + h.cross(linear),
+            force: linear * body.mass - h.cross(angular),
+        }
+    }
+
     fn close(a: &Wrench, b: &Wrench) -> bool {
         (a.torque - b.torque).norm() < 1e-12 * (1.0 + a.torque.norm())
             && (a.force - b.force).norm() < 1e-12 * (1.0 + a.force.norm())
@@ -608,31 +596,6 @@ mod tests {
             prop_assert!((x_ab.twist_back(&twist_a).linear - linear).norm() < 1e-12);
         }
 
-        /// The derivative of (motion . wrench) vanishes when both are carried along by a motion:
-        /// crm and crf are dual.
-        #[test]
-        fn cross_products_are_dual(
-            v in (vector(), vector()),
-            m in (vector(), vector()),
-            f in (vector(), vector()),
-        ) {
-            let (v, m) = (
-                Motion {
-                    angular: v.0,
-                    linear: v.1,
-                },
-                Motion {
-                    angular: m.0,
-                    linear: m.1,
-                },
-            );
-            let f = Wrench {
-                torque: f.0,
-                force: f.1,
-            };
-            prop_assert!((v.cross(&m).dot(&f) + m.dot(&v.cross_wrench(&f))).abs() < 1e-11);
-        }
-
         /// The net wrench from classical accelerations equals I a + v x* I v with spatial ones,
         /// a = [alpha; a_O - omega x v_O].
         #[test]
@@ -651,7 +614,12 @@ mod tests {
                 angular: alpha,
                 linear: a - omega.cross(&v),
             };
-            let expected = body.momentum(&spatial) + twist.cross_wrench(&body.momentum(&twist));
+            let p = momentum(&body, &twist);
+            let rate = Wrench {
+                torque: omega.cross(&p.torque) + v.cross(&p.force),
+                force: omega.cross(&p.force),
+            };
+            let expected = momentum(&body, &spatial) + rate;
             prop_assert!(close(&body.net_wrench(&omega, &alpha, &a), &expected));
         }
 
@@ -665,8 +633,8 @@ mod tests {
             linear in vector(),
         ) {
             let twist = Motion { angular, linear };
-            let in_a = body.transformed(&x_ab).momentum(&x_ab.twist(&twist));
-            let carried = x_ab.wrench(&body.momentum(&twist));
+            let in_a = momentum(&body.transformed(&x_ab), &x_ab.twist(&twist));
+            let carried = x_ab.wrench(&momentum(&body, &twist));
             prop_assert!(
                 (in_a.torque - carried.torque).norm() < 1e-11 * (1.0 + carried.torque.norm())
             );

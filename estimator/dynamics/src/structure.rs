@@ -243,7 +243,7 @@ pub enum Route {
     /// From the side of the parent: no unknown contact there.
     Parent,
     /// From both sides, the wrench of each weighted by its inverse covariance: neither has an
-    /// unknown contact, and both have sensors. (Separately: [`super::Solver::sides`].)
+    /// unknown contact, and both have sensors.
     Fused,
     /// From the solution of the whole sub-tree: unknown contacts on both sides.
     Whole,
@@ -335,88 +335,9 @@ impl Structure {
             }
             contact.place(index, &position, direction.as_ref())?;
         }
-
-        let mut places: Vec<LinkPlace> = (0..model.link_count())
-            .map(|link| LinkPlace {
-                parent: if link == 0 {
-                    0
-                } else {
-                    model.joints()[link - 1].parent
-                },
-                subtree: 0,
-                end: link + 1,
-                is_top: link == 0,
-                contacts_below: ContactSet::EMPTY,
-                sensors_below: SensorSet::EMPTY,
-            })
-            .collect();
-        for sensor in sensors {
-            let place = places
-                .get_mut(sensor.joint + 1)
-                .ok_or_else(|| StructureError::NoJoint(String::new()))?;
-            if std::mem::replace(&mut place.is_top, true) {
-                return Err(StructureError::TwoSensors(
-                    model.joint_name(sensor.joint).to_owned(),
-                ));
-            }
-        }
-        let mut subtrees = Vec::with_capacity(sensors.len() + 1);
-        for link in 0..places.len() {
-            if places[link].is_top {
-                places[link].subtree = subtrees.len();
-                subtrees.push(SubTree {
-                    top: link,
-                    sensors: SensorSet::EMPTY,
-                    contacts: ContactSet::EMPTY,
-                });
-            } else {
-                places[link].subtree = places[places[link].parent].subtree;
-            }
-        }
-        for (index, contact) in contacts.iter().enumerate() {
-            let place = &mut places[contact.frame.link];
-            place.contacts_below.insert(index);
-            subtrees[place.subtree].contacts.insert(index);
-        }
-        for (index, sensor) in sensors.iter().enumerate() {
-            // For the side of the child, the sensor is at the top of the sub-tree, above all of its
-            // joints; for the side of the parent it is below.
-            let child = sensor.joint + 1;
-            let parent = places[child].parent;
-            places[parent].sensors_below.insert(index);
-            for link in [child, parent] {
-                subtrees[places[link].subtree].sensors.insert(index);
-            }
-        }
-        for link in (1..places.len()).rev() {
-            let LinkPlace {
-                parent,
-                end,
-                is_top,
-                contacts_below,
-                sensors_below,
-                ..
-            } = places[link];
-            let above = &mut places[parent];
-            above.end = above.end.max(end);
-            if !is_top {
-                above.contacts_below = above.contacts_below.union(&contacts_below);
-                above.sensors_below = above.sensors_below.union(&sensors_below);
-            }
-        }
-        let mut dof_links: Vec<Vec<usize>> = (0..model.dof_count())
-            .filter_map(|dof| model.dof_joint(dof))
-            .map(|joint| vec![joint + 1])
-            .collect();
-        let mut link_dofs = vec![None; places.len()];
-        for joint in model.joints() {
-            link_dofs[joint.child] = joint.dof;
-            if let Some(links) = joint.dof.and_then(|dof| dof_links.get_mut(dof))
-                && !links.contains(&joint.child)
-            {
-                links.push(joint.child);
-            }
-        }
+        let mut places = cut_places(model, sensors)?;
+        let subtrees = subtrees(&mut places, sensors, &contacts);
+        let (dof_links, link_dofs) = moved_links(model);
         Ok(Self {
             sensors: sensors.to_vec(),
             contacts,
@@ -652,6 +573,100 @@ impl Structure {
         let top = self.subtrees[subtree].top;
         (top..self.places[top].end).filter(move |&link| self.places[link].subtree == subtree)
     }
+}
+
+/// The place of every link, with the cuts at the sensors.
+fn cut_places(model: &Model, sensors: &[SensorCut]) -> Result<Vec<LinkPlace>, StructureError> {
+    let parent = |link: usize| {
+        link.checked_sub(1)
+            .map_or(0, |joint| model.joints()[joint].parent)
+    };
+    let mut places: Vec<LinkPlace> = (0..model.link_count())
+        .map(|link| LinkPlace {
+            parent: parent(link),
+            subtree: 0,
+            end: link + 1,
+            is_top: link == 0,
+            contacts_below: ContactSet::EMPTY,
+            sensors_below: SensorSet::EMPTY,
+        })
+        .collect();
+    for sensor in sensors {
+        let place = places
+            .get_mut(sensor.joint + 1)
+            .ok_or_else(|| StructureError::NoJoint(String::new()))?;
+        if std::mem::replace(&mut place.is_top, true) {
+            return Err(StructureError::TwoSensors(
+                model.joint_name(sensor.joint).to_owned(),
+            ));
+        }
+    }
+    Ok(places)
+}
+
+/// The sub-trees, and what is below each link in its sub-tree.
+fn subtrees(
+    places: &mut [LinkPlace],
+    sensors: &[SensorCut],
+    contacts: &[ContactSpec],
+) -> Vec<SubTree> {
+    let mut subtrees = Vec::with_capacity(sensors.len() + 1);
+    for link in 0..places.len() {
+        if places[link].is_top {
+            places[link].subtree = subtrees.len();
+            subtrees.push(SubTree {
+                top: link,
+                sensors: SensorSet::EMPTY,
+                contacts: ContactSet::EMPTY,
+            });
+        } else {
+            places[link].subtree = places[places[link].parent].subtree;
+        }
+    }
+    for (index, contact) in contacts.iter().enumerate() {
+        let place = &mut places[contact.frame.link];
+        place.contacts_below.insert(index);
+        subtrees[place.subtree].contacts.insert(index);
+    }
+    for (index, sensor) in sensors.iter().enumerate() {
+        // For the side of the child, the sensor is at the top of the sub-tree, above all of its
+        // joints; for the side of the parent it is below.
+        let child = sensor.joint + 1;
+        let parent = places[child].parent;
+        places[parent].sensors_below.insert(index);
+        for link in [child, parent] {
+            subtrees[places[link].subtree].sensors.insert(index);
+        }
+    }
+    for link in (1..places.len()).rev() {
+        let below = places[link];
+        let above = &mut places[below.parent];
+        above.end = above.end.max(below.end);
+        if !below.is_top {
+            above.contacts_below = above.contacts_below.union(&below.contacts_below);
+            above.sensors_below = above.sensors_below.union(&below.sensors_below);
+        }
+    }
+    subtrees
+}
+
+/// Per degree of freedom, the links that it moves: first that of the joint with its name. Per link,
+/// the degree of freedom of the joint above it.
+fn moved_links(model: &Model) -> (Vec<Vec<usize>>, Vec<Option<usize>>) {
+    let mut dof_links: Vec<Vec<usize>> = (0..model.dof_count())
+        .filter_map(|dof| model.dof_joint(dof))
+        .map(|joint| vec![joint + 1])
+        .collect();
+    let mut link_dofs = vec![None; model.link_count()];
+    for joint in model.joints() {
+        link_dofs[joint.child] = joint.dof;
+        if let Some(links) = joint.dof.and_then(|dof| dof_links.get_mut(dof))
+            && !links.contains(&joint.child)
+        {
+            links.push(joint.child);
+        }
+    }
+    (dof_links, link_dofs)
 }
 
 /// Why a structure cannot be built.

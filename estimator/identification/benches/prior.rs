@@ -8,7 +8,9 @@
 use divan::{Bencher, black_box};
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::model::Model;
-use proprio_dynamics::regressor::identifiable::{Identifiable, Measured, Offsets, Regime, Scope};
+use proprio_dynamics::regressor::identifiable::{
+    Identifiable, Measurement, Offsets, Regime, Scope,
+};
 use proprio_identification::prior::{Posterior, Prior};
 
 fn main() {
@@ -45,7 +47,7 @@ fn case(count: usize) -> Case {
         &model,
         Scope::Tree,
         &Regime::free(&model),
-        Measured::Wrench,
+        Measurement::Wrench,
         Offsets::Known,
     )
     .expect("a basis");

@@ -20,7 +20,7 @@ use nalgebra::DMatrix;
 use proprio_dynamics::DynamicsError;
 use proprio_dynamics::calibration::{Gain, Kind};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
-use proprio_dynamics::regressor::identifiable::Column;
+use proprio_dynamics::regressor::identifiable::ParameterColumn;
 use std::f64::consts::SQRT_2;
 
 /// The noise of an F/T sensor at each of the hundred readings per second that identification uses
@@ -195,7 +195,7 @@ fn with_known(
     let unknowns = measurement.unknowns();
     let mut columns = Vec::new();
     for (row, column) in known.columns.iter().enumerate() {
-        if let Column::Inertial { link, parameter } = *column
+        if let ParameterColumn::Inertial { link, parameter } = *column
             && let Ok(place) = unknowns.links.binary_search(&link)
         {
             columns.push((row, LINK_PARAMETERS * place + parameter));

@@ -333,10 +333,7 @@ impl Robot {
     /// stand on the first.
     #[must_use]
     pub fn regime(&self) -> Regime {
-        let fixed = |motion: &FrameMotion| BaseRegime::Restricted {
-            gravity: -motion.proper_acceleration,
-            joints: Vec::new(),
-        };
+        let fixed = |motion: &FrameMotion| BaseRegime::Fixed(-motion.proper_acceleration);
         let motion = match &self.base {
             BaseMotion::Standing(motion) => fixed(motion),
             BaseMotion::Stance(stances) => stances

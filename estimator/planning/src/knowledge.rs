@@ -18,7 +18,8 @@ use proprio_dynamics::DynamicsError;
 use proprio_dynamics::calibration::UNKNOWN_OFFSET;
 use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::regressor::identifiable::{
-    BaseParameter, BaseRegime, Column, Identifiable, JointMotion, Measured, Offsets, Regime, Scope,
+    BaseParameter, BaseRegime, Identifiable, JointMotion, Measurement, Offsets, ParameterColumn,
+    Regime, Scope,
 };
 use proprio_dynamics::spatial::Vec3;
 use proprio_identification::forecast::{Forecast, ForecastError, SensorNoise};
@@ -80,10 +81,7 @@ pub fn only(robot: &Robot, moving: &[usize]) -> Regime {
     let mut regime = regime(robot);
     if regime.motion == BaseRegime::Free {
         let gravity = Vec3::from(UPRIGHT);
-        regime.motion = BaseRegime::Restricted {
-            gravity,
-            joints: Vec::new(),
-        };
+        regime.motion = BaseRegime::Fixed(gravity);
         regime.base = 0;
     }
     for (dof, motion) in regime.joints.iter_mut().enumerate() {
@@ -101,7 +99,7 @@ fn identifiable(robot: &Robot, regime: &Regime) -> Result<Identifiable, Dynamics
         &robot.model,
         scope,
         regime,
-        Measured::Wrench,
+        Measurement::Wrench,
         Offsets::Unknown,
     )
 }
@@ -136,7 +134,7 @@ fn remaining(robot: &Robot, subspace: &Identifiable) -> CovarianceRoot {
         weighted.rows_mut(first, LINK_PARAMETERS).copy_from(&own);
     }
     for (row, column) in columns.iter().enumerate() {
-        if let Column::Offset { sensor, component } = *column {
+        if let ParameterColumn::Offset { sensor, component } = *column {
             let configured = robot.offsets[sensor].1[component];
             let is_free = subspace.basis().row(row).norm() < ROUNDING;
             let deviation = if is_free {

@@ -7,11 +7,11 @@ use fastrand::Rng;
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::calibration::Unknown;
 use proprio_dynamics::model::{Limits, Model};
-use proprio_dynamics::regressor::identifiable::Column;
+use proprio_dynamics::regressor::identifiable::ParameterColumn;
 use proprio_dynamics::regressor::{EstimateRows, LINK_PARAMETERS};
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{
-    Certainty, ContactKind, DynamicsError, FrameMotion, InverseDynamics, JointState, Kinematics,
+    ContactKind, Determinacy, DynamicsError, FrameMotion, InverseDynamics, JointState, Kinematics,
     Solver,
 };
 use proprio_identification::dataset::observation::Observation;
@@ -215,24 +215,21 @@ impl Workspace {
             .map(|dof| (dof, Some(DMatrix::zeros(count, columns))))
             .collect();
         let mut readings = Vec::new();
-        let mut stacked = vec![0.0; columns];
+        let mut row = vec![0.0; columns];
         for (number, state) in states(robot, count).iter().enumerate() {
             let seen = puppet.observe(Nanos::ZERO, state)?;
             let (kinematics, active) = (puppet.kinematics(), &seen.active);
             solver.solve(model, structure, kinematics, &seen.readings, active, &[])?;
             let rows = EstimateRows::new(structure, &solver, kinematics)?;
             for (dof, torque) in &mut torques {
-                let subtree = rows.torque_subtree(*dof);
-                let is_assumed = solver.torque_certainty()[*dof] == Certainty::Assumed;
-                let (Some(subtree), Some(matrix), false) = (subtree, torque.as_mut(), is_assumed)
-                else {
+                let is_determined = rows.torque_subtree(*dof).is_some()
+                    && solver.torque_certainty()[*dof] != Determinacy::Assumed;
+                let (Some(matrix), true) = (torque.as_mut(), is_determined) else {
                     *torque = None;
                     continue;
                 };
-                let mut row = vec![0.0; rows.column_count(subtree).unwrap_or_default()];
                 rows.torque_row(*dof, &mut row)?;
-                rows.expand(subtree, &row, &mut stacked)?;
-                matrix.row_mut(number).copy_from_slice(&stacked);
+                matrix.row_mut(number).copy_from_slice(&row);
             }
             readings.push(seen.readings);
         }
@@ -255,13 +252,13 @@ impl Workspace {
     pub fn in_columns(
         &self,
         robot: &Robot,
-        columns: &[Column],
+        columns: &[ParameterColumn],
         calibrations: &[(usize, Unknown)],
     ) -> Rows {
         let of_offset = |sensor: usize| LINK_PARAMETERS * self.links + 6 * sensor;
-        let place = |column: &Column| match *column {
-            Column::Inertial { link, parameter } => LINK_PARAMETERS * link + parameter,
-            Column::Offset { sensor, component } => of_offset(sensor) + component,
+        let place = |column: &ParameterColumn| match *column {
+            ParameterColumn::Inertial { link, parameter } => LINK_PARAMETERS * link + parameter,
+            ParameterColumn::Offset { sensor, component } => of_offset(sensor) + component,
         };
         let places: Vec<usize> = columns.iter().map(place).collect();
         let is_in = |column: usize| places.contains(&column);

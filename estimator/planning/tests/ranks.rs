@@ -8,7 +8,7 @@ use nalgebra::DMatrix;
 use proprio_dynamics::model::{MeasurementDirection, MeasurementFrame, Model};
 use proprio_dynamics::regressor::StackedRegressor;
 use proprio_dynamics::regressor::identifiable::{
-    BaseRegime, Identifiable, Measured, Offsets, Regime, Scope,
+    BaseRegime, Identifiable, Measurement, Offsets, Regime, Scope,
 };
 use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
 use proprio_dynamics::{
@@ -106,14 +106,17 @@ fn compare(urdf: &Path, sensors: &[&str], rng: &mut Rng) -> Option<String> {
     for is_free in [false, true] {
         let mut regime = Regime::free(&model);
         if !is_free {
-            regime.motion = BaseRegime::Restricted {
-                gravity: Vec3::new(0.0, 0.0, -9.81),
-                joints: Vec::new(),
-            };
+            regime.motion = BaseRegime::Fixed(Vec3::new(0.0, 0.0, -9.81));
         }
         let scope = Scope::SubTrees(&structure);
-        let closed =
-            Identifiable::new(&model, scope, &regime, Measured::Wrench, Offsets::Unknown).unwrap();
+        let closed = Identifiable::new(
+            &model,
+            scope,
+            &regime,
+            Measurement::Wrench,
+            Offsets::Unknown,
+        )
+        .unwrap();
         let (rank, gap) = sampled(&model, &structure, is_free, rng);
         assert_eq!(
             closed.rank(),

@@ -9,7 +9,7 @@ use super::steps::StepCover;
 use super::validity::{Dependences, ValidityCheck, first_fault};
 use crate::setup::Setup;
 use crate::uncertainty::{Solution, Uncertainty};
-use proprio_dynamics::{Certainty, ContactSet, Dependence, DofSet, SensorSet, Solver};
+use proprio_dynamics::{Determinacy, ContactSet, Dependence, DofSet, SensorSet, Solver};
 use proprio_identification::online::Doubt;
 use proprio_identification::robot::ChannelRole;
 use proprio_topics::{ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Nanos, Reason, Residual};
@@ -248,7 +248,7 @@ impl Judge<'_> {
         if reason != Reason::None {
             return (reason, cause);
         }
-        if self.solver.torque_certainty().get(dof) == Some(&Certainty::Assumed) {
+        if self.solver.torque_certainty().get(dof) == Some(&Determinacy::Assumed) {
             return (Reason::Undetermined, cause);
         }
         if let Some(leading) = self.doubts(dof).and_then(|doubt| doubt.leading.as_ref()) {
@@ -319,8 +319,8 @@ impl Judge<'_> {
         let is_known = is_detected || active.contains(contact);
         match result.certainty {
             _ if !is_known => (reason, cause) = (Reason::Absent, NO_CAUSE),
-            Certainty::Absent => (reason, cause) = (Reason::Absent, NO_CAUSE),
-            Certainty::Assumed if reason == Reason::None => reason = Reason::Undetermined,
+            Determinacy::Absent => (reason, cause) = (Reason::Absent, NO_CAUSE),
+            Determinacy::Assumed if reason == Reason::None => reason = Reason::Undetermined,
             _ => {}
         }
         let wrench = result.wrench.force_first();

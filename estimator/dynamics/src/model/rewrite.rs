@@ -20,7 +20,7 @@ use std::ops::Range;
 
 use nalgebra::Matrix4;
 
-use super::xml::Node;
+use super::xml::ElementRef;
 use super::{Model, ModelError, urdf};
 use crate::spatial::{Mat3, Pose, RigidInertia};
 
@@ -28,7 +28,7 @@ use crate::spatial::{Mat3, Pose, RigidInertia};
 const FLAT: f64 = 1e-6;
 
 /// A URDF link that belongs to a body.
-struct Share<'a> {
+struct Portion<'a> {
     name: &'a str,
     pose: Pose,
     /// In the body's frame.
@@ -61,10 +61,10 @@ pub(super) fn rewrite(
     }
     let document = urdf::parse(text)?;
     let raw = urdf::link_inertias(&document)?;
-    let mut bodies: Vec<Vec<Share<'_>>> = before.iter().map(|_| Vec::new()).collect();
+    let mut bodies: Vec<Vec<Portion<'_>>> = before.iter().map(|_| Vec::new()).collect();
     for (name, inertia) in &raw {
         if let Some(frame) = model.frame(name) {
-            bodies[frame.link].push(Share {
+            bodies[frame.link].push(Portion {
                 name,
                 pose: frame.pose,
                 old: inertia.transformed(&frame.pose),
@@ -121,12 +121,12 @@ pub(super) fn rewrite(
 /// The new inertia of each share, in the body's frame; `None` where the link loses its
 /// `<inertial>`.
 fn distribute(
-    shares: &[Share<'_>],
+    shares: &[Portion<'_>],
     top: &str,
     old: &RigidInertia,
     new: &RigidInertia,
 ) -> Vec<Option<RigidInertia>> {
-    let nothing = |share: &Share<'_>| share.old == RigidInertia::zero();
+    let nothing = |share: &Portion<'_>| share.old == RigidInertia::zero();
     let heaviest = || {
         let massive = (0..shares.len()).filter(|&i| shares[i].old.mass > 0.0);
         massive.max_by(|&a, &b| shares[a].old.mass.total_cmp(&shares[b].old.mass))
@@ -145,7 +145,7 @@ fn distribute(
         .iter()
         .enumerate()
         .all(|(i, share)| i == main || nothing(share));
-    let exists = |share: &Share<'_>| nothing(share) || share.old.check(1e-9).is_ok();
+    let exists = |share: &Portion<'_>| nothing(share) || share.old.check(1e-9).is_ok();
     let map = carrying(old, new).filter(|_| !alone && shares.iter().all(exists));
     // The remainder after the other shares, so that the sum is correct to the last digit.
     let mut rest = *new;
@@ -200,7 +200,7 @@ fn scaled(inertia: &RigidInertia, factor: f64) -> RigidInertia {
 /// The replacement in a link's text. The first `<inertial>` counts, as everywhere.
 fn patch(
     text: &str,
-    node: Node<'_>,
+    node: ElementRef<'_>,
     inertia: Option<&RigidInertia>,
     patches: &mut Vec<(Range<usize>, String)>,
 ) {

@@ -14,9 +14,9 @@ use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
 use self::elements::{check_expanded, numbers, once, part, place, read_sensors, required};
-use super::xml::{self, Document, Node, XmlError};
+use super::xml::{self, Document, ElementRef, XmlError};
 use super::{
-    Axis, AxisKind, Frame, Joint, JointFacts, JointKind, Limits, MeasurementDirection,
+    AxisKind, Frame, Joint, JointAxis, JointFacts, JointKind, Limits, MeasurementDirection,
     MeasurementFrame, Model, ModelError, POINT, SensorElement, Unread,
 };
 use crate::spatial::{Mat3, Pose, RigidInertia, Vec3};
@@ -26,8 +26,8 @@ use crate::spatial::{Mat3, Pose, RigidInertia, Vec3};
 const INERTIA_TOLERANCE: f64 = 1e-5;
 
 /// A link of the URDF, before folding.
-struct RawLink<'d> {
-    node: Node<'d>,
+struct UrdfLink<'d> {
+    node: ElementRef<'d>,
     name: &'d str,
     inertia: RigidInertia,
     has_inertial: bool,
@@ -37,8 +37,8 @@ struct RawLink<'d> {
 }
 
 /// A joint of the URDF, before folding.
-struct RawJoint<'d> {
-    node: Node<'d>,
+struct UrdfJoint<'d> {
+    node: ElementRef<'d>,
     name: &'d str,
     /// None if it is `floating` or `planar`.
     kind: Option<JointKind>,
@@ -63,7 +63,7 @@ pub(super) fn read(text: &str, keep: &[&str]) -> Result<Model, ModelError> {
     let tree = Tree::build(&links, &joints, &mut warnings)?;
     check_kept(keep, &joints, &sensors)?;
     let coordinates = Coordinates::of(&mut joints, &mut warnings)?;
-    Folder {
+    Folding {
         links: &links,
         joints: &joints,
         keep: keep.iter().copied().collect(),
@@ -83,7 +83,7 @@ pub(super) fn parse(text: &str) -> Result<Document<'_>, ModelError> {
 }
 
 /// The `<robot>` of a document.
-pub(super) fn robot<'d>(document: &'d Document<'_>) -> Result<Node<'d>, ModelError> {
+pub(super) fn robot<'d>(document: &'d Document<'_>) -> Result<ElementRef<'d>, ModelError> {
     let root = document.root("robot");
     if root.name() == "robot" {
         check_expanded(root)?;
@@ -110,7 +110,7 @@ pub(super) fn link_inertias<'d>(
 // ---------------------------------------------------------------- links and joints
 
 /// The pose that an element's `<origin>` gives.
-fn origin(node: Node<'_>, owner: Node<'_>) -> Result<Pose, ModelError> {
+fn origin(node: ElementRef<'_>, owner: ElementRef<'_>) -> Result<Pose, ModelError> {
     let Some(origin) = node.child("origin") else {
         return Ok(Pose::identity());
     };
@@ -120,10 +120,10 @@ fn origin(node: Node<'_>, owner: Node<'_>) -> Result<Pose, ModelError> {
 
 /// The name of a link or a joint, which must be the first of its name.
 fn name<'d>(
-    node: Node<'d>,
+    node: ElementRef<'d>,
     kind: &'static str,
     seen: &mut HashMap<&'d str, usize>,
-    nodes: impl Fn(usize) -> Node<'d>,
+    nodes: impl Fn(usize) -> ElementRef<'d>,
 ) -> Result<&'d str, ModelError> {
     let name = required(
         node,
@@ -142,14 +142,14 @@ fn name<'d>(
 }
 
 fn read_links<'d>(
-    robot: Node<'d>,
+    robot: ElementRef<'d>,
     warnings: &mut Vec<String>,
-) -> Result<(Vec<RawLink<'d>>, HashMap<&'d str, usize>), ModelError> {
-    let mut links: Vec<RawLink<'_>> = Vec::new();
+) -> Result<(Vec<UrdfLink<'d>>, HashMap<&'d str, usize>), ModelError> {
+    let mut links: Vec<UrdfLink<'_>> = Vec::new();
     let mut numbers = HashMap::new();
     for node in robot.children().filter(|node| node.name() == "link") {
         let name = name(node, "link", &mut numbers, |first| links[first].node)?;
-        let mut link = RawLink {
+        let mut link = UrdfLink {
             node,
             name,
             inertia: RigidInertia::zero(),
@@ -170,8 +170,8 @@ fn read_links<'d>(
 }
 
 fn read_inertia(
-    link: &mut RawLink<'_>,
-    inertial: Node<'_>,
+    link: &mut UrdfLink<'_>,
+    inertial: ElementRef<'_>,
     warnings: &mut Vec<String>,
 ) -> Result<(), ModelError> {
     let (owner, name) = (link.node, link.name);
@@ -179,7 +179,7 @@ fn read_inertia(
     let mass = part(inertial, owner, "<mass>", "add <mass value=\"...\"/> in kg")?;
     let remedy = "add <inertia ixx=\"...\" .../> about the centre of mass, in kg m^2";
     let tensor = part(inertial, owner, "<inertia>", remedy)?;
-    let number = |node: Node<'_>, attribute, remedy| {
+    let number = |node: ElementRef<'_>, attribute, remedy| {
         required(node, owner, attribute, remedy)?;
         numbers(node, owner, attribute).map(|one| one.map_or(0.0, |[number]| number))
     };
@@ -219,11 +219,11 @@ fn read_inertia(
 }
 
 fn read_joints<'d>(
-    robot: Node<'d>,
+    robot: ElementRef<'d>,
     links: &HashMap<&'d str, usize>,
     warnings: &mut Vec<String>,
-) -> Result<Vec<RawJoint<'d>>, ModelError> {
-    let mut joints: Vec<RawJoint<'_>> = Vec::new();
+) -> Result<Vec<UrdfJoint<'d>>, ModelError> {
+    let mut joints: Vec<UrdfJoint<'_>> = Vec::new();
     let mut seen = HashMap::new();
     for node in robot.children().filter(|node| node.name() == "joint") {
         let name = name(node, "joint", &mut seen, |first| joints[first].node)?;
@@ -248,10 +248,10 @@ fn is_moving(kind: Option<&JointKind>) -> bool {
 }
 
 fn read_joint<'d>(
-    node: Node<'d>,
+    node: ElementRef<'d>,
     name: &'d str,
     links: &HashMap<&'d str, usize>,
-) -> Result<RawJoint<'d>, ModelError> {
+) -> Result<UrdfJoint<'d>, ModelError> {
     let types = "write type=\"revolute\", \"continuous\", \"prismatic\" or \"fixed\"";
     let word = required(node, node, "type", types)?;
     let link = |role, tag, remedy| {
@@ -273,22 +273,9 @@ fn read_joint<'d>(
     };
     let parent = link("parent", "<parent>", "add <parent link=\"...\"/>")?;
     let child = link("child", "<child>", "add <child link=\"...\"/>")?;
-    let axis = || {
-        let Some(axis) = node.child("axis") else {
-            let x = AxisKind::X(1.0);
-            return Ok(Axis {
-                vector: Vec3::x(),
-                kind: x,
-            });
-        };
-        let remedy = "write its direction, such as xyz=\"0 0 1\"";
-        required(axis, node, "xyz", remedy)?;
-        let direction = numbers(axis, node, "xyz")?.unwrap_or_default();
-        Axis::new(Vec3::from(direction)).ok_or_else(|| ModelError::ZeroAxis(place(axis, node)))
-    };
     let kind = match word {
-        "revolute" | "continuous" => Some(JointKind::Revolute(axis()?)),
-        "prismatic" => Some(JointKind::Prismatic(axis()?)),
+        "revolute" | "continuous" => Some(JointKind::Revolute(axis(node)?)),
+        "prismatic" => Some(JointKind::Prismatic(axis(node)?)),
         "fixed" => Some(JointKind::Fixed),
         "floating" | "planar" => None,
         _ => {
@@ -317,17 +304,8 @@ fn read_joint<'d>(
     });
     // An infinite limit means no limit.
     let limits = limits.filter(|limits| (limits.upper - limits.lower).is_finite());
-    let mimic = match node.child("mimic").filter(|_| moves) {
-        None => None,
-        Some(mimic) => {
-            let remedy = "write joint=\"...\", the joint that it follows";
-            let follows = required(mimic, node, "joint", remedy)?;
-            let [multiplier] = numbers(mimic, node, "multiplier")?.unwrap_or([1.0]);
-            let [offset] = numbers(mimic, node, "offset")?.unwrap_or([0.0]);
-            Some((follows, multiplier, offset))
-        }
-    };
-    Ok(RawJoint {
+    let mimic = if moves { mimic(node)? } else { None };
+    Ok(UrdfJoint {
         node,
         name,
         kind,
@@ -339,6 +317,32 @@ fn read_joint<'d>(
         velocity: positive(velocity),
         mimic,
     })
+}
+
+/// The direction of a joint's `<axis>`, x without one.
+fn axis(node: ElementRef<'_>) -> Result<JointAxis, ModelError> {
+    let Some(axis) = node.child("axis") else {
+        return Ok(JointAxis {
+            vector: Vec3::x(),
+            kind: AxisKind::X(1.0),
+        });
+    };
+    let remedy = "write its direction, such as xyz=\"0 0 1\"";
+    required(axis, node, "xyz", remedy)?;
+    let direction = numbers(axis, node, "xyz")?.unwrap_or_default();
+    JointAxis::new(Vec3::from(direction)).ok_or_else(|| ModelError::ZeroAxis(place(axis, node)))
+}
+
+/// The joint that a joint follows, with multiplier and offset.
+fn mimic(node: ElementRef<'_>) -> Result<Option<(&str, f64, f64)>, ModelError> {
+    let Some(mimic) = node.child("mimic") else {
+        return Ok(None);
+    };
+    let remedy = "write joint=\"...\", the joint that it follows";
+    let follows = required(mimic, node, "joint", remedy)?;
+    let [multiplier] = numbers(mimic, node, "multiplier")?.unwrap_or([1.0]);
+    let [offset] = numbers(mimic, node, "offset")?.unwrap_or([0.0]);
+    Ok(Some((follows, multiplier, offset)))
 }
 
 /// The pose of a joint's child in the joint's parent, with the joint at a position.
@@ -366,8 +370,8 @@ struct Tree {
 
 impl Tree {
     fn build(
-        links: &[RawLink<'_>],
-        joints: &[RawJoint<'_>],
+        links: &[UrdfLink<'_>],
+        joints: &[UrdfJoint<'_>],
         warnings: &mut Vec<String>,
     ) -> Result<Self, ModelError> {
         let mut above: Vec<Option<usize>> = vec![None; links.len()];
@@ -388,7 +392,7 @@ impl Tree {
             .collect();
         if roots.len() > 1 {
             let name = |&link: &usize| {
-                let RawLink { node, name, .. } = &links[link];
+                let UrdfLink { node, name, .. } = &links[link];
                 format!("{name} (line {})", node.line())
             };
             return Err(ModelError::SeveralRoots(roots.iter().map(name).collect()));
@@ -420,8 +424,8 @@ impl Tree {
     /// frames: massless, without other joints.
     fn drop_floating_base(
         &mut self,
-        links: &[RawLink<'_>],
-        joints: &[RawJoint<'_>],
+        links: &[UrdfLink<'_>],
+        joints: &[UrdfJoint<'_>],
         warnings: &mut Vec<String>,
     ) -> Result<(), ModelError> {
         let (mut link, mut above) = (self.root, HashSet::new());
@@ -441,7 +445,7 @@ impl Tree {
                 self.dropped.extend(above.iter().copied());
             }
         }
-        let is_robot = |joint: &&RawJoint<'_>| !self.dropped.contains(&joint.parent);
+        let is_robot = |joint: &&UrdfJoint<'_>| !self.dropped.contains(&joint.parent);
         match (joints.iter().filter(is_robot)).find(|joint| joint.kind.is_none()) {
             None => Ok(()),
             Some(joint) => Err(ModelError::UnsupportedJoint {
@@ -454,7 +458,7 @@ impl Tree {
 
 fn check_kept(
     keep: &[&str],
-    joints: &[RawJoint<'_>],
+    joints: &[UrdfJoint<'_>],
     sensors: &[SensorElement],
 ) -> Result<(), ModelError> {
     for &name in keep {
@@ -464,7 +468,7 @@ fn check_kept(
         let (mut some, others): (Vec<_>, Vec<_>) =
             (joints.iter()).partition(|joint| joint.kind == Some(JointKind::Fixed));
         some.extend(others.into_iter().filter(|joint| joint.kind.is_some()));
-        let described = |joint: &&RawJoint<'_>| sensors.iter().any(|s| s.joint == joint.name);
+        let described = |joint: &&UrdfJoint<'_>| sensors.iter().any(|s| s.joint == joint.name);
         if some.iter().any(described) {
             some.retain(described);
         } else {
@@ -493,7 +497,7 @@ impl Coordinates {
     /// Degrees of freedom are numbered in the order of the file. A joint with a `<mimic>` has the
     /// one of the joint that it follows, if necessary through others. One that follows a fixed
     /// joint is made fixed where that holds it.
-    fn of(joints: &mut [RawJoint<'_>], warnings: &mut Vec<String>) -> Result<Self, ModelError> {
+    fn of(joints: &mut [UrdfJoint<'_>], warnings: &mut Vec<String>) -> Result<Self, ModelError> {
         let names: HashSet<&str> = joints.iter().map(|joint| joint.name).collect();
         for joint in joints.iter_mut() {
             if let Some((leader, ..)) = joint.mimic.filter(|(leader, ..)| !names.contains(leader)) {
@@ -522,9 +526,9 @@ impl Coordinates {
     }
 
     /// The same without changing the joints.
-    fn resolve(joints: &[RawJoint<'_>]) -> Result<Self, ModelError> {
-        let moves = |joint: &RawJoint<'_>| is_moving(joint.kind.as_ref());
-        let leads = |joint: &RawJoint<'_>| moves(joint) && joint.mimic.is_none();
+    fn resolve(joints: &[UrdfJoint<'_>]) -> Result<Self, ModelError> {
+        let moves = |joint: &UrdfJoint<'_>| is_moving(joint.kind.as_ref());
+        let leads = |joint: &UrdfJoint<'_>| moves(joint) && joint.mimic.is_none();
         let leaders: Vec<usize> = (0..joints.len()).filter(|&j| leads(&joints[j])).collect();
         let numbers: HashMap<&str, usize> =
             joints.iter().map(|j| j.name).zip(0..joints.len()).collect();
@@ -582,14 +586,24 @@ impl Coordinates {
 // ---------------------------------------------------------------- folding
 
 /// Folds fixed joints and numbers the remaining bodies and joints.
-struct Folder<'a, 'd> {
-    links: &'a [RawLink<'d>],
-    joints: &'a [RawJoint<'d>],
+struct Folding<'a, 'd> {
+    links: &'a [UrdfLink<'d>],
+    joints: &'a [UrdfJoint<'d>],
     keep: HashSet<&'a str>,
     coordinates: Coordinates,
 }
 
-impl Folder<'_, '_> {
+/// Links that are fixed together.
+struct Fused {
+    /// In the frame of the top link.
+    inertia: RigidInertia,
+    /// The top link first.
+    members: Vec<usize>,
+    /// The joints that lead to other bodies, with their poses.
+    below: Vec<(usize, Pose)>,
+}
+
+impl Folding<'_, '_> {
     fn fold(
         &self,
         tree: &Tree,
@@ -632,37 +646,13 @@ impl Folder<'_, '_> {
             if let Some((number, parent, placement)) = above {
                 self.add_joint(&mut model, number, parent, placement);
             }
-            let body = model.inertias.len();
-            let mut inertia = RigidInertia::zero();
-            let mut has_inertial = false;
-            let mut below = Vec::new();
-            let mut members = Vec::new();
-            let mut group = vec![(top, Pose::identity())];
-            while let Some((link, x_body_link)) = group.pop() {
-                members.push(link);
-                inertia = inertia + self.links[link].inertia.transformed(&x_body_link);
-                has_inertial |= self.links[link].has_inertial;
-                model.frames.insert(
-                    self.links[link].name.to_owned(),
-                    Frame {
-                        link: body,
-                        pose: x_body_link,
-                    },
-                );
-                for &number in &tree.children[link] {
-                    let joint = &self.joints[number];
-                    let x_body_joint = x_body_link * joint.origin;
-                    let is_fixed = joint.kind == Some(JointKind::Fixed);
-                    if is_fixed && !self.keep.contains(joint.name) {
-                        let links = [link, joint.child].map(|l| self.links[l].name.to_owned());
-                        (model.folded_joints).insert(joint.name.to_owned(), links.into());
-                        group.push((joint.child, x_body_joint));
-                    } else {
-                        below.push((joint.child, Some((number, body, x_body_joint))));
-                    }
-                }
-            }
-            let RawLink { node, name, .. } = self.links[top];
+            let Fused {
+                inertia,
+                members,
+                below,
+            } = self.fuse(&mut model, tree, top);
+            let has_inertial = members.iter().any(|&link| self.links[link].has_inertial);
+            let UrdfLink { node, name, .. } = self.links[top];
             self.check_body(&members, &inertia, total, &mut model.warnings)?;
             match above {
                 Some((number, ..)) if !has_inertial => {
@@ -678,16 +668,50 @@ impl Folder<'_, '_> {
                 )),
                 _ => {}
             }
+            let body = model.inertias.len();
             model.inertias.push(inertia);
             model.link_names.push(name.to_owned());
             // The stack is last in, first out: pushed in reverse, the joints of a body come in the
             // order of the file.
-            bodies.extend(below.into_iter().rev());
+            let below = below.into_iter().rev();
+            bodies.extend(below.map(|(number, placement)| {
+                (self.joints[number].child, Some((number, body, placement)))
+            }));
         }
         if !unknown.is_empty() {
             return Err(ModelError::MissingInertial(unknown));
         }
         Ok(model)
+    }
+
+    /// The links that are fixed to `top`, as the next body of the model.
+    fn fuse(&self, model: &mut Model, tree: &Tree, top: usize) -> Fused {
+        let body = model.inertias.len();
+        let mut fused = Fused {
+            inertia: RigidInertia::zero(),
+            members: Vec::new(),
+            below: Vec::new(),
+        };
+        let mut group = vec![(top, Pose::identity())];
+        while let Some((link, pose)) = group.pop() {
+            fused.members.push(link);
+            fused.inertia = fused.inertia + self.links[link].inertia.transformed(&pose);
+            let name = self.links[link].name.to_owned();
+            model.frames.insert(name, Frame { link: body, pose });
+            for &number in &tree.children[link] {
+                let joint = &self.joints[number];
+                let x_body_joint = pose * joint.origin;
+                let is_fixed = joint.kind == Some(JointKind::Fixed);
+                if is_fixed && !self.keep.contains(joint.name) {
+                    let links = [link, joint.child].map(|l| self.links[l].name.to_owned());
+                    (model.folded_joints).insert(joint.name.to_owned(), links.into());
+                    group.push((joint.child, x_body_joint));
+                } else {
+                    fused.below.push((number, x_body_joint));
+                }
+            }
+        }
+        fused
     }
 
     /// Adds the joint above the next body. A moving joint with an F/T sensor is divided: into the

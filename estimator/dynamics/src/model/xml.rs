@@ -8,7 +8,7 @@
 //! messages and the rewriting of a URDF need.
 
 use std::borrow::Cow;
-use std::ops::Range;
+use std::ops::{ControlFlow, Range};
 
 use encoding_rs::{Encoding, UTF_8, UTF_16BE, UTF_16LE, WINDOWS_1252};
 use quick_xml::errors::SyntaxError;
@@ -100,10 +100,6 @@ impl<'t> Document<'t> {
     pub(super) fn parse(text: &'t str) -> Result<Self, XmlError> {
         // To the other readers a NUL is the end.
         let text = text.split('\0').next().unwrap_or_default();
-        let wrong = |at: usize, reason: String| XmlError {
-            line: line_at(text, at),
-            reason,
-        };
         let reader_from = |at: usize| {
             let mut reader = quick_xml::Reader::from_str(text.get(at..).unwrap_or_default());
             let config = reader.config_mut();
@@ -116,16 +112,23 @@ impl<'t> Document<'t> {
         // Where the reader began. It would not count a byte order mark.
         let mut base = text.len() - text.trim_start_matches('\u{feff}').len();
         let mut reader = reader_from(base);
-        let mut document = Self {
-            text,
-            elements: Vec::new(),
+        let mut builder = TreeBuilder {
+            document: Self {
+                text,
+                elements: Vec::new(),
+            },
+            open: Vec::new(),
         };
-        let mut open: Vec<usize> = Vec::new();
         loop {
             let place = |at: u64| usize::try_from(at).map_or(text.len(), |at| base + at);
             let start = place(reader.buffer_position());
-            let event = match reader.read_event() {
-                Ok(event) => event,
+            match reader.read_event() {
+                Ok(event) => {
+                    let end = place(reader.buffer_position());
+                    if builder.take(event, start..end)?.is_break() {
+                        break;
+                    }
+                }
                 Err(error) => {
                     // `<!x>`, which no reader knows, is skipped.
                     let unknown = matches!(
@@ -134,108 +137,27 @@ impl<'t> Document<'t> {
                     );
                     let length = text.get(start..).and_then(|rest| rest.find('>'));
                     let Some(length) = length.filter(|_| unknown) else {
-                        return Err(wrong(place(reader.error_position()), error.to_string()));
+                        let at = place(reader.error_position());
+                        return Err(builder.document.wrong(at, error.to_string()));
                     };
                     base = start + length + 1;
                     reader = reader_from(base);
-                    continue;
                 }
-            };
-            let end = place(reader.buffer_position());
-            let add_text = |document: &mut Self, more: &str| {
-                let element = open
-                    .last()
-                    .and_then(|&number| document.elements.get_mut(number));
-                element
-                    .into_iter()
-                    .for_each(|element| element.text.push_str(more));
-            };
-            let is_empty = matches!(event, Event::Empty(_));
-            match event {
-                Event::Start(_) | Event::Empty(_) => {
-                    let tag = text.get(start + 1..end - 1).unwrap_or_default();
-                    let tag = tag.strip_suffix('/').filter(|_| is_empty).unwrap_or(tag);
-                    let tag = tag.trim_start();
-                    let name_end = tag.find(char::is_whitespace).unwrap_or(tag.len());
-                    let name = tag.get(..name_end).unwrap_or_default();
-                    let mut attributes = Vec::new();
-                    for attribute in Attributes::new(tag, name_end) {
-                        let attribute = attribute
-                            .map_err(|error| wrong(start, format!("<{name}>: {error}")))?;
-                        let key = str::from_utf8(attribute.key.into_inner()).unwrap_or_default();
-                        let value = match attribute.value {
-                            Cow::Borrowed(raw) => str::from_utf8(raw).unwrap_or_default(),
-                            Cow::Owned(_) => "",
-                        };
-                        attributes.push((key, lenient(value)));
-                    }
-                    let number = document.elements.len();
-                    if let Some(parent) = open.last() {
-                        document.elements[*parent].children.push(number);
-                    }
-                    document.elements.push(Element {
-                        name,
-                        attributes,
-                        text: String::new(),
-                        children: Vec::new(),
-                        range: start..end,
-                        content: end,
-                    });
-                    if !is_empty {
-                        open.push(number);
-                    }
-                }
-                Event::End(tag) => {
-                    let name = tag.name();
-                    let name = str::from_utf8(name.into_inner()).unwrap_or_default().trim();
-                    let Some(number) = open.pop() else {
-                        // After the root it ends the text for the other readers, too.
-                        if !document.elements.is_empty() {
-                            break;
-                        }
-                        return Err(wrong(start, format!("</{name}> closes nothing")));
-                    };
-                    let element = &mut document.elements[number];
-                    if element.name != name {
-                        let line = line_at(text, element.range.start);
-                        let opened = element.name;
-                        return Err(wrong(
-                            start,
-                            format!("</{name}> where <{opened}> of line {line} is open"),
-                        ));
-                    }
-                    element.range.end = end;
-                }
-                Event::Text(more) => {
-                    add_text(&mut document, str::from_utf8(&more).unwrap_or_default());
-                }
-                Event::CData(more) => {
-                    add_text(&mut document, str::from_utf8(&more).unwrap_or_default());
-                }
-                Event::GeneralRef(_) => {
-                    add_text(
-                        &mut document,
-                        &lenient(text.get(start..end).unwrap_or_default()),
-                    );
-                }
-                Event::Eof => break,
-                Event::Comment(_) | Event::Decl(_) | Event::PI(_) | Event::DocType(_) => {}
             }
         }
-        if let Some(&number) = open.last() {
-            let Element { name, range, .. } = &document.elements[number];
-            let reason = format!("<{name}> is not closed");
-            return Err(wrong(range.start, reason));
+        builder.finish()
+    }
+
+    fn wrong(&self, at: usize, reason: String) -> XmlError {
+        XmlError {
+            line: line_at(self.text, at),
+            reason,
         }
-        if document.elements.is_empty() {
-            return Err(wrong(0, "it has no element".to_owned()));
-        }
-        Ok(document)
     }
 
     /// The first root element of this name, else the first one of any name.
-    pub(super) fn root(&self, name: &str) -> Node<'_> {
-        let node = |number| Node {
+    pub(super) fn root(&self, name: &str) -> ElementRef<'_> {
+        let node = |number| ElementRef {
             document: self,
             number,
         };
@@ -249,6 +171,120 @@ impl<'t> Document<'t> {
             number = self.elements.partition_point(|e| e.range.start < end);
         }
         node(0)
+    }
+}
+
+/// A document while it is read.
+struct TreeBuilder<'t> {
+    document: Document<'t>,
+    /// The elements whose end tag has not come, outermost first.
+    open: Vec<usize>,
+}
+
+impl<'t> TreeBuilder<'t> {
+    /// Takes what is next in the text, at `range`; breaks at its end.
+    fn take(&mut self, event: Event<'_>, range: Range<usize>) -> Result<ControlFlow<()>, XmlError> {
+        match event {
+            Event::Start(_) => self.start(range, false)?,
+            Event::Empty(_) => self.start(range, true)?,
+            Event::End(tag) => {
+                let name = tag.name();
+                let name = str::from_utf8(name.into_inner()).unwrap_or_default();
+                return self.end(name.trim(), range);
+            }
+            Event::Text(more) => self.add_text(str::from_utf8(&more).unwrap_or_default()),
+            Event::CData(more) => self.add_text(str::from_utf8(&more).unwrap_or_default()),
+            Event::GeneralRef(_) => {
+                let raw = self.document.text.get(range).unwrap_or_default();
+                self.add_text(&lenient(raw));
+            }
+            Event::Eof => return Ok(ControlFlow::Break(())),
+            Event::Comment(_) | Event::Decl(_) | Event::PI(_) | Event::DocType(_) => {}
+        }
+        Ok(ControlFlow::Continue(()))
+    }
+
+    fn start(&mut self, range: Range<usize>, is_empty: bool) -> Result<(), XmlError> {
+        let tag = self.document.text.get(range.start + 1..range.end - 1);
+        let tag = tag.unwrap_or_default();
+        let tag = tag.strip_suffix('/').filter(|_| is_empty).unwrap_or(tag);
+        let tag = tag.trim_start();
+        let name_end = tag.find(char::is_whitespace).unwrap_or(tag.len());
+        let name = tag.get(..name_end).unwrap_or_default();
+        let mut attributes = Vec::new();
+        for attribute in Attributes::new(tag, name_end) {
+            let wrong = |error| {
+                self.document
+                    .wrong(range.start, format!("<{name}>: {error}"))
+            };
+            let attribute = attribute.map_err(wrong)?;
+            let key = str::from_utf8(attribute.key.into_inner()).unwrap_or_default();
+            let value = match attribute.value {
+                Cow::Borrowed(raw) => str::from_utf8(raw).unwrap_or_default(),
+                Cow::Owned(_) => "",
+            };
+            attributes.push((key, lenient(value)));
+        }
+        let elements = &mut self.document.elements;
+        let number = elements.len();
+        if let Some(parent) = self.open.last() {
+            elements[*parent].children.push(number);
+        }
+        elements.push(Element {
+            name,
+            attributes,
+            text: String::new(),
+            children: Vec::new(),
+            content: range.end,
+            range,
+        });
+        if !is_empty {
+            self.open.push(number);
+        }
+        Ok(())
+    }
+
+    fn end(&mut self, name: &str, range: Range<usize>) -> Result<ControlFlow<()>, XmlError> {
+        let Some(number) = self.open.pop() else {
+            // After the root it ends the text for the other readers, too.
+            if !self.document.elements.is_empty() {
+                return Ok(ControlFlow::Break(()));
+            }
+            let reason = format!("</{name}> closes nothing");
+            return Err(self.document.wrong(range.start, reason));
+        };
+        let element = &mut self.document.elements[number];
+        element.range.end = range.end;
+        if element.name == name {
+            return Ok(ControlFlow::Continue(()));
+        }
+        let line = line_at(self.document.text, element.range.start);
+        let reason = format!("</{name}> where <{}> of line {line} is open", element.name);
+        Err(self.document.wrong(range.start, reason))
+    }
+
+    /// Text belongs to the innermost open element.
+    fn add_text(&mut self, more: &str) {
+        let elements = &mut self.document.elements;
+        if let Some(element) = self
+            .open
+            .last()
+            .and_then(|&number| elements.get_mut(number))
+        {
+            element.text.push_str(more);
+        }
+    }
+
+    fn finish(self) -> Result<Document<'t>, XmlError> {
+        if let Some(&number) = self.open.last() {
+            let Element { name, range, .. } = &self.document.elements[number];
+            let reason = format!("<{name}> is not closed");
+            return Err(self.document.wrong(range.start, reason));
+        }
+        if self.document.elements.is_empty() {
+            return Err(self.document.wrong(0, "it has no element".to_owned()));
+        }
+        Ok(self.document)
     }
 }
 
@@ -281,12 +317,12 @@ fn line_at(text: &str, at: usize) -> usize {
 
 /// An element of a document.
 #[derive(Clone, Copy)]
-pub(super) struct Node<'d> {
+pub(super) struct ElementRef<'d> {
     document: &'d Document<'d>,
     number: usize,
 }
 
-impl<'d> Node<'d> {
+impl<'d> ElementRef<'d> {
     fn element(self) -> &'d Element<'d> {
         &self.document.elements[self.number]
     }

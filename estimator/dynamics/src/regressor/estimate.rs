@@ -1,15 +1,13 @@
 //! Sensitivity of the solver's estimates to each inertial parameter and each offset: the rows that
-//! carry a parameter covariance to joint torques and contact wrenches.
+//! carry a parameter covariance to joint torques.
 //!
-//! The estimates are linear in the sum of net wrenches: `tau_j = s_j . F_j - h_j . b` and
-//! `x_i = k_i . b` (derivation at the top of `solver.rs`). `s`, `h` and `k` depend on neither the
-//! parameters nor the readings. So link `l` of the sub-tree enters a torque with the motion
-//! `m_l = [l below j] s_j - h_j`, and a contact with `m_l = k_i`. Its ten coefficients are
-//! `m_l^T X* A_l`. Those of the offset of an F/T sensor above link `l` (or, with the other sign,
-//! below it) are `m_l` expressed in the sensor's measurement frame.
+//! A torque is linear in the sum of net wrenches: `tau_j = s_j . F_j - h_j . b` (derivation at the
+//! top of `solver.rs`). `s` and `h` depend on neither the parameters nor the readings. So link `l`
+//! of the sub-tree enters a torque with the motion `m_l = [l below j] s_j - h_j`. Its ten
+//! coefficients are `m_l^T X* A_l`. Those of the offset of an F/T sensor above link `l` (or, with
+//! the other sign, below it) are `m_l` expressed in the sensor's measurement frame.
 
 use super::link::{LINK_PARAMETERS, in_link_axes, row_along};
-use super::subtree::spread;
 use crate::error::{DynamicsError, check_size};
 use crate::kinematics::{ExternalWrench, Kinematics, check_external, check_readings};
 use crate::solver::Solver;
@@ -26,11 +24,9 @@ use crate::structure::Structure;
 /// It borrows a solver with its last solution and the kinematics of that solution. The solution
 /// also has the contacts that were present.
 ///
-/// An estimate depends on one sub-tree ([`EstimateRows::torque_subtree`],
-/// [`EstimateRows::contact_subtree`]). Its row has that sub-tree's columns only, in the order of
-/// [`super::SubTreeRegressor`]: ten per link, ascending, then six per sensor at its ends,
-/// ascending, [torque; force] in its measurement frame. [`EstimateRows::expand`] writes it over the
-/// columns of all sub-trees.
+/// A row has the columns of all sub-trees: ten per link, ascending, then six per sensor, ascending,
+/// [torque; force] in its measurement frame. An estimate depends on one sub-tree
+/// ([`EstimateRows::torque_subtree`]): the row is zero in the columns of the others.
 #[derive(Clone, Copy, Debug)]
 pub struct EstimateRows<'a> {
     structure: &'a Structure,
@@ -75,114 +71,75 @@ impl<'a> EstimateRows<'a> {
         subtrees.all(|other| other == Some(first)).then_some(first)
     }
 
-    /// The sub-tree on which a contact's wrench depends; `None` if there is no such contact.
-    pub fn contact_subtree(&self, contact: usize) -> Option<usize> {
-        self.structure
-            .subtree_of(self.structure.contacts().get(contact)?.frame.link)
-    }
-
-    /// Number of columns of a sub-tree's rows: `10 links + 6 sensors`; `None` if there is no such
-    /// sub-tree.
-    pub fn column_count(&self, subtree: usize) -> Option<usize> {
-        let tree = self.structure.subtrees().get(subtree)?;
-        Some(LINK_PARAMETERS * self.structure.links_of(subtree).count() + 6 * tree.sensors.len())
-    }
-
-    /// Number of columns of all sub-trees: `10 N_B + 6 per sensor`.
-    pub fn stacked_column_count(&self) -> usize {
+    /// Number of columns, `10 N_B + 6 per sensor`.
+    pub fn column_count(&self) -> usize {
         LINK_PARAMETERS * self.structure.link_count() + 6 * self.structure.sensors().len()
     }
 
-    /// Writes a sub-tree's row over the columns of all sub-trees, zeros included: those of
-    /// [`super::StackedRegressor`] without the contacts'.
+    /// Writes the row of a joint's torque [Nm or N], zeros included.
     ///
     /// # Errors
-    /// There is no such sub-tree, or the length of `row` or `stacked` is not the number of columns.
-    /// Nothing is changed in that case.
-    pub fn expand(
-        &self,
-        subtree: usize,
-        row: &[f64],
-        stacked: &mut [f64],
-    ) -> Result<(), DynamicsError> {
-        let columns = self.column_count(subtree).ok_or(DynamicsError::Index {
-            what: "sub-trees",
-            index: subtree,
-            count: self.structure.subtrees().len(),
-        })?;
-        check_size("numbers of an estimate's row", row.len(), columns)?;
-        check_size(
-            "numbers of a stacked row",
-            stacked.len(),
-            self.stacked_column_count(),
-        )?;
-        stacked.fill(0.0);
-        spread(self.structure, subtree, row, stacked);
-        Ok(())
-    }
-
-    /// Writes the row of a joint's torque [Nm or N].
-    ///
-    /// # Errors
-    /// There is no such degree of freedom, or the length of `row` is not the number of columns of
-    /// its sub-tree. Nothing is changed in that case.
+    /// There is no such degree of freedom, its joints are in several sub-trees, or the length of
+    /// `row` is not the number of columns. Nothing is changed in that case.
     pub fn torque_row(&self, dof: usize, row: &mut [f64]) -> Result<(), DynamicsError> {
-        let subtree = self.place_of(dof)?;
-        self.write(subtree, |other| self.torque_motion(dof, other), row)
-    }
-
-    /// Writes the row of a component of a contact's wrench, [torque; force] at the origin and in
-    /// the axes of the contact's frame [Nm, N].
-    ///
-    /// # Errors
-    /// There is no such contact or component, or the length of `row` is not the number of columns
-    /// of its sub-tree. Nothing is changed in that case.
-    pub fn contact_row(
-        &self,
-        contact: usize,
-        component: usize,
-        row: &mut [f64],
-    ) -> Result<(), DynamicsError> {
-        let (motion, subtree) = self.contact_motion(contact, component)?;
-        self.write(subtree, |_| motion, row)
+        let subtree = self.one_subtree(dof)?;
+        check_size(
+            "numbers of an estimate's row",
+            row.len(),
+            self.column_count(),
+        )?;
+        row.fill(0.0);
+        let (links, offsets) = row.split_at_mut(LINK_PARAMETERS * self.structure.link_count());
+        let links = links.as_chunks_mut::<LINK_PARAMETERS>().0;
+        for link in self.structure.links_of(subtree) {
+            // The motion is transformed to the link, so that the ten columns need no transform to
+            // the base.
+            let in_link = self
+                .kinematics
+                .pose(link)
+                .twist_back(&self.torque_motion(dof, link));
+            links[link] = row_along(&in_link, &in_link_axes(self.kinematics.motion(link)));
+        }
+        let offsets = offsets.as_chunks_mut::<6>().0;
+        for sensor in self.structure.subtrees()[subtree].sensors.iter() {
+            offsets[sensor] = self.offset_row(dof, subtree, sensor);
+        }
+        Ok(())
     }
 
     /// Contribution of the raw readings and known wrenches to a torque: the other part of the
     /// estimate.
     ///
     /// # Errors
-    /// There is no such degree of freedom, the sizes do not fit, a reading is not finite, or a
-    /// known wrench is on no link or not finite.
+    /// There is no such degree of freedom, its joints are in several sub-trees, the sizes do not
+    /// fit, a reading is not finite, or a known wrench is on no link or not finite.
     pub fn torque_measured(
         &self,
         dof: usize,
         readings: &[Wrench],
         external: &[ExternalWrench],
     ) -> Result<f64, DynamicsError> {
-        let subtree = self.place_of(dof)?;
-        let motion = |other| self.torque_motion(dof, other);
-        self.measured(subtree, motion, readings, external)
-    }
-
-    /// Contribution of the raw readings and known wrenches to a component of a contact's wrench
-    /// [torque; force]: the other part of the estimate.
-    ///
-    /// # Errors
-    /// There is no such contact or component, the sizes do not fit, a reading is not finite, or a
-    /// known wrench is on no link or not finite.
-    pub fn contact_measured(
-        &self,
-        contact: usize,
-        component: usize,
-        readings: &[Wrench],
-        external: &[ExternalWrench],
-    ) -> Result<f64, DynamicsError> {
-        let (motion, subtree) = self.contact_motion(contact, component)?;
-        self.measured(subtree, |_| motion, readings, external)
+        let subtree = self.one_subtree(dof)?;
+        check_readings(readings, self.structure.sensors().len())?;
+        check_external(external, self.structure.link_count())?;
+        let mut sum = 0.0;
+        for sensor in self.structure.subtrees()[subtree].sensors.iter() {
+            let row = self.offset_row(dof, subtree, sensor);
+            let reading = readings[sensor].torque_first();
+            sum -= row.iter().zip(&reading).map(|(a, b)| a * b).sum::<f64>();
+        }
+        for known in external {
+            let link = known.frame.link;
+            if self.structure.subtree_of(link) == Some(subtree) {
+                let wrench = known.in_base(self.kinematics);
+                sum -= self.torque_motion(dof, link).dot(&wrench);
+            }
+        }
+        Ok(sum)
     }
 
     /// The sub-tree of the links that a degree of freedom moves.
-    fn place_of(&self, dof: usize) -> Result<usize, DynamicsError> {
+    fn one_subtree(&self, dof: usize) -> Result<usize, DynamicsError> {
         self.torque_subtree(dof).ok_or(DynamicsError::Index {
             what: "degrees of freedom",
             index: dof,
@@ -190,12 +147,12 @@ impl<'a> EstimateRows<'a> {
         })
     }
 
-    /// Sum of `[other below j] s_j - h_j` over the joints of the degree of freedom.
-    fn torque_motion(&self, dof: usize, other: usize) -> Motion {
-        let links = self.structure.moved_by(dof).iter();
-        links.fold(Motion::zero(), |sum, &link| {
-            let (axis, response) = self.solver.torque_rows(link);
-            if self.structure.below(link).contains(&other) {
+    /// Sum of `[link below j] s_j - h_j` over the joints of the degree of freedom.
+    fn torque_motion(&self, dof: usize, link: usize) -> Motion {
+        let moved = self.structure.moved_by(dof).iter();
+        moved.fold(Motion::zero(), |sum, &top| {
+            let (axis, response) = self.solver.torque_rows(top);
+            if self.structure.below(top).contains(&link) {
                 sum + *axis - *response
             } else {
                 sum - *response
@@ -203,66 +160,9 @@ impl<'a> EstimateRows<'a> {
         })
     }
 
-    fn contact_motion(
-        &self,
-        contact: usize,
-        component: usize,
-    ) -> Result<(Motion, usize), DynamicsError> {
-        let subtree = self.contact_subtree(contact).ok_or(DynamicsError::Index {
-            what: "contacts",
-            index: contact,
-            count: self.structure.contacts().len(),
-        })?;
-        // The solver's order is force first.
-        let motions = self.solver.contact_rows(contact);
-        let motion = [3, 4, 5, 0, 1, 2]
-            .get(component)
-            .map(|&i: &usize| motions[i])
-            .ok_or(DynamicsError::Index {
-                what: "components of a wrench",
-                index: component,
-                count: 6,
-            })?;
-        Ok((motion, subtree))
-    }
-
-    fn write(
-        &self,
-        subtree: usize,
-        motion: impl Fn(usize) -> Motion,
-        row: &mut [f64],
-    ) -> Result<(), DynamicsError> {
-        let columns = self.column_count(subtree).unwrap_or(0);
-        check_size("numbers of an estimate's row", row.len(), columns)?;
-        let (links, offsets) =
-            row.split_at_mut(columns - 6 * self.structure.subtrees()[subtree].sensors.len());
-        for (out, link) in links
-            .chunks_exact_mut(LINK_PARAMETERS)
-            .zip(self.structure.links_of(subtree))
-        {
-            // The motion is transformed to the link, so that the ten columns need no transform to
-            // the base.
-            let in_link = self.kinematics.pose(link).twist_back(&motion(link));
-            out.copy_from_slice(&row_along(
-                &in_link,
-                &in_link_axes(self.kinematics.motion(link)),
-            ));
-        }
-        let sensors = self.structure.subtrees()[subtree].sensors;
-        for (out, sensor) in offsets.chunks_exact_mut(6).zip(sensors.iter()) {
-            out.copy_from_slice(&self.offset_row(subtree, sensor, &motion));
-        }
-        Ok(())
-    }
-
     /// Coefficients of a sensor's offset [torque; force]. For a given raw reading an offset reduces
     /// the wrench that is subtracted from the net wrenches.
-    fn offset_row(
-        &self,
-        subtree: usize,
-        sensor: usize,
-        motion: &impl Fn(usize) -> Motion,
-    ) -> [f64; 6] {
+    fn offset_row(&self, dof: usize, subtree: usize, sensor: usize) -> [f64; 6] {
         let cut = &self.structure.sensors()[sensor];
         let child = cut.joint() + 1;
         let (link, side) = if self.structure.subtree_of(child) == Some(subtree) {
@@ -270,33 +170,10 @@ impl<'a> EstimateRows<'a> {
         } else {
             (self.structure.parent_of(child), -1.0)
         };
-        let in_sensor = self.solver.sensor_pose(sensor).twist_back(&motion(link));
+        let motion = self.torque_motion(dof, link);
+        let in_sensor = self.solver.sensor_pose(sensor).twist_back(&motion);
         let factor = side * cut.sign();
         let (n, f) = (in_sensor.angular * factor, in_sensor.linear * factor);
         [n.x, n.y, n.z, f.x, f.y, f.z]
-    }
-
-    fn measured(
-        &self,
-        subtree: usize,
-        motion: impl Fn(usize) -> Motion,
-        readings: &[Wrench],
-        external: &[ExternalWrench],
-    ) -> Result<f64, DynamicsError> {
-        check_readings(readings, self.structure.sensors().len())?;
-        check_external(external, self.structure.link_count())?;
-        let mut sum = 0.0;
-        for sensor in self.structure.subtrees()[subtree].sensors.iter() {
-            let row = self.offset_row(subtree, sensor, &motion);
-            let reading = readings[sensor].torque_first();
-            sum -= row.iter().zip(&reading).map(|(a, b)| a * b).sum::<f64>();
-        }
-        for known in external {
-            let link = known.frame.link;
-            if self.structure.subtree_of(link) == Some(subtree) {
-                sum -= motion(link).dot(&known.in_base(self.kinematics));
-            }
-        }
-        Ok(sum)
     }
 }

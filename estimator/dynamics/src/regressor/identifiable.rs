@@ -4,9 +4,9 @@
 //! The paper's identifiable subspace `I_Y` (section III.A, eq. (6) and (7)) is the orthogonal
 //! complement of the parameters that no motion excites. Usually its basis `B` comes from a rank
 //! decision on sampled regressors. Here it follows from the geometry of the joints. This covers any
-//! tree cut at any F/T sensors, a base of restricted motion, joints in static postures only, joint
-//! torques instead of wrenches, and unknown sensor offsets. [`Identifiable::new`] decides ranks
-//! only of matrices with at most sixteen columns (and of the offsets alone).
+//! tree cut at any F/T sensors, a free base or one at rest, moving and locked joints, joint torques
+//! instead of wrenches, and unknown sensor offsets. [`Identifiable::new`] decides ranks only of
+//! matrices with at most sixteen columns (and of the offsets alone).
 //!
 //! # How
 //! A body's ten parameters are a symmetric 4 x 4 matrix, the pseudo-inertia `J`
@@ -42,7 +42,7 @@
 //!
 //! Its solutions `theta` are point masses in the kernel of all `S`. These are three directions for
 //! a revolute joint (mass, first moment and second moment along the axis), six for a prismatic one,
-//! ten for a fixed one, one for helical, cylindrical, universal, spherical and planar joints. A
+//! ten for a fixed one. A
 //! null vector is such a `theta` on the joint's outer body and its opposite on the inner one. The
 //! null space is their direct sum: `10 N_B - sum n_j` combinations are identifiable. For restricted
 //! base motion compare Wensing, Niemeyer and Slotine, arXiv:1711.03896 (for joint torques); here
@@ -69,35 +69,26 @@
 //! needed.
 //!
 //! Lengths and gravity below a millionth of their SI unit count as zero when these units are
-//! chosen. Values above a million times their SI unit are errors, as are rotations that are not
-//! orthonormal to the tolerance. So all results are finite.
+//! chosen. Values above a million times their SI unit are errors. So all results are finite.
 
-mod scaling;
-
-mod tree;
-
-use crate::regressor::identifiable::scaling::{
-    check_pose, check_size_of, contact_wrenches, of_length_one, of_order_one, scaled, unit,
-};
-use crate::regressor::identifiable::tree::{Attached, at_reference, base_reach, route, sides};
 mod assemble;
 mod expression;
+mod pass;
 mod reach;
 mod regime;
 
-use nalgebra::{DMatrix, SMatrix};
+use nalgebra::DMatrix;
 
-use self::assemble::{Hidden, Member, NullVector, Scale, assemble};
-use self::reach::{Reach, Span};
+use self::assemble::{Composite, Hidden, NullVector, assemble};
+use self::pass::{Units, Visit, check_vector, contact_wrenches, pass, sides};
+use self::reach::{Reach, Subspace};
 use crate::error::{DynamicsError, check_size};
 use crate::model::Model;
-use crate::spatial::{Pose, Wrench};
-use crate::structure::{ContactKind, Structure};
+use crate::spatial::{Vec3, Wrench};
+use crate::structure::Structure;
 
 pub use expression::{BaseParameter, Term};
-pub use regime::{
-    BaseRegime, Body, Column, Freedom, Invisible, JointMotion, Measured, Offsets, Regime, Scope,
-};
+pub use regime::{BaseRegime, JointMotion, Measurement, Offsets, ParameterColumn, Regime, Scope};
 
 /// The identifiable subspace of inertial parameters, with or without offsets.
 ///
@@ -114,11 +105,10 @@ pub use regime::{
 /// parent on that link, and `-` for the sensors below.
 #[derive(Clone, Debug)]
 pub struct Identifiable {
-    columns: Vec<Column>,
+    columns: Vec<ParameterColumn>,
     names: Vec<String>,
     basis: DMatrix<f64>,
     null: Vec<NullVector>,
-    invisible: Vec<Invisible>,
     confused: usize,
 }
 
@@ -134,213 +124,48 @@ impl Identifiable {
         model: &Model,
         scope: Scope<'_>,
         regime: &Regime,
-        measured: Measured,
+        measured: Measurement,
         offsets: Offsets,
     ) -> Result<Self, DynamicsError> {
-        check_size(
-            "joints of the regime",
-            regime.joints.len(),
-            model.dof_count(),
-        )?;
-        if regime.base >= model.link_count() {
-            return Err(DynamicsError::NoLink(regime.base));
-        }
-        let structure = match scope {
-            Scope::Tree => None,
-            Scope::SubTree(structure, _) | Scope::SubTrees(structure) => Some(structure),
-        };
-        if let Some(structure) = structure {
-            check_size(
-                "links of the structure",
-                structure.link_count(),
-                model.link_count(),
-            )?;
-        }
-        if let Scope::SubTree(structure, number) = scope
-            && number >= structure.subtrees().len()
-        {
-            return Err(DynamicsError::Index {
-                what: "sub-trees",
-                index: number,
-                count: structure.subtrees().len(),
-            });
-        }
-        // The separately measured parts of the robot: numbers of sub-trees, or one number for all
-        // links of a whole tree.
-        let piece = |link: usize| match scope {
-            Scope::Tree => Some(0),
-            Scope::SubTree(structure, number) => {
-                structure.subtree_of(link).filter(|&of| of == number)
+        check(model, scope, regime)?;
+        let visits = pass(model, regime)?;
+        let contacts = contact_wrenches(scope, regime, measured, &visits)?;
+        let gravity = match &regime.motion {
+            BaseRegime::Free => None,
+            BaseRegime::Fixed(gravity) => {
+                check_vector(gravity, "gravity of regime", 0)?;
+                Some(*gravity)
             }
-            Scope::SubTrees(structure) => structure.subtree_of(link),
         };
-        let route = route(model, regime.base);
-        let place = |link: usize| route.iter().position(|step| step.link == link).unwrap_or(0);
-        let bodies: Vec<Body> = route.iter().map(|step| step.body(model, regime)).collect();
+        let recursion = Recursion {
+            units: Units::of(&visits, gravity.as_ref()),
+            visits,
+            scope,
+            measured,
+            gravity,
+            contacts,
+            tolerance: regime.tolerance.clamp(1e-12, 1e-2),
+        };
         let links: Vec<usize> = (0..model.link_count())
-            .filter(|&link| piece(link).is_some())
+            .filter(|&link| scope.part_of(link).is_some())
             .collect();
-        let sensors: Vec<usize> = match (scope, offsets) {
-            (_, Offsets::Known) => Vec::new(),
-            (Scope::Tree, Offsets::Unknown) => vec![0],
-            (Scope::SubTree(structure, number), Offsets::Unknown) => {
-                structure.subtrees()[number].sensors.iter().collect()
-            }
-            (Scope::SubTrees(structure), Offsets::Unknown) => {
-                (0..structure.sensors().len()).collect()
-            }
-        };
-        let mut attached = Vec::new();
-        for (column, &sensor) in sensors.iter().enumerate() {
-            match structure {
-                None => attached.push(Attached {
-                    body: 0,
-                    column,
-                    carry: SMatrix::identity(),
-                }),
-                Some(structure) => {
-                    let sides = sides(model, &structure.sensors()[sensor]);
-                    let sides = sides.into_iter().filter(|&(link, _)| piece(link).is_some());
-                    attached.extend(sides.map(|(link, carry)| Attached {
-                        body: place(link),
-                        column,
-                        carry,
-                    }));
-                }
-            }
-        }
-        let scopes: Vec<_> = route.iter().map(|step| piece(step.link)).collect();
-        let mut unknown = Vec::new();
-        for contact in regime.contacts.iter() {
-            let contacts = structure.map_or(&[][..], Structure::contacts);
-            let spec = contacts.get(contact).ok_or(DynamicsError::Index {
-                what: "contacts",
-                index: contact,
-                count: contacts.len(),
-            })?;
-            let Some(number) = piece(spec.frame.link) else {
-                continue;
-            };
-            let first = route.iter().find(|step| piece(step.link) == Some(number));
-            let is_first = first.is_some_and(|step| step.link == spec.frame.link);
-            // Its place is irrelevant if it removes the whole balance and nothing else is measured.
-            if !is_first && (spec.kind != ContactKind::Wrench || measured != Measured::Wrench) {
-                return Err(DynamicsError::Contact(contact));
-            }
-            unknown.extend(
-                contact_wrenches(spec)
-                    .into_iter()
-                    .map(|wrench| (number, wrench)),
-            );
-        }
-        let numbers: Vec<usize> = route.iter().map(|step| step.link).collect();
-        let mut found = solve(
-            &bodies,
-            &scopes,
-            &numbers,
-            &attached,
-            &unknown,
-            sensors.len(),
-            &regime.motion,
-            measured,
-            regime.tolerance,
-        )?;
-        for invisible in &mut found.invisible {
-            invisible.joint = invisible.joint.and(route[place(invisible.link)].joint);
-        }
-        let sensor_name = |sensor: usize| {
-            structure.map_or("base", |structure| {
-                model.joint_name(structure.sensors()[sensor].joint())
-            })
-        };
-        found.label(
-            &links,
-            |link| model.link_name(link).to_owned(),
-            &sensors,
-            |sensor| sensor_name(sensor).to_owned(),
-        );
-        Ok(found)
-    }
-
-    /// Computes the subspace of a mechanism with joints of any type; body 0 is its base. The motion
-    /// of the base is given by `motion` alone: its `placement` and `joint` are ignored. An unknown
-    /// offset is that of the wrench on the base, in its frame.
-    ///
-    /// # Errors
-    /// There is no body, the number of a parent is not smaller than that of its body, a number is
-    /// not finite, a rotation is invalid, or a length or acceleration is too large
-    /// ([Tolerance](self#tolerance)).
-    pub fn of_mechanism(
-        bodies: &[Body],
-        motion: &BaseRegime,
-        measured: Measured,
-        offsets: Offsets,
-        tolerance: f64,
-    ) -> Result<Self, DynamicsError> {
-        if bodies.is_empty() {
-            return Err(DynamicsError::NoLink(0));
-        }
-        for (number, body) in bodies.iter().enumerate() {
-            let is_valid = match body.parent {
-                Some(parent) => parent < number,
-                None => number == 0,
-            };
-            if !is_valid {
-                return Err(DynamicsError::NoLink(body.parent.unwrap_or(number)));
-            }
-        }
-        // Depth first, so that the bodies beyond a body come directly after it.
-        let mut order = Vec::with_capacity(bodies.len());
-        let mut waiting = vec![0];
-        while let Some(body) = waiting.pop() {
-            order.push(body);
-            waiting.extend(
-                (body + 1..bodies.len())
-                    .rev()
-                    .filter(|&b| bodies[b].parent == Some(body)),
-            );
-        }
-        let sorted: Vec<Body> = order
-            .iter()
-            .map(|&body| Body {
-                parent: bodies[body]
-                    .parent
-                    .and_then(|parent| order.iter().position(|&b| b == parent)),
-                ..bodies[body].clone()
-            })
-            .collect();
-        let sensors: Vec<usize> = match offsets {
+        let sensors = match offsets {
             Offsets::Known => Vec::new(),
-            Offsets::Unknown => vec![0],
+            Offsets::Unknown => scope.sensors(),
         };
-        let attached: Vec<_> = sensors
-            .iter()
-            .map(|&column| Attached {
-                body: 0,
-                column,
-                carry: SMatrix::identity(),
-            })
-            .collect();
-        let scopes = vec![Some(0); bodies.len()];
-        let mut found = solve(
-            &sorted,
-            &scopes,
-            &order,
-            &attached,
-            &[],
-            sensors.len(),
-            motion,
-            measured,
-            tolerance,
-        )?;
-        let links: Vec<usize> = (0..bodies.len()).collect();
-        found.label(
-            &links,
-            |body| format!("body{body}"),
-            &sensors,
-            |_| "base".to_owned(),
-        );
-        Ok(found)
+        let composites = recursion.composites(model, &links, &sensors);
+        let Recursion {
+            units, tolerance, ..
+        } = recursion;
+        let assembled = assemble(&composites, sensors.len(), &units, tolerance);
+        let (columns, names) = labels(model, scope, &links, &sensors);
+        Ok(Self {
+            columns,
+            names,
+            basis: assembled.basis,
+            null: assembled.null,
+            confused: assembled.confused,
+        })
     }
 
     /// `B`, columns x [`Identifiable::rank`]: orthonormal columns that span the identifiable
@@ -356,7 +181,7 @@ impl Identifiable {
     }
 
     /// The meaning of each column.
-    pub fn columns(&self) -> &[Column] {
+    pub fn columns(&self) -> &[ParameterColumn] {
         &self.columns
     }
 
@@ -379,12 +204,6 @@ impl Identifiable {
         null
     }
 
-    /// Per joint within the scope, and for the first link of each part, the number of unobservable
-    /// directions, in the order of a pass from the base.
-    pub fn invisible(&self) -> &[Invisible] {
-        &self.invisible
-    }
-
     /// Number of directions lost to the offsets: rank without offsets + number of offset columns -
     /// rank with them. In these directions an offset and inertial parameters, or several offsets,
     /// are not separable in this regime.
@@ -396,175 +215,177 @@ impl Identifiable {
     pub fn base_parameters(&self) -> Vec<BaseParameter> {
         expression::base_parameters(&self.names, &self.null)
     }
-
-    fn label(
-        &mut self,
-        links: &[usize],
-        link_name: impl Fn(usize) -> String,
-        sensors: &[usize],
-        sensor_name: impl Fn(usize) -> String,
-    ) {
-        const PARAMETERS: [&str; 10] = [
-            "m", "h_x", "h_y", "h_z", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz",
-        ];
-        const COMPONENTS: [&str; 6] = ["t_x", "t_y", "t_z", "f_x", "f_y", "f_z"];
-        for &link in links {
-            let name = link_name(link);
-            for (parameter, suffix) in PARAMETERS.iter().enumerate() {
-                self.columns.push(Column::Inertial { link, parameter });
-                self.names.push(format!("{name}.{suffix}"));
-            }
-        }
-        for &sensor in sensors {
-            let name = sensor_name(sensor);
-            for (component, suffix) in COMPONENTS.iter().enumerate() {
-                self.columns.push(Column::Offset { sensor, component });
-                self.names.push(format!("{name}.{suffix}"));
-            }
-        }
-    }
 }
 
-/// Visits the bodies, which are depth first. `pieces`: the measured part to which each body
-/// belongs. `numbers`: the caller's numbers, which give the order of the columns of measured parts.
-/// `unknown`: per part, unknown wrenches that are always present, in the frame of its first body.
-#[expect(
-    clippy::too_many_arguments,
-    reason = "the one place where both entries meet"
-)]
-fn solve(
-    bodies: &[Body],
-    pieces: &[Option<usize>],
-    numbers: &[usize],
-    attached: &[Attached],
-    unknown: &[(usize, Wrench)],
-    sensors: usize,
-    motion: &BaseRegime,
-    measured: Measured,
-    tolerance: f64,
-) -> Result<Identifiable, DynamicsError> {
-    if !tolerance.is_finite() {
+/// Refuses arguments that do not fit each other.
+fn check(model: &Model, scope: Scope<'_>, regime: &Regime) -> Result<(), DynamicsError> {
+    check_size(
+        "joints of the regime",
+        regime.joints.len(),
+        model.dof_count(),
+    )?;
+    if regime.base >= model.link_count() {
+        return Err(DynamicsError::NoLink(regime.base));
+    }
+    if let Some(structure) = scope.structure() {
+        check_size(
+            "links of the structure",
+            structure.link_count(),
+            model.link_count(),
+        )?;
+    }
+    if let Scope::SubTree(structure, number) = scope
+        && number >= structure.subtrees().len()
+    {
+        return Err(DynamicsError::Index {
+            what: "sub-trees",
+            index: number,
+            count: structure.subtrees().len(),
+        });
+    }
+    if !regime.tolerance.is_finite() {
         return Err(DynamicsError::NotFinite {
             what: "tolerance of regime",
             index: 0,
         });
     }
-    let tolerance = tolerance.clamp(1e-12, 1e-2);
-    let mut joints = Vec::with_capacity(bodies.len());
-    for (body, &number) in bodies.iter().zip(numbers) {
-        check_pose(&body.placement, tolerance, "placement of link", number)?;
-        joints.push(at_reference(
-            &body.placement,
-            &body.joint,
-            "joint to link",
-            |_| number,
-        )?);
-    }
-    let held = match motion {
-        BaseRegime::Free => None,
-        BaseRegime::Restricted { gravity, joints } => {
-            check_size_of(gravity, "gravity of regime", 0)?;
-            let (world, freedoms) =
-                at_reference(&Pose::identity(), joints, "joint of the base", |index| {
-                    index
-                })?;
-            Some((world.rotation.tr_mul(gravity), freedoms))
-        }
-    };
-    let scale = Scale {
-        length: unit(
-            joints
-                .iter()
-                .skip(1)
-                .map(|(placement, _)| placement.translation.norm()),
-        ),
-        acceleration: unit(held.iter().map(|(gravity, _)| gravity.norm())),
-    };
-    let mut measured_numbers: Vec<usize> = numbers
-        .iter()
-        .zip(pieces)
-        .filter(|(_, piece)| piece.is_some())
-        .map(|(&number, _)| number)
-        .collect();
-    measured_numbers.sort_unstable();
-    let torques = measured != Measured::Wrench;
-    let mut reaches: Vec<Option<Reach>> = vec![None; bodies.len()];
-    // Bodies between the base and a measured one are needed too.
-    let mut is_needed: Vec<bool> = pieces.iter().map(Option::is_some).collect();
-    for (number, body) in bodies.iter().enumerate().rev() {
-        if let Some(parent) = body.parent {
-            is_needed[parent] |= is_needed[number];
+    Ok(())
+}
+
+/// The meaning and the name of each column.
+fn labels(
+    model: &Model,
+    scope: Scope<'_>,
+    links: &[usize],
+    sensors: &[usize],
+) -> (Vec<ParameterColumn>, Vec<String>) {
+    const PARAMETERS: [&str; 10] = [
+        "m", "h_x", "h_y", "h_z", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz",
+    ];
+    const COMPONENTS: [&str; 6] = ["t_x", "t_y", "t_z", "f_x", "f_y", "f_z"];
+    let (mut columns, mut names) = (Vec::new(), Vec::new());
+    for &link in links {
+        let name = model.link_name(link);
+        for (parameter, suffix) in PARAMETERS.iter().enumerate() {
+            columns.push(ParameterColumn::Inertial { link, parameter });
+            names.push(format!("{name}.{suffix}"));
         }
     }
-    let mut places = vec![0; bodies.len()];
-    let (mut members, mut invisible): (Vec<Member>, _) = (Vec::new(), Vec::new());
-    for (number, (body, (placement, freedoms))) in bodies.iter().zip(joints).enumerate() {
-        if !is_needed[number] {
-            continue;
+    let cuts = scope.structure().map_or(&[][..], Structure::sensors);
+    for &sensor in sensors {
+        let name = model.joint_name(cuts[sensor].joint());
+        for (component, suffix) in COMPONENTS.iter().enumerate() {
+            columns.push(ParameterColumn::Offset { sensor, component });
+            names.push(format!("{name}.{suffix}"));
         }
-        let piece = pieces[number];
-        let inner = body
-            .parent
-            .filter(|&parent| piece.is_some() && pieces[parent] == piece);
-        let mut visible = None;
-        let before = body.parent.and_then(|parent| reaches[parent].as_ref());
-        let mut reach = match before {
-            None => base_reach(held.as_ref(), &scale, tolerance),
-            Some(before) => {
-                let mut reach = before.moved(&scaled(&placement, &scale));
-                let mut rows = Span::empty();
-                for (twist, motion) in freedoms {
-                    let twist = of_order_one(&twist, &scale);
-                    let step = reach.cross(&twist, motion, torques && inner.is_some(), tolerance);
-                    rows.join(&step, tolerance);
-                }
-                visible = Some(rows);
-                reach
-            }
-        };
-        if piece.is_some() {
-            let rows = match (visible, inner) {
-                (Some(rows), Some(_)) => rows,
-                _ => {
-                    let own = unknown.iter().filter(|&&(of, _)| Some(of) == piece);
-                    let own = own
-                        .map(|(_, wrench)| of_length_one(wrench, &scale))
-                        .collect();
-                    let axes = match measured {
-                        Measured::Torques => Span::empty(),
-                        Measured::Wrench | Measured::Both => Span::without(own, tolerance),
-                    };
-                    reach.begin(axes, tolerance);
-                    reach.rows().clone()
-                }
-            };
-            let hidden = Hidden::new(&rows, &scale, tolerance);
-            invisible.push(Invisible {
-                joint: inner.map(|_| numbers[number].saturating_sub(1)),
-                link: numbers[number],
-                directions: hidden.count(),
+    }
+    (columns, names)
+}
+
+/// The recursion of the spans from the base over all links.
+struct Recursion<'a> {
+    visits: Vec<Visit>,
+    scope: Scope<'a>,
+    measured: Measurement,
+    /// None if the base is free.
+    gravity: Option<Vec3>,
+    /// See [`contact_wrenches`].
+    contacts: Vec<(usize, Wrench)>,
+    units: Units,
+    tolerance: f64,
+}
+
+impl Recursion<'_> {
+    /// The links of the scope, with what is hidden beyond the joint before each, in the order of
+    /// the pass.
+    fn composites(&self, model: &Model, links: &[usize], sensors: &[usize]) -> Vec<Composite> {
+        let cuts = self.scope.structure().map_or(&[][..], Structure::sensors);
+        let sides: Vec<_> = sensors.iter().map(|&k| sides(model, &cuts[k])).collect();
+        let mut places = vec![0; self.visits.len()];
+        let mut composites = Vec::with_capacity(links.len());
+        for (number, (visit, hidden)) in self.visits.iter().zip(self.hidden()).enumerate() {
+            let Some(hidden) = hidden else { continue };
+            let offsets = sides.iter().enumerate().flat_map(|(column, sides)| {
+                let own = sides.iter().filter(|(link, _)| *link == visit.link);
+                own.map(move |(_, carry)| (column, *carry))
             });
-            places[number] = members.len();
-            members.push(Member {
-                block: measured_numbers.partition_point(|&other| other < numbers[number]),
-                inner: inner.map(|inner| (places[inner], placement)),
+            places[number] = composites.len();
+            composites.push(Composite {
+                block: links.partition_point(|&other| other < visit.link),
+                inner: self
+                    .inner(visit)
+                    .map(|inner| (places[inner], visit.placement)),
                 hidden,
-                offsets: attached
-                    .iter()
-                    .filter(|attached| attached.body == number)
-                    .map(|attached| (attached.column, attached.carry))
-                    .collect(),
+                offsets: offsets.collect(),
             });
         }
-        reaches[number] = Some(reach);
+        composites
     }
-    let assembled = assemble(&members, sensors, &scale, tolerance);
-    Ok(Identifiable {
-        columns: Vec::new(),
-        names: Vec::new(),
-        basis: assembled.basis,
-        null: assembled.null,
-        invisible,
-        confused: assembled.confused,
-    })
+
+    /// The previous link, if it is in the same separately measured part.
+    fn inner(&self, visit: &Visit) -> Option<usize> {
+        let part = self.scope.part_of(visit.link)?;
+        let of_parent = |&parent: &usize| self.scope.part_of(self.visits[parent].link);
+        visit
+            .parent
+            .filter(|parent| of_parent(parent) == Some(part))
+    }
+
+    /// Per link of the pass, if it is in the scope, what is hidden beyond the joint before it.
+    fn hidden(&self) -> Vec<Option<Hidden>> {
+        let (units, tolerance) = (&self.units, self.tolerance);
+        let torques = self.measured != Measurement::Wrench;
+        let parts: Vec<_> = self
+            .visits
+            .iter()
+            .map(|v| self.scope.part_of(v.link))
+            .collect();
+        // Links between the base and a measured one are needed too.
+        let mut is_needed: Vec<bool> = parts.iter().map(Option::is_some).collect();
+        for (number, visit) in self.visits.iter().enumerate().rev() {
+            if let Some(parent) = visit.parent {
+                is_needed[parent] |= is_needed[number];
+            }
+        }
+        let mut reaches: Vec<Option<Reach>> = vec![None; self.visits.len()];
+        let mut all_hidden = Vec::with_capacity(self.visits.len());
+        for (number, visit) in self.visits.iter().enumerate() {
+            if !is_needed[number] {
+                all_hidden.push(None);
+                continue;
+            }
+            let inner = self.inner(visit);
+            let mut rows = Subspace::empty();
+            let mut reach = match visit.parent.and_then(|parent| reaches[parent].as_ref()) {
+                None => match self.gravity {
+                    None => Reach::free(),
+                    Some(gravity) => Reach::standing(&(gravity / -units.acceleration)),
+                },
+                Some(before) => before.moved(&units.pose(&visit.placement)),
+            };
+            if let Some((twist, moves)) = &visit.freedom {
+                let measured = torques && inner.is_some();
+                let own = reach.cross(&units.twist(twist), *moves, measured, tolerance);
+                rows.join(&own, tolerance);
+            }
+            if let (Some(part), None) = (parts[number], inner) {
+                reach.begin(self.measured_twists(part), tolerance);
+                rows = reach.rows().clone();
+            }
+            let hidden = parts[number].map(|_| Hidden::new(&rows, units, tolerance));
+            all_hidden.push(hidden);
+            reaches[number] = Some(reach);
+        }
+        all_hidden
+    }
+
+    /// The twists along which the balance of a part is measured, where its pass begins.
+    fn measured_twists(&self, part: usize) -> Subspace<6> {
+        if self.measured == Measurement::Torques {
+            return Subspace::empty();
+        }
+        let own = self.contacts.iter().filter(|(of, _)| *of == part);
+        let unknown = own.map(|(_, wrench)| self.units.wrench(wrench)).collect();
+        Subspace::without(unknown, self.tolerance)
+    }
 }

@@ -4,13 +4,12 @@
 mod columns;
 
 use crate::regressor::subtree::columns::{contact_columns, put, wrench_columns};
-use nalgebra::{DMatrixView, Matrix6, Vector6};
+use nalgebra::{Matrix6, Vector6};
 
 use crate::error::{DynamicsError, check_size};
 use crate::kinematics::{ExternalWrench, Kinematics, check_external, check_readings};
 use crate::least_squares::{LeastSquares, noise_factor, scale_factor};
 use crate::regressor::link::{LINK_PARAMETERS, WITH_FORCE, link_rows};
-use crate::regressor::tree::transposed_view;
 use crate::spatial::{Pose, Wrench};
 use crate::structure::{ContactSet, Structure};
 
@@ -161,11 +160,6 @@ impl SubTreeRegressor {
     /// There is no such row.
     pub fn row(&self, row: usize) -> &[f64] {
         &self.values[self.stride * row..][..self.column_count()]
-    }
-
-    /// The six rows as the columns of a view.
-    pub fn transposed(&self) -> DMatrixView<'_, f64> {
-        transposed_view(&self.values, self.column_count(), 6, self.stride)
     }
 
     /// The right side: the raw readings of the sensors, as wrenches by the rest of the robot on
@@ -465,208 +459,4 @@ impl StackedRegressor {
     pub fn subtrees(&self) -> &[SubTreeRegressor] {
         &self.subtrees
     }
-
-    /// Number of stacked rows, six per sub-tree.
-    pub fn row_count(&self) -> usize {
-        6 * self.subtrees.len()
-    }
-
-    /// First of the stacked columns of contacts, `10 N_B + 6 per sensor`: after those of all links
-    /// and offsets.
-    pub fn contact_column(&self) -> usize {
-        LINK_PARAMETERS * self.structure.link_count() + 6 * self.sensors.len()
-    }
-
-    /// Number of stacked columns:
-    /// `10 N_B + 6 per sensor + unknowns of the contacts present at the last update`.
-    pub fn column_count(&self) -> usize {
-        let unknown: usize = self.subtrees.iter().map(|subtree| subtree.unknown).sum();
-        self.contact_column() + unknown
-    }
-
-    /// Each present contact with its stacked columns, ascending.
-    pub fn contacts(&self) -> impl Iterator<Item = PresentContact> {
-        let present = |contact| {
-            let mut own = self.subtrees.iter().flat_map(|subtree| &subtree.contacts);
-            own.find(|present| present.contact == contact)
-        };
-        (0..self.structure.contacts().len())
-            .filter_map(present)
-            .scan(self.contact_column(), |column, present| {
-                let first = *column;
-                *column += present.unknowns;
-                Some(PresentContact {
-                    column: first,
-                    ..*present
-                })
-            })
-    }
-
-    /// Writes all rows, zeros included, one after the other into `out`: `row_count x column_count`
-    /// numbers.
-    ///
-    /// # Errors
-    /// The length of `out` is wrong. Nothing is changed in that case.
-    pub fn write_stacked(&self, out: &mut [f64]) -> Result<(), DynamicsError> {
-        let columns = self.column_count();
-        check_size(
-            "numbers of the stacked regressor",
-            out.len(),
-            self.row_count() * columns,
-        )?;
-        out.fill(0.0);
-        for (number, subtree) in self.subtrees.iter().enumerate() {
-            for row in 0..6 {
-                let (from, to) = (
-                    subtree.row(row),
-                    &mut out[(6 * number + row) * columns..][..columns],
-                );
-                spread(&self.structure, number, from, to);
-            }
-        }
-        for stacked in self.contacts() {
-            for (number, subtree) in self.subtrees.iter().enumerate() {
-                for own in subtree
-                    .contacts
-                    .iter()
-                    .filter(|own| own.contact == stacked.contact)
-                {
-                    for row in 0..6 {
-                        out[(6 * number + row) * columns + stacked.column..][..own.unknowns]
-                            .copy_from_slice(
-                                &subtree.row(row)[own.column..own.column + own.unknowns],
-                            );
-                    }
-                }
-            }
-        }
-        Ok(())
-    }
-
-    /// Writes the covariance of all stacked rows from F/T noise into `out`, `6 K x 6 K`, row by
-    /// row. Sub-trees that share a sensor are correlated: it enters the two with opposite signs.
-    ///
-    /// # Errors
-    /// The length of `out` is wrong. Nothing is changed in that case.
-    pub fn write_covariance(&self, out: &mut [f64]) -> Result<(), DynamicsError> {
-        check_size(
-            "numbers of the stacked covariance",
-            out.len(),
-            self.row_count() * self.row_count(),
-        )?;
-        self.covariance_of(|_| 6, SubTreeRegressor::row, out);
-        Ok(())
-    }
-
-    /// Number of rows that remain without contact columns, of all sub-trees. Zero before
-    /// [`StackedRegressor::eliminate_contacts`].
-    pub fn projected_row_count(&self) -> usize {
-        self.subtrees.iter().map(|subtree| subtree.remaining).sum()
-    }
-
-    /// Writes all rows that remain without contact columns, sub-tree by sub-tree, zeros included,
-    /// one after the other into `rows`: `projected_row_count x contact_column` numbers, over the
-    /// columns `[10 N_B | 6 per sensor]`; and their right sides into `measured`.
-    ///
-    /// # Errors
-    /// One of the two has the wrong length. Nothing is changed in that case.
-    pub fn write_projected(
-        &self,
-        rows: &mut [f64],
-        measured: &mut [f64],
-    ) -> Result<(), DynamicsError> {
-        let (count, columns) = (self.projected_row_count(), self.contact_column());
-        check_size("numbers of the projected rows", rows.len(), count * columns)?;
-        check_size("right sides of the projected rows", measured.len(), count)?;
-        rows.fill(0.0);
-        let mut next = 0;
-        for (number, subtree) in self.subtrees.iter().enumerate() {
-            for (row, value) in subtree.projected_measured().iter().enumerate() {
-                let to = &mut rows[columns * next..columns * (next + 1)];
-                spread(&self.structure, number, subtree.projected_row(row), to);
-                measured[next] = *value;
-                next += 1;
-            }
-        }
-        Ok(())
-    }
-
-    /// Writes the covariance of the rows that remain without contact columns from F/T noise into
-    /// `out`, square, row by row. With [`Weighting::Noise`] it has identities on its diagonal, one
-    /// for each sub-tree with sensors; between sub-trees that share a sensor it is not zero.
-    ///
-    /// # Errors
-    /// The length of `out` is wrong. Nothing is changed in that case.
-    pub fn write_projected_covariance(&self, out: &mut [f64]) -> Result<(), DynamicsError> {
-        let count = self.projected_row_count();
-        check_size(
-            "numbers of the projected covariance",
-            out.len(),
-            count * count,
-        )?;
-        self.covariance_of(
-            SubTreeRegressor::remaining,
-            SubTreeRegressor::projected_row,
-            out,
-        );
-        Ok(())
-    }
-
-    /// Covariance of rows of each sub-tree, from their columns of offsets: noise enters as an
-    /// offset does.
-    fn covariance_of(
-        &self,
-        count: impl Fn(&SubTreeRegressor) -> usize,
-        row: impl for<'b> Fn(&'b SubTreeRegressor, usize) -> &'b [f64],
-        out: &mut [f64],
-    ) {
-        let rows: usize = self.subtrees.iter().map(&count).sum();
-        out.fill(0.0);
-        let mut top = 0;
-        for a in &self.subtrees {
-            let mut left = 0;
-            for b in &self.subtrees {
-                for (place_a, sensor) in a.sensors().enumerate() {
-                    let Some(place_b) = b.sensors().position(|other| other == sensor) else {
-                        continue;
-                    };
-                    let from_a = a.offset_column() + 6 * place_a;
-                    let from_b = b.offset_column() + 6 * place_b;
-                    for i in 0..count(a) {
-                        for j in 0..count(b) {
-                            let pairs = row(a, i)[from_a..from_a + 6]
-                                .iter()
-                                .zip(&row(b, j)[from_b..from_b + 6]);
-                            out[(top + i) * rows + left + j] += pairs
-                                .zip(&self.variances[sensor])
-                                .map(|((x, y), variance)| x * y * variance)
-                                .sum::<f64>();
-                        }
-                    }
-                }
-                left += count(b);
-            }
-            top += count(a);
-        }
-    }
-}
-
-/// Writes a row over the columns of a sub-tree's links and offsets to the stacked columns of all
-/// sub-trees. The contact columns that follow in the row are omitted; nothing else of `stacked` is
-/// written.
-pub(super) fn spread(structure: &Structure, subtree: usize, row: &[f64], stacked: &mut [f64]) {
-    let mut rest = row;
-    let mut put = |start: usize, width: usize| {
-        let (block, left) = rest.split_at(width);
-        stacked[start..start + width].copy_from_slice(block);
-        rest = left;
-    };
-    structure
-        .links_of(subtree)
-        .for_each(|link| put(LINK_PARAMETERS * link, LINK_PARAMETERS));
-    let offsets = LINK_PARAMETERS * structure.link_count();
-    let sensors = structure.subtrees()[subtree].sensors;
-    sensors
-        .iter()
-        .for_each(|sensor| put(offsets + 6 * sensor, 6));
 }

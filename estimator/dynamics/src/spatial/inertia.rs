@@ -1,6 +1,6 @@
 //! Rigid-body inertia: ten parameters, and the test of their physical consistency.
 
-use crate::spatial::{Mat3, Motion, Pose, Vec3, Wrench};
+use crate::spatial::{Mat3, Pose, Vec3, Wrench};
 use nalgebra::Matrix4;
 use std::ops::Add;
 
@@ -130,15 +130,6 @@ impl RigidInertia {
             mass: self.mass,
             first_moment: h + t * self.mass,
             inertia,
-        }
-    }
-
-    /// Momentum about the origin of a body that moves with `twist`:
-    /// `[I omega + h x v; m v - h x omega]`.
-    pub fn momentum(&self, twist: &Motion) -> Wrench {
-        Wrench {
-            torque: self.inertia * twist.angular + self.first_moment.cross(&twist.linear),
-            force: twist.linear * self.mass - self.first_moment.cross(&twist.angular),
         }
     }
 

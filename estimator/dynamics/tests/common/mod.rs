@@ -5,12 +5,14 @@
 
 use std::fmt::Write as _;
 
+use nalgebra::DMatrix;
 use proprio_dynamics::model::{
     Frame, Joint, JointKind, MeasurementDirection, MeasurementFrame, Model,
 };
-use proprio_dynamics::spatial::{Motion, Pose, Vec3, Wrench};
+use proprio_dynamics::spatial::{Motion, Pose, RigidInertia, Vec3, Wrench};
 use proprio_dynamics::{
-    ContactKind, ContactSpec, ExternalWrench, FrameMotion, JointState, Kinematics, Noise, SensorCut,
+    ContactKind, ContactSpec, ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics,
+    Noise, SensorCut,
 };
 
 /// SplitMix64: small, and the same on every machine.
@@ -277,6 +279,47 @@ pub(crate) fn motion(random: &mut Random) -> FrameMotion {
         angular_acceleration: random.vector(5.0),
         proper_acceleration: random.vector(10.0),
     }
+}
+
+/// The ten parameters of every link.
+pub(crate) fn parameters(model: &Model) -> Vec<f64> {
+    let links = model.inertias().iter();
+    links.flat_map(RigidInertia::parameters).collect()
+}
+
+/// The mass matrix for a floating base, column by column: inverse dynamics of unit accelerations
+/// at rest. Rows and columns are those of the base, force and linear part first, then the joints.
+pub(crate) fn mass_matrix(model: &Model, base: usize, position: &[f64]) -> DMatrix<f64> {
+    let (size, still) = (6 + model.dof_count(), vec![0.0; model.dof_count()]);
+    let (mut kinematics, mut inverse) = (
+        Kinematics::new(model, base).unwrap(),
+        InverseDynamics::new(model),
+    );
+    let mut mass = DMatrix::zeros(size, size);
+    for column in 0..size {
+        let unit: Vec<f64> = (0..size)
+            .map(|i| f64::from(u8::from(i == column)))
+            .collect();
+        let state = JointState {
+            position,
+            velocity: &still,
+            acceleration: &unit[6..],
+        };
+        let motion = FrameMotion {
+            angular_velocity: Vec3::zeros(),
+            angular_acceleration: Vec3::from_column_slice(&unit[3..6]),
+            proper_acceleration: Vec3::from_column_slice(&unit[..3]),
+        };
+        kinematics.update(model, state, &motion).unwrap();
+        inverse.update(model, &kinematics, &[]).unwrap();
+        let rows = inverse.base_wrench().force_first();
+        let rows = rows.iter().chain(inverse.torque()).copied();
+        mass.column_mut(column)
+            .iter_mut()
+            .zip(rows)
+            .for_each(|(to, row)| *to = row);
+    }
+    mass
 }
 
 /// The unit motion of a joint's URDF child relative to its parent, in base coordinates, from the

@@ -537,7 +537,8 @@ impl Place {
             return nothing;
         };
         let torque = |&dof: &usize| {
-            let row = row(&rows, dof, parameters.len())?;
+            let mut row = vec![0.0; parameters.len()];
+            rows.torque_row(dof, &mut row).ok()?;
             let measured = rows.torque_measured(dof, &readings, &[]).ok()?;
             Some((measured + dot(&row, parameters), row))
         };
@@ -659,16 +660,6 @@ fn measured_with(unit: &Unit, units: &[Unit]) -> Vec<usize> {
         }
     }
     found
-}
-
-/// The row of a torque over the columns of the robot.
-fn row(rows: &EstimateRows<'_>, dof: usize, columns: usize) -> Option<Vec<f64>> {
-    let subtree = rows.torque_subtree(dof)?;
-    let mut own = vec![0.0; rows.column_count(subtree)?];
-    rows.torque_row(dof, &mut own).ok()?;
-    let mut all = vec![0.0; columns];
-    rows.expand(subtree, &own, &mut all).ok()?;
-    Some(all)
 }
 
 #[cfg(test)]

@@ -11,7 +11,7 @@ use crate::finding::Finding;
 use crate::training::Excluded;
 use nalgebra::DMatrix;
 use proprio_dynamics::calibration::{Calibration, Kind, Unknown};
-use proprio_dynamics::regressor::identifiable::Column;
+use proprio_dynamics::regressor::identifiable::ParameterColumn;
 use proprio_dynamics::spatial::RigidInertia;
 use proprio_topics::Nanos;
 
@@ -120,7 +120,7 @@ pub struct LinkOutcome {
 #[derive(Clone, Debug, PartialEq)]
 pub struct CovarianceRoot {
     /// Quantities of the first rows: ten parameters of each seen link, then six offsets per sensor.
-    pub columns: Vec<Column>,
+    pub columns: Vec<ParameterColumn>,
     /// Quantities of the rows after those: the sensor's number and its calibration parameter.
     pub calibrations: Vec<(usize, Unknown)>,
     /// `U`, square, upper triangular; the covariance is `U U^T`.

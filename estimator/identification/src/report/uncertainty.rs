@@ -10,7 +10,7 @@ use crate::training::TrainingLog;
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::regressor::identifiable::{
-    BaseParameter, Column, Identifiable, JointMotion, Measured, Offsets, Scope, Term,
+    BaseParameter, Identifiable, JointMotion, Measurement, Offsets, ParameterColumn, Scope, Term,
 };
 use proprio_dynamics::spatial::RigidInertia;
 
@@ -413,10 +413,12 @@ pub(crate) fn covariance(
     );
     let mut columns = Vec::new();
     for &link in &unknowns.links {
-        columns.extend((0..LINK_PARAMETERS).map(|parameter| Column::Inertial { link, parameter }));
+        columns.extend(
+            (0..LINK_PARAMETERS).map(|parameter| ParameterColumn::Inertial { link, parameter }),
+        );
     }
     for &sensor in &unknowns.sensors {
-        columns.extend((0..6).map(|component| Column::Offset { sensor, component }));
+        columns.extend((0..6).map(|component| ParameterColumn::Offset { sensor, component }));
     }
     let wide = root.ncols();
     let mut joint = DMatrix::zeros(p + s, wide + s);
@@ -562,7 +564,7 @@ pub(crate) fn subspace(
             &robot.model,
             Scope::Tree,
             &regime,
-            Measured::Torques,
+            Measurement::Torques,
             Offsets::Known,
         )
         .ok();
@@ -580,9 +582,9 @@ pub(crate) fn subspace(
     };
     let both = (0..regime.joints.len())
         .all(is_measured)
-        .then(|| of(Measured::Both))
+        .then(|| of(Measurement::Both))
         .flatten();
-    both.or_else(|| of(Measured::Wrench))
+    both.or_else(|| of(Measurement::Wrench))
 }
 
 pub(crate) fn base_parameters(
@@ -600,8 +602,10 @@ pub(crate) fn base_parameters(
         let columns = subspace.columns().iter();
         columns
             .map(|column| match column {
-                Column::Inertial { link, parameter } => bodies[*link].parameters()[*parameter],
-                Column::Offset { .. } => 0.0,
+                ParameterColumn::Inertial { link, parameter } => {
+                    bodies[*link].parameters()[*parameter]
+                }
+                ParameterColumn::Offset { .. } => 0.0,
             })
             .collect()
     };
@@ -609,7 +613,7 @@ pub(crate) fn base_parameters(
     let (mut out, mut not_separable, mut rank) = (Vec::new(), Vec::new(), 0);
     for base in subspace.base_parameters() {
         let is_inertial =
-            |column: usize| matches!(subspace.columns()[column], Column::Inertial { .. });
+            |column: usize| matches!(subspace.columns()[column], ParameterColumn::Inertial { .. });
         let all = || std::iter::once(&base.kept).chain(&base.terms);
         let inertial = all().filter(|t| is_inertial(t.column)).count();
         let offsets = all().count() - inertial;
@@ -624,7 +628,7 @@ pub(crate) fn base_parameters(
         let mut row = DVector::zeros(unknowns.parameters());
         let mut seen = true;
         for term in all() {
-            if let Column::Inertial { link, parameter } = subspace.columns()[term.column] {
+            if let ParameterColumn::Inertial { link, parameter } = subspace.columns()[term.column] {
                 match unknowns.links.binary_search(&link) {
                     Ok(place) => row[LINK_PARAMETERS * place + parameter] += term.coefficient,
                     Err(_) => seen = false,
@@ -636,8 +640,8 @@ pub(crate) fn base_parameters(
             continue;
         };
         let unit = match subspace.columns()[base.kept.column] {
-            Column::Inertial { parameter: 0, .. } => "kg",
-            Column::Inertial {
+            ParameterColumn::Inertial { parameter: 0, .. } => "kg",
+            ParameterColumn::Inertial {
                 parameter: 1..=3, ..
             } => "kg m",
             _ => "kg m^2",

@@ -179,12 +179,9 @@ impl Bench for Regression {
     fn show(&self, output: &mut Output) {
         let (model, parameters) = (&self.robot.model, self.robot.parameters());
         let times = |row: &[f64]| row.iter().zip(&parameters).map(|(a, b)| a * b).sum::<f64>();
-        output.add3(
-            "moment",
-            "base",
-            self.regressor.base_torque_rows().map(times),
-        );
-        output.add3("force", "base", self.regressor.base_force_rows().map(times));
+        let three = |rows: [usize; 3]| rows.map(|row| times(self.regressor.row(row)));
+        output.add3("moment", "base", three([0, 1, 2]));
+        output.add3("force", "base", three([3, 4, 5]));
         let rows = (0..model.dof_count()).filter_map(|dof| self.regressor.joint_row(dof));
         self.robot
             .show_torque(&rows.map(times).collect::<Vec<_>>(), output);
@@ -207,10 +204,8 @@ const SAMPLES_IN_PASS: usize = 16;
 impl Identification {
     fn new(robot: &Rc<Robot>) -> Self {
         let regression = Regression::new(robot);
-        let (rows, columns) = (
-            regression.regressor.row_count(),
-            regression.regressor.column_count(),
-        );
+        let model = &robot.model;
+        let (rows, columns) = (6 + model.dof_count(), 10 * model.link_count());
         Self {
             regression,
             information: Information::new(columns),

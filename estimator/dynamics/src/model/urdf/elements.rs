@@ -1,32 +1,34 @@
 //! Reads the elements of a URDF: their numbers and names, with a message that has the place where
 //! one is missing or wrong, and the elements of F/T sensors.
 
-use super::{MeasurementDirection, MeasurementFrame, ModelError, Node, SensorElement, Unread};
-use crate::model::Place;
+use super::{
+    ElementRef, MeasurementDirection, MeasurementFrame, ModelError, SensorElement, Unread,
+};
+use crate::model::Location;
 use crate::spatial::Pose;
 use std::collections::HashSet;
 
 /// The place of an element of a link or joint.
-pub(super) fn place(element: Node<'_>, owner: Node<'_>) -> Place {
+pub(super) fn place(element: ElementRef<'_>, owner: ElementRef<'_>) -> Location {
     let name = owner.attribute("name").unwrap_or("(without a name)");
-    Place {
+    Location {
         line: element.line(),
         owner: format!("{} {name}", owner.name()),
     }
 }
 
 /// An element's name as it is written.
-fn tag(element: Node<'_>) -> String {
+fn tag(element: ElementRef<'_>) -> String {
     format!("<{}>", element.name())
 }
 
 /// The element `<...>` directly in another one.
 pub(super) fn part<'d>(
-    parent: Node<'d>,
-    owner: Node<'d>,
+    parent: ElementRef<'d>,
+    owner: ElementRef<'d>,
     missing: &'static str,
     remedy: &'static str,
-) -> Result<Node<'d>, ModelError> {
+) -> Result<ElementRef<'d>, ModelError> {
     let name = missing.trim_matches(['<', '>']);
     parent.child(name).ok_or_else(|| ModelError::Missing {
         place: place(parent, owner),
@@ -39,8 +41,8 @@ pub(super) fn part<'d>(
 
 /// The value of an attribute, which is there, not empty, and expanded.
 pub(super) fn required<'d>(
-    element: Node<'d>,
-    owner: Node<'d>,
+    element: ElementRef<'d>,
+    owner: ElementRef<'d>,
     attribute: &'static str,
     remedy: &'static str,
 ) -> Result<&'d str, ModelError> {
@@ -66,8 +68,8 @@ pub(super) fn required<'d>(
 
 /// The value of an attribute, unless xacro would put something else in its place.
 fn expanded<'d>(
-    element: Node<'d>,
-    owner: Node<'d>,
+    element: ElementRef<'d>,
+    owner: ElementRef<'d>,
     attribute: &str,
     value: &'d str,
 ) -> Result<&'d str, ModelError> {
@@ -81,7 +83,7 @@ fn expanded<'d>(
 }
 
 /// Refuses elements that xacro would replace: links and joints may be missing.
-pub(super) fn check_expanded(robot: Node<'_>) -> Result<(), ModelError> {
+pub(super) fn check_expanded(robot: ElementRef<'_>) -> Result<(), ModelError> {
     let mut inside = robot.descendants();
     match inside.find(|node| node.name().starts_with("xacro:")) {
         None => Ok(()),
@@ -94,8 +96,8 @@ pub(super) fn check_expanded(robot: Node<'_>) -> Result<(), ModelError> {
 
 /// The `N` numbers of an attribute; none if it is missing or empty.
 pub(super) fn numbers<const N: usize>(
-    element: Node<'_>,
-    owner: Node<'_>,
+    element: ElementRef<'_>,
+    owner: ElementRef<'_>,
     attribute: &str,
 ) -> Result<Option<[f64; N]>, ModelError> {
     let Some(value) = element.attribute(attribute) else {
@@ -130,12 +132,17 @@ pub(super) fn numbers<const N: usize>(
 }
 
 /// Warns of elements that occur twice: the first one counts, as in urdfdom.
-pub(super) fn once(element: Node<'_>, owner: Node<'_>, names: &[&str], warnings: &mut Vec<String>) {
+pub(super) fn once(
+    element: ElementRef<'_>,
+    owner: ElementRef<'_>,
+    names: &[&str],
+    warnings: &mut Vec<String>,
+) {
     let mut seen = HashSet::new();
     for child in element.children() {
         let name = child.name();
         if names.contains(&name) && !seen.insert(name) {
-            let Place { line, owner } = place(child, owner);
+            let Location { line, owner } = place(child, owner);
             warnings.push(format!(
                 "line {line}: {owner}: <{name}> occurs twice; the first one counts"
             ));
@@ -146,12 +153,13 @@ pub(super) fn once(element: Node<'_>, owner: Node<'_>, names: &[&str], warnings:
 /// Reads both forms of F/T `<sensor>` elements. One that cannot be understood becomes a warning,
 /// and is kept with what is wrong: the configuration may replace it.
 pub(super) fn read_sensors(
-    robot: Node<'_>,
+    robot: ElementRef<'_>,
     warnings: &mut Vec<String>,
 ) -> (Vec<SensorElement>, Vec<Unread>) {
     let (mut sensors, mut unread): (Vec<SensorElement>, Vec<Unread>) = (Vec::new(), Vec::new());
-    let is_sensor =
-        |node: &Node<'_>| node.name() == "sensor" && node.attribute("type") == Some("force_torque");
+    let is_sensor = |node: &ElementRef<'_>| {
+        node.name() == "sensor" && node.attribute("type") == Some("force_torque")
+    };
     let plain = robot.children().filter(is_sensor).map(|node| {
         (
             node,
@@ -206,13 +214,13 @@ fn is_same_sensor(a: &SensorElement, b: &SensorElement) -> bool {
 }
 
 pub(super) fn read_sensor(
-    node: Node<'_>,
+    node: ElementRef<'_>,
     name: &str,
     joint: &str,
 ) -> Result<SensorElement, String> {
     let inner = |wanted: &str| {
         node.descendant(wanted)
-            .map(Node::text)
+            .map(ElementRef::text)
             .filter(|text| !text.is_empty())
     };
     let frame = match inner("frame") {

@@ -9,44 +9,16 @@
 //! to the top. At each body ten directions are still open. The `n` null pairs of the joint towards
 //! the top involve `n` of them; the others are final.
 
-use nalgebra::{DMatrix, SMatrix, SymmetricEigen};
+use nalgebra::{DMatrix, Matrix6, SMatrix, SymmetricEigen};
 
-use super::reach::{Span, coefficients};
+use super::pass::{Units, wrench_transform};
+use super::reach::{Subspace, coefficients};
 use crate::spatial::{Pose, RigidInertia};
 
 pub(super) type Matrix10 = SMatrix<f64, 10, 10>;
 
 /// Entries below this, relative to one, are rounding errors.
 const ROUNDING: f64 = 1e-13;
-
-/// Units in which geometry and motion are of order one; mass is in kg.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Scale {
-    /// [m]
-    pub(super) length: f64,
-    /// [m/s^2]
-    pub(super) acceleration: f64,
-}
-
-impl Scale {
-    /// Factor from a parameter in SI units to the scaled one.
-    fn parameter(&self, index: usize) -> f64 {
-        match index {
-            0 => 1.0,
-            1..=3 => 1.0 / self.length,
-            _ => 1.0 / (self.length * self.length),
-        }
-    }
-
-    /// Factor from a component of an offset, [torque; force], in SI units to the scaled one.
-    pub(super) fn offset(&self, component: usize) -> f64 {
-        if component < 3 {
-            1.0 / (self.acceleration * self.length)
-        } else {
-            1.0 / self.acceleration
-        }
-    }
-}
 
 /// The unobservable and observable parts, for the rows of one joint or of the top, of its composite
 /// `theta` and the offsets `O` beyond it; SI units, [torque; force].
@@ -63,7 +35,7 @@ pub(super) struct Hidden {
 }
 
 impl Hidden {
-    pub(super) fn new(rows: &Span<16>, scale: &Scale, tolerance: f64) -> Self {
+    pub(super) fn new(rows: &Subspace<16>, units: &Units, tolerance: f64) -> Self {
         let mut rest: Vec<[f64; 16]> = rows.basis().iter().map(coefficients).collect();
         // Gram-Schmidt on the parameter part, carrying the offset part along.
         let inertial = |row: &[f64; 16]| row[..10].iter().map(|x| x * x).sum::<f64>();
@@ -92,11 +64,11 @@ impl Hidden {
         }
         let offsets = rest
             .iter()
-            .map(|row| std::array::from_fn(|i| clean(row[10 + i]) * scale.offset(i)))
+            .map(|row| std::array::from_fn(|i| clean(row[10 + i]) * units.offset(i)))
             .collect();
 
         let rank = kept.len();
-        let inertial = DMatrix::from_fn(10, rank, |i, k| kept[k][i] * scale.parameter(i));
+        let inertial = DMatrix::from_fn(10, rank, |i, k| kept[k][i] * units.parameter(i));
         let (q, r) = householder(inertial);
         let (transfers, pivots) = reduced(&q.columns(rank, 10 - rank).into_owned());
         // The theta of least norm with inertial^T theta = -offset part.
@@ -104,7 +76,7 @@ impl Hidden {
         for component in 0..6 {
             let mut y: Vec<f64> = kept
                 .iter()
-                .map(|row| -clean(row[10 + component]) * scale.offset(component))
+                .map(|row| -clean(row[10 + component]) * units.offset(component))
                 .collect();
             for i in 0..rank {
                 let known: f64 = (0..i).map(|k| r[(k, i)] * y[k]).sum();
@@ -121,15 +93,11 @@ impl Hidden {
             offsets,
         }
     }
-
-    pub(super) fn count(&self) -> usize {
-        self.pivots.len()
-    }
 }
 
 /// One body of a separately measured part of the robot.
 #[derive(Clone, Debug)]
-pub(super) struct Member {
+pub(super) struct Composite {
     /// Index of its block of ten columns: 0 for the first ten.
     pub(super) block: usize,
     /// Its inner member in the same part, and its pose in that member at the reference position;
@@ -138,7 +106,7 @@ pub(super) struct Member {
     pub(super) hidden: Hidden,
     /// Offsets of sensors on this body: index of the six columns, and the 6 x 6 matrix that takes
     /// them to wrenches in its frame.
-    pub(super) offsets: Vec<(usize, SMatrix<f64, 6, 6>)>,
+    pub(super) offsets: Vec<(usize, Matrix6<f64>)>,
 }
 
 /// Result of `assemble`.
@@ -162,9 +130,9 @@ pub(super) struct NullVector {
 /// Assembles the members of all parts, each after its inner member and depth first, over
 /// `10 * members.len() + 6 * sensors` columns.
 pub(super) fn assemble(
-    members: &[Member],
+    members: &[Composite],
     sensors: usize,
-    scale: &Scale,
+    units: &Units,
     tolerance: f64,
 ) -> Assembled {
     let inertial = 10 * members.len();
@@ -186,11 +154,11 @@ pub(super) fn assemble(
     let count = 6 * sensors;
     let (hiding, visible) = offset_maps(members, &moved, count);
     // Rows on offsets alone, compared in scaled units; then made orthonormal in SI units.
-    let units: Vec<f64> = (0..count).map(|i| scale.offset(i % 6)).collect();
-    let found = independent_rows(visible, &units, tolerance);
+    let factors: Vec<f64> = (0..count).map(|i| units.offset(i % 6)).collect();
+    let found = independent_rows(visible, &factors, tolerance);
     let separate = found.len();
     let (q, _) = householder(DMatrix::from_fn(count, separate, |i, k| found[k][i]));
-    let seen = q.columns(0, separate);
+    let seen = q.columns(0, separate).into_owned();
     let unseen = q.columns(separate, count - separate).into_owned();
     let (unseen, pivots) = reduced(&unseen);
     for (k, &pivot) in pivots.iter().enumerate() {
@@ -207,33 +175,14 @@ pub(super) fn assemble(
         });
     }
 
-    // Rows [A | C] with A orthonormal: C follows from the null vectors (hiding o, o). The rows on
-    // offsets alone are subtracted, then the rows are made orthonormal: (1 + C C^T)^-1/2 = 1 + C
-    // g(C^T C) C^T with g(l) = -1 / (s (s + 1)), s = sqrt(1 + l).
-    let mut carried = -alone.tr_mul(&hiding);
-    let known = &carried * seen;
-    carried -= known * seen.transpose();
     let mut basis = DMatrix::zeros(inertial + count, rank + separate);
-    basis.view_mut((0, 0), (inertial, rank)).copy_from(&alone);
-    if carried.iter().any(|x| clean(*x) != 0.0) {
-        let gram = carried.tr_mul(&carried);
-        let SymmetricEigen {
-            eigenvectors,
-            eigenvalues,
-        } = SymmetricEigen::new(gram.clone());
-        let g = eigenvalues.map(|value| {
-            let s = (1.0 + value.max(0.0)).sqrt();
-            -1.0 / (s * (s + 1.0))
-        });
-        let g = &eigenvectors * DMatrix::from_diagonal(&g) * eigenvectors.transpose();
-        let factor = g * carried.transpose();
-        let mut parameters = basis.view_mut((0, 0), (inertial, rank));
-        parameters += (&alone * &carried) * &factor;
-        let offsets = carried.transpose() + gram * factor;
-        basis
-            .view_mut((inertial, 0), (count, rank))
-            .copy_from(&offsets);
-    }
+    let (parameters, offsets) = joined(alone, &hiding, &seen);
+    basis
+        .view_mut((0, 0), (inertial, rank))
+        .copy_from(&parameters);
+    basis
+        .view_mut((inertial, 0), (count, rank))
+        .copy_from(&offsets);
     basis
         .view_mut((inertial, rank), (count, separate))
         .copy_from(&seen);
@@ -244,8 +193,40 @@ pub(super) fn assemble(
     }
 }
 
+/// Orthonormal rows [A | C] over parameters and offsets, each as columns, from orthonormal rows
+/// `alone` over parameters: C follows from the null vectors (hiding o, o). The rows `seen` on
+/// offsets alone are subtracted, then the rows are made orthonormal: (1 + C C^T)^-1/2 = 1 + C
+/// g(C^T C) C^T with g(l) = -1 / (s (s + 1)), s = sqrt(1 + l).
+fn joined(
+    alone: DMatrix<f64>,
+    hiding: &DMatrix<f64>,
+    seen: &DMatrix<f64>,
+) -> (DMatrix<f64>, DMatrix<f64>) {
+    let mut carried = -alone.tr_mul(hiding);
+    let known = &carried * seen;
+    carried -= known * seen.transpose();
+    if carried.iter().all(|x| clean(*x) == 0.0) {
+        let offsets = DMatrix::zeros(carried.ncols(), carried.nrows());
+        return (alone, offsets);
+    }
+    let gram = carried.tr_mul(&carried);
+    let SymmetricEigen {
+        eigenvectors,
+        eigenvalues,
+    } = SymmetricEigen::new(gram.clone());
+    let g = eigenvalues.map(|value| {
+        let s = (1.0 + value.max(0.0)).sqrt();
+        -1.0 / (s * (s + 1.0))
+    });
+    let g = &eigenvectors * DMatrix::from_diagonal(&g) * eigenvectors.transpose();
+    let factor = g * carried.transpose();
+    let parameters = &alone + (&alone * &carried) * &factor;
+    let offsets = carried.transpose() + gram * factor;
+    (parameters, offsets)
+}
+
 /// The pairs: a transfer on the outer body, its opposite on the inner.
-fn null_pairs(members: &[Member], moved: &[Option<Matrix10>]) -> Vec<NullVector> {
+fn null_pairs(members: &[Composite], moved: &[Option<Matrix10>]) -> Vec<NullVector> {
     let mut null = Vec::new();
     for (member, moved) in members.iter().zip(moved) {
         for (k, &pivot) in member.hidden.pivots.iter().enumerate() {
@@ -271,21 +252,29 @@ fn null_pairs(members: &[Member], moved: &[Option<Matrix10>]) -> Vec<NullVector>
     null
 }
 
+/// What a body passes to its inner body.
+struct OpenDirections {
+    /// End of the range of members from this one on that are this one or beyond it.
+    end: usize,
+    /// Directions that its joint's null pairs involve, over ten entries per member beyond: 10
+    /// (end - member) x n.
+    directions: DMatrix<f64>,
+    /// The null pairs in these directions, n x n.
+    pairs: DMatrix<f64>,
+}
+
+/// How the null pairs of a joint turn the ten directions of its inner body that are open.
+struct JointTurn {
+    own: DMatrix<f64>,
+    /// What comes from the directions that the outer body passed up.
+    handed: DMatrix<f64>,
+}
+
 /// Orthonormal basis of the complement of all null pairs, `10 * members.len()` x `rank`.
-fn complement(members: &[Member], moved: &[Option<Matrix10>], rank: usize) -> DMatrix<f64> {
-    /// Data that a body passes to its inner body.
-    struct Open {
-        /// End of the range of members from this one on that are this one or beyond it.
-        end: usize,
-        /// Directions that its joint's null pairs involve, over ten entries per member beyond: 10
-        /// (end - member) x n.
-        directions: DMatrix<f64>,
-        /// The null pairs in these directions, n x n.
-        pairs: DMatrix<f64>,
-    }
+fn complement(members: &[Composite], moved: &[Option<Matrix10>], rank: usize) -> DMatrix<f64> {
     let mut basis = DMatrix::zeros(10 * members.len(), rank);
     let mut done = 0;
-    let mut open: Vec<Option<Open>> = members.iter().map(|_| None).collect();
+    let mut open: Vec<Option<OpenDirections>> = members.iter().map(|_| None).collect();
     let mut outer: Vec<Vec<usize>> = vec![Vec::new(); members.len()];
     for (number, member) in members.iter().enumerate() {
         if let Some((inner, _)) = member.inner {
@@ -293,32 +282,14 @@ fn complement(members: &[Member], moved: &[Option<Matrix10>], rank: usize) -> DM
         }
     }
     for (number, member) in members.iter().enumerate().rev() {
-        let beyond: Vec<(usize, Open)> = outer[number]
+        let beyond: Vec<(usize, OpenDirections)> = outer[number]
             .iter()
             .filter_map(|&child| open[child].take().map(|open| (child, open)))
             .collect();
-        // Ten directions stay open throughout, at first the parameters of this body. The joints
-        // beyond are processed one by one: the null pairs of a joint, in these ten and in the
-        // directions passed up, remove as many directions as were passed up. One matrix for all
-        // joints would cost the third power of their number.
-        let mut own = DMatrix::identity(10, 10);
-        let mut turns = Vec::with_capacity(beyond.len());
-        for (child, open) in &beyond {
-            let n = open.pairs.ncols();
-            let mut local = DMatrix::zeros(10 + n, n);
-            if let Some(moved) = &moved[*child] {
-                let opposite = -(own.tr_mul(moved) * &members[*child].hidden.transfers);
-                local.rows_mut(0, 10).copy_from(&opposite);
-            }
-            local.rows_mut(10, n).copy_from(&open.pairs);
-            let (q, _) = householder(local);
-            let turn = q.view((0, n), (10, 10)).into_owned();
-            own *= &turn;
-            turns.push((turn, q.view((10, n), (n, 10)).into_owned()));
-        }
+        let (mut own, turns) = take_pairs(members, moved, &beyond);
         // The null pairs of the joint towards the top, or the unobservable directions of the top,
         // among the ten directions still open.
-        let n = member.hidden.count();
+        let n = member.hidden.pivots.len();
         let (mut turned, involved) = householder(own.tr_mul(&member.hidden.transfers));
         own *= &turned;
         let end = beyond
@@ -334,9 +305,9 @@ fn complement(members: &[Member], moved: &[Option<Matrix10>], rank: usize) -> DM
         out.rows_mut(10 * member.block, 10)
             .copy_from(&own.columns(n, finished));
         // The directions passed up by each joint are rotated with all joints after it.
-        for ((child, open), (turn, handed)) in beyond.iter().zip(&turns).rev() {
-            let part = &open.directions * (handed * &turned);
-            turned = turn * turned;
+        for ((child, open), turn) in beyond.iter().zip(&turns).rev() {
+            let part = &open.directions * (&turn.handed * &turned);
+            turned = &turn.own * turned;
             directions
                 .rows_mut(10 * (child - number), part.nrows())
                 .copy_from(&part.columns(0, n));
@@ -347,7 +318,7 @@ fn complement(members: &[Member], moved: &[Option<Matrix10>], rank: usize) -> DM
         }
         done += finished;
         if member.inner.is_some() {
-            open[number] = Some(Open {
+            open[number] = Some(OpenDirections {
                 end,
                 directions,
                 pairs: involved,
@@ -357,9 +328,39 @@ fn complement(members: &[Member], moved: &[Option<Matrix10>], rank: usize) -> DM
     basis
 }
 
+/// Ten directions of a body stay open throughout, at first its parameters. The joints beyond are
+/// processed one by one: the null pairs of a joint, in these ten and in the directions passed up,
+/// remove as many directions as were passed up. (One matrix for all joints would cost the third
+/// power of their number.) Returns them over the body's parameters, and the turn by each joint.
+fn take_pairs(
+    members: &[Composite],
+    moved: &[Option<Matrix10>],
+    beyond: &[(usize, OpenDirections)],
+) -> (DMatrix<f64>, Vec<JointTurn>) {
+    let mut own = DMatrix::identity(10, 10);
+    let mut turns = Vec::with_capacity(beyond.len());
+    for (child, open) in beyond {
+        let n = open.pairs.ncols();
+        let mut local = DMatrix::zeros(10 + n, n);
+        if let Some(moved) = &moved[*child] {
+            let opposite = -(own.tr_mul(moved) * &members[*child].hidden.transfers);
+            local.rows_mut(0, 10).copy_from(&opposite);
+        }
+        local.rows_mut(10, n).copy_from(&open.pairs);
+        let (q, _) = householder(local);
+        let turn = q.view((0, n), (10, 10)).into_owned();
+        own *= &turn;
+        turns.push(JointTurn {
+            own: turn,
+            handed: q.view((10, n), (n, 10)).into_owned(),
+        });
+    }
+    (own, turns)
+}
+
 /// Per column of an offset, the parameters that hide it; and per row on offsets alone, its entries.
 fn offset_maps(
-    members: &[Member],
+    members: &[Composite],
     moved: &[Option<Matrix10>],
     count: usize,
 ) -> (DMatrix<f64>, Vec<Vec<f64>>) {
@@ -448,18 +449,6 @@ fn parameter_transform(x_ab: &Pose) -> Matrix10 {
             .parameters();
         matrix.set_column(k, &column.into());
     }
-    matrix
-}
-
-/// The matrix that takes a wrench [torque; force] in `b` to `a`, given `x_ab`.
-pub(super) fn wrench_transform(x_ab: &Pose) -> SMatrix<f64, 6, 6> {
-    let r = &x_ab.rotation;
-    let mut matrix = SMatrix::<f64, 6, 6>::zeros();
-    matrix.fixed_view_mut::<3, 3>(0, 0).copy_from(r);
-    matrix.fixed_view_mut::<3, 3>(3, 3).copy_from(r);
-    matrix
-        .fixed_view_mut::<3, 3>(0, 3)
-        .copy_from(&(x_ab.translation.cross_matrix() * r));
     matrix
 }
 

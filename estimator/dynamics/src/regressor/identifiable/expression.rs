@@ -76,68 +76,13 @@ impl fmt::Display for BaseParameter {
 /// The sums for these null vectors, each of which has a 1 at its pivot and zeros at the pivots of
 /// later ones.
 pub(super) fn base_parameters(names: &[String], null: &[NullVector]) -> Vec<BaseParameter> {
-    let count = names.len();
-    let mut eliminated: Vec<usize> = null.iter().map(|vector| vector.pivot).collect();
-    let mut order = vec![None; count];
-    for (k, &pivot) in eliminated.iter().enumerate() {
-        order[pivot] = Some(k);
-    }
-    // Dense null vectors with the identity at all pivots: those towards the base are computed
-    // before those that need them.
-    let mut ready: Vec<Vec<f64>> = Vec::with_capacity(null.len());
-    for (k, vector) in null.iter().enumerate() {
-        let mut dense = vec![0.0; count];
-        for &(column, entry) in &vector.entries {
-            dense[column] = entry;
-        }
-        for &(column, _) in &vector.entries {
-            if let Some(other) = order[column].filter(|&other| other < k) {
-                let factor = std::mem::take(&mut dense[column]);
-                for (x, y) in dense.iter_mut().zip(&ready[other]) {
-                    *x -= factor * y;
-                }
-                dense[column] = 0.0;
-            }
-        }
-        ready.push(dense);
-    }
-    // phi ~ phi - ready_k phi_(pivot k): the coefficient of the eliminated k in the sum of a kept
-    // column is -ready_k there.
-    let mut is_kept: Vec<bool> = order.iter().map(Option::is_none).collect();
-    loop {
-        let worst = ready
-            .iter()
-            .enumerate()
-            .flat_map(|(k, dense)| {
-                dense
-                    .iter()
-                    .enumerate()
-                    .map(move |(column, x)| (k, column, x.abs()))
-            })
-            .filter(|&(_, column, _)| is_kept[column])
-            .max_by(|a, b| a.2.total_cmp(&b.2));
-        let Some((k, column, _)) = worst.filter(|worst| worst.2 > BaseParameter::LARGEST) else {
-            break;
-        };
-        // Each exchange multiplies the determinant of the eliminated rows by more than LARGEST, so
-        // this ends.
-        let pivot = ready[k][column];
-        ready[k].iter_mut().for_each(|x| *x /= pivot);
-        let chosen = ready[k].clone();
-        for (other, dense) in ready.iter_mut().enumerate() {
-            let factor = dense[column];
-            if other != k && factor != 0.0 {
-                dense
-                    .iter_mut()
-                    .zip(&chosen)
-                    .for_each(|(x, y)| *x -= factor * y);
-                dense[column] = 0.0;
-            }
-        }
-        is_kept[column] = false;
-        is_kept[eliminated[k]] = true;
-        eliminated[k] = column;
-    }
+    let mut elimination = Elimination::new(names.len(), null);
+    elimination.bound();
+    let Elimination {
+        eliminated,
+        is_kept,
+        vectors,
+    } = elimination;
     let term = |coefficient: f64, column: usize| Term {
         coefficient,
         column,
@@ -145,16 +90,93 @@ pub(super) fn base_parameters(names: &[String], null: &[NullVector]) -> Vec<Base
     };
     let mut by_column: Vec<(usize, usize)> = eliminated.iter().copied().zip(0..).collect();
     by_column.sort_unstable();
-    (0..count)
+    (0..names.len())
         .filter(|&column| is_kept[column])
         .map(|kept| BaseParameter {
             kept: term(1.0, kept),
             terms: by_column
                 .iter()
-                .map(|&(column, k)| (-ready[k][kept], column))
+                .map(|&(column, k)| (-vectors[k][kept], column))
                 .filter(|(coefficient, _)| coefficient.abs() >= BaseParameter::SMALLEST)
                 .map(|(coefficient, column)| term(coefficient, column))
                 .collect(),
         })
         .collect()
+}
+
+/// Dense null vectors, with the identity at the columns that they eliminate: `phi ~ phi - vector_k
+/// phi_(eliminated k)`, so the coefficient of the eliminated `k` in the sum of a kept column is
+/// `-vector_k` there.
+struct Elimination {
+    /// Per vector, its column.
+    eliminated: Vec<usize>,
+    is_kept: Vec<bool>,
+    vectors: Vec<Vec<f64>>,
+}
+
+impl Elimination {
+    fn new(count: usize, null: &[NullVector]) -> Self {
+        let mut order = vec![None; count];
+        for (k, vector) in null.iter().enumerate() {
+            order[vector.pivot] = Some(k);
+        }
+        // Those towards the base are computed before those that need them.
+        let mut vectors: Vec<Vec<f64>> = Vec::with_capacity(null.len());
+        for (k, vector) in null.iter().enumerate() {
+            let mut dense = vec![0.0; count];
+            for &(column, entry) in &vector.entries {
+                dense[column] = entry;
+            }
+            for &(column, _) in &vector.entries {
+                if let Some(other) = order[column].filter(|&other| other < k) {
+                    let factor = std::mem::take(&mut dense[column]);
+                    for (x, y) in dense.iter_mut().zip(&vectors[other]) {
+                        *x -= factor * y;
+                    }
+                    dense[column] = 0.0;
+                }
+            }
+            vectors.push(dense);
+        }
+        Self {
+            eliminated: null.iter().map(|vector| vector.pivot).collect(),
+            is_kept: order.iter().map(Option::is_none).collect(),
+            vectors,
+        }
+    }
+
+    /// Exchanges kept and eliminated columns until no factor exceeds the bound.
+    fn bound(&mut self) {
+        while let Some((k, column)) = self.worst() {
+            // Each exchange multiplies the determinant of the eliminated rows by more than LARGEST,
+            // so this ends.
+            let pivot = self.vectors[k][column];
+            self.vectors[k].iter_mut().for_each(|x| *x /= pivot);
+            let chosen = self.vectors[k].clone();
+            for (other, dense) in self.vectors.iter_mut().enumerate() {
+                let factor = dense[column];
+                if other != k && factor != 0.0 {
+                    dense
+                        .iter_mut()
+                        .zip(&chosen)
+                        .for_each(|(x, y)| *x -= factor * y);
+                    dense[column] = 0.0;
+                }
+            }
+            self.is_kept[column] = false;
+            self.is_kept[self.eliminated[k]] = true;
+            self.eliminated[k] = column;
+        }
+    }
+
+    /// The vector and the kept column of the greatest factor, if it exceeds the bound.
+    fn worst(&self) -> Option<(usize, usize)> {
+        let factors = self.vectors.iter().enumerate().flat_map(|(k, dense)| {
+            let columns = dense.iter().enumerate();
+            columns.map(move |(column, x)| (k, column, x.abs()))
+        });
+        let kept = factors.filter(|&(_, column, _)| self.is_kept[column]);
+        let (k, column, worst) = kept.max_by(|a, b| a.2.total_cmp(&b.2))?;
+        (worst > BaseParameter::LARGEST).then_some((k, column))
+    }
 }

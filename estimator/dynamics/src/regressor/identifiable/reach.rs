@@ -2,20 +2,19 @@
 //! and their recursion from body to body.
 //!
 //! Everything here is in *scaled* units (lengths, masses and accelerations of order one:
-//! `super::Scale`) and in the frame of one body with every freedom at its reference position. A
+//! `super::pass::Units`) and in the frame of one body with every joint at its reference position. A
 //! wrench `[n; f]` and a transfer of inertia are 4 x 4 matrices as in the documentation of the
 //! parent module.
 
 use nalgebra::{Matrix3, Matrix4};
 
-use super::regime::JointMotion;
 use crate::spatial::{Mat3, Motion, Pose, Vec3};
 
 /// A subspace of `R^N` by an orthonormal basis.
 #[derive(Clone, Debug)]
-pub(super) struct Span<const N: usize>(Vec<[f64; N]>);
+pub(super) struct Subspace<const N: usize>(Vec<[f64; N]>);
 
-impl<const N: usize> Span<N> {
+impl<const N: usize> Subspace<N> {
     pub(super) fn empty() -> Self {
         Self(Vec::new())
     }
@@ -133,29 +132,59 @@ fn take_out<const N: usize>(vector: &mut [f64; N], unit: &[f64; N]) {
 /// `e . [n; f]`.
 type Row = [f64; 16];
 
+/// The twist that a joint allows, as matrices.
+struct JointTwist {
+    angular: Vec3,
+    /// `S`.
+    s: Matrix4<f64>,
+    /// `S^2`.
+    square: Matrix4<f64>,
+    /// Its rotation, `S(omega)`.
+    turn: Mat3,
+}
+
+impl JointTwist {
+    fn new(Motion { angular, linear }: &Motion) -> Self {
+        let (w, v) = (angular, linear);
+        let s = twist_matrix(&[w.x, w.y, w.z, v.x, v.y, v.z]);
+        Self {
+            angular: *angular,
+            square: s * s,
+            turn: s.fixed_view::<3, 3>(0, 0).into_owned(),
+            s,
+        }
+    }
+
+    /// The change of a row with the position of the joint.
+    fn turned_row(&self, vector: &Row) -> Row {
+        let (m, e) = row_matrices(vector);
+        row(&(m * self.s * 2.0), &(e * self.s - self.s * e))
+    }
+}
+
 /// Spans of the quantities that a body attains over all states of the regime.
 #[derive(Clone, Debug)]
 pub(super) struct Reach {
     /// Of `(D, 1)`: three rows of `D = [S(alpha) + S(omega)^2, a]`, then the 1 that multiplies
     /// offsets.
-    acceleration: Span<13>,
+    acceleration: Subspace<13>,
     /// Of angular velocities `omega`.
-    omega: Span<3>,
+    omega: Subspace<3>,
     /// Of the twists `E` along which a net wrench is measured.
-    axes: Span<6>,
+    axes: Subspace<6>,
     /// Of the first three columns of `E^T S(omega)`, `E` and `omega` of one state.
-    mixed: Span<12>,
+    mixed: Subspace<12>,
     /// Of the rows `(sym(E^T D), E)`: the measured functionals of this body's parameters and of the
     /// offsets beyond it.
-    rows: Span<16>,
+    rows: Subspace<16>,
 }
 
 impl Reach {
     /// Of a body that moves freely.
     pub(super) fn free() -> Self {
         Self {
-            acceleration: Span::full(),
-            omega: Span::full(),
+            acceleration: Subspace::full(),
+            omega: Subspace::full(),
             ..Self::unmeasured()
         }
     }
@@ -166,26 +195,26 @@ impl Reach {
         (one[3], one[7], one[11], one[12]) = (proper.x, proper.y, proper.z, 1.0);
         let norm = dot(&one, &one).sqrt();
         Self {
-            acceleration: Span(vec![one.map(|x| x / norm)]),
-            omega: Span::empty(),
+            acceleration: Subspace(vec![one.map(|x| x / norm)]),
+            omega: Subspace::empty(),
             ..Self::unmeasured()
         }
     }
 
     fn unmeasured() -> Self {
         Self {
-            acceleration: Span::empty(),
-            omega: Span::empty(),
-            axes: Span::empty(),
-            mixed: Span::empty(),
-            rows: Span::empty(),
+            acceleration: Subspace::empty(),
+            omega: Subspace::empty(),
+            axes: Subspace::empty(),
+            mixed: Subspace::empty(),
+            rows: Subspace::empty(),
         }
     }
 
     /// Starts a separately measured part of the robot: its net wrench is measured here along these
     /// constant twists.
-    pub(super) fn begin(&mut self, axes: Span<6>, tolerance: f64) {
-        (self.axes, self.mixed, self.rows) = (axes, Span::empty(), Span::empty());
+    pub(super) fn begin(&mut self, axes: Subspace<6>, tolerance: f64) {
+        (self.axes, self.mixed, self.rows) = (axes, Subspace::empty(), Subspace::empty());
         let omegas: Vec<_> = self.omega.basis().iter().map(cross_matrix).collect();
         let twists: Vec<_> = self.axes.basis().iter().map(twist_matrix).collect();
         let mixed = omegas
@@ -193,7 +222,7 @@ impl Reach {
             .flat_map(|omega| twists.iter().map(|e| mixed(e, omega)));
         self.mixed.add(mixed.collect(), tolerance);
         if self.acceleration.is_full() && self.axes.is_full() {
-            self.rows = Span::full();
+            self.rows = Subspace::full();
             return;
         }
         let accelerations = self.acceleration.basis().iter().map(acceleration_matrix);
@@ -233,11 +262,11 @@ impl Reach {
         }
     }
 
-    /// Crosses one freedom, from the body before it to the body beyond it; both have the same frame
-    /// at the reference position. `measured`: whether the force along the freedom, of all bodies
-    /// beyond it, is measured.
+    /// Crosses a joint, from the body before it to the body beyond it; both have the same frame at
+    /// the reference position. `s` is the twist that it allows. `moves`: whether it moves, or is
+    /// locked. `measured`: whether the force along it, of all bodies beyond it, is measured.
     ///
-    /// Returns the functionals of the inertia and the offsets beyond that this freedom makes
+    /// Returns the functionals of the inertia and the offsets beyond that this joint makes
     /// observable. These rows vanish exactly on the transfers that no measurement distinguishes
     /// from the same transfer frozen at the reference position. With `X = exp(S q)`,
     ///
@@ -252,120 +281,117 @@ impl Reach {
     pub(super) fn cross(
         &mut self,
         s: &Motion,
-        motion: JointMotion,
+        moves: bool,
         measured: bool,
         tolerance: f64,
-    ) -> Span<16> {
-        let step = twist_matrix(&[
-            s.angular.x,
-            s.angular.y,
-            s.angular.z,
-            s.linear.x,
-            s.linear.y,
-            s.linear.z,
-        ]);
-        let turn: Mat3 = step.fixed_view::<3, 3>(0, 0).into_owned();
-        let square = step * step;
-        let moves = motion == JointMotion::Moving;
-        let row_turned = |vector: &Row| {
-            let (m, e) = row_matrices(vector);
-            row(&(m * step * 2.0), &(e * step - step * e))
-        };
-        if !matches!(motion, JointMotion::Locked(_)) {
-            // Every position of the freedom: the spans that are invariant under its motion.
-            self.acceleration.close(
-                |vector| {
-                    let (d, _) = acceleration_matrix(vector);
-                    acceleration(&(d * step - step * d), 0.0)
-                },
-                tolerance,
-            );
-            self.omega.close(
-                |omega| s.angular.cross(&Vec3::from(*omega)).into(),
-                tolerance,
-            );
-            self.axes.close(
-                |axis| {
-                    let e = twist_matrix(axis);
-                    twist(&(e * step - step * e))
-                },
-                tolerance,
-            );
-            self.mixed.close(
-                |vector| {
-                    let n = mixed_matrix(vector);
-                    let turned = step.tr_mul(&n) + n * turn;
-                    std::array::from_fn(|i| turned[(i / 3, i % 3)])
-                },
-                tolerance,
-            );
-            self.rows.close(row_turned, tolerance);
-        }
-
-        // Rows added by the motion of this freedom and by its measurement.
-        let axes: Vec<_> = self.axes.basis().iter().map(twist_matrix).collect();
-        let omegas: Vec<_> = self.omega.basis().iter().map(cross_matrix).collect();
-        let none = Matrix4::zeros();
-        let mut gained: Vec<Row> = Vec::new();
-        let mut gained_mixed = Vec::new();
+    ) -> Subspace<16> {
+        let joint = JointTwist::new(s);
         if moves {
-            for e in &axes {
-                gained.push(row(&e.tr_mul(&step), &none));
-                gained.push(row(&e.tr_mul(&square), &none));
-                gained_mixed.push(mixed(e, &turn));
-            }
-            for vector in self.mixed.basis() {
-                gained.push(row(
-                    &(mixed_matrix(vector) * step.fixed_view::<3, 4>(0, 0)),
-                    &none,
-                ));
-            }
+            self.close(&joint, tolerance);
         }
+        let (rows, mixed) = self.gained(&joint, moves, measured);
+        let mut visible = Subspace::empty();
+        visible.add(rows, tolerance);
+        self.mixed.add(mixed, tolerance);
         if measured {
-            for vector in self.acceleration.basis() {
-                let (d, one) = acceleration_matrix(vector);
-                gained.push(row(&step.tr_mul(&d), &(step * one)));
-            }
-            gained_mixed.extend(omegas.iter().map(|omega| mixed(&step, omega)));
-            if moves {
-                gained.push(row(&step.tr_mul(&step), &none));
-                gained.push(row(&step.tr_mul(&square), &none));
-                gained.extend(
-                    omegas
-                        .iter()
-                        .map(|omega| row(&step.tr_mul(&(embed(omega) * step)), &none)),
-                );
-                gained_mixed.push(mixed(&step, &turn));
-            }
+            self.axes.add(vec![twist(&joint.s)], tolerance);
         }
-        let mut visible = Span::empty();
-        visible.add(gained, tolerance);
-        self.mixed.add(gained_mixed, tolerance);
-        if measured {
-            self.axes.add(vec![twist(&step)], tolerance);
-        }
+        let mut turned = Vec::new();
         if moves {
+            let omegas: Vec<_> = self.omega.basis().iter().map(cross_matrix).collect();
             let gained = omegas
                 .iter()
-                .map(|omega| acceleration(&(embed(omega) * step), 0.0));
-            let own = [acceleration(&step, 0.0), acceleration(&square, 0.0)];
+                .map(|omega| acceleration(&(embed(omega) * joint.s), 0.0));
+            let own = [
+                acceleration(&joint.s, 0.0),
+                acceleration(&joint.square, 0.0),
+            ];
             self.acceleration
                 .add(gained.chain(own).collect(), tolerance);
             self.omega.add(vec![s.angular.into()], tolerance);
+            turned.extend(self.rows.basis().iter().map(|row| joint.turned_row(row)));
         }
-        let turned = match motion {
-            JointMotion::Locked(_) => Vec::new(),
-            JointMotion::Moving | JointMotion::Posed => {
-                self.rows.basis().iter().map(row_turned).collect()
-            }
-        };
         self.rows.add(visible.basis().to_vec(), tolerance);
         visible.add(turned, tolerance);
         visible
     }
 
+    /// Every position of a joint: the spans that are invariant under its motion.
+    fn close(&mut self, joint: &JointTwist, tolerance: f64) {
+        let JointTwist { s, turn, .. } = joint;
+        self.acceleration.close(
+            |vector| {
+                let (d, _) = acceleration_matrix(vector);
+                acceleration(&(d * s - s * d), 0.0)
+            },
+            tolerance,
+        );
+        let angular = joint.angular;
+        self.omega
+            .close(|omega| angular.cross(&Vec3::from(*omega)).into(), tolerance);
+        self.axes.close(
+            |axis| {
+                let e = twist_matrix(axis);
+                twist(&(e * s - s * e))
+            },
+            tolerance,
+        );
+        self.mixed.close(
+            |vector| {
+                let n = mixed_matrix(vector);
+                let turned = s.tr_mul(&n) + n * turn;
+                std::array::from_fn(|i| turned[(i / 3, i % 3)])
+            },
+            tolerance,
+        );
+        self.rows.close(|row| joint.turned_row(row), tolerance);
+    }
+
+    /// Rows, and vectors of `mixed`, that are added by the motion of a joint and by its
+    /// measurement.
+    fn gained(
+        &self,
+        joint: &JointTwist,
+        moves: bool,
+        measured: bool,
+    ) -> (Vec<Row>, Vec<[f64; 12]>) {
+        let JointTwist {
+            s, turn, square, ..
+        } = joint;
+        let axes: Vec<_> = self.axes.basis().iter().map(twist_matrix).collect();
+        let omegas: Vec<_> = self.omega.basis().iter().map(cross_matrix).collect();
+        let none = Matrix4::zeros();
+        let (mut rows, mut gained_mixed) = (Vec::new(), Vec::new());
+        if moves {
+            for e in &axes {
+                rows.push(row(&e.tr_mul(s), &none));
+                rows.push(row(&e.tr_mul(square), &none));
+                gained_mixed.push(mixed(e, turn));
+            }
+            for vector in self.mixed.basis() {
+                let m = mixed_matrix(vector) * s.fixed_view::<3, 4>(0, 0);
+                rows.push(row(&m, &none));
+            }
+        }
+        if measured {
+            for vector in self.acceleration.basis() {
+                let (d, one) = acceleration_matrix(vector);
+                rows.push(row(&s.tr_mul(&d), &(s * one)));
+            }
+            gained_mixed.extend(omegas.iter().map(|omega| mixed(s, omega)));
+        }
+        if measured && moves {
+            rows.push(row(&s.tr_mul(s), &none));
+            rows.push(row(&s.tr_mul(square), &none));
+            let turning = omegas.iter().map(|omega| s.tr_mul(&(embed(omega) * s)));
+            rows.extend(turning.map(|m| row(&m, &none)));
+            gained_mixed.push(mixed(s, turn));
+        }
+        (rows, gained_mixed)
+    }
+
     /// All measured functionals of this body.
-    pub(super) fn rows(&self) -> &Span<16> {
+    pub(super) fn rows(&self) -> &Subspace<16> {
         &self.rows
     }
 }

@@ -1,7 +1,7 @@
 //! Motion and measurements for which [`super::Identifiable`] is computed.
 
 use crate::model::Model;
-use crate::spatial::{Motion, Pose, Vec3};
+use crate::spatial::Vec3;
 use crate::structure::{ContactSet, Structure};
 
 /// Motion of a joint during the measurements.
@@ -9,37 +9,17 @@ use crate::structure::{ContactSet, Structure};
 pub enum JointMotion {
     /// It moves: position, velocity and acceleration all vary.
     Moving,
-    /// It takes different positions, but is at rest during each measurement: static postures.
-    Posed,
     /// It is always at this position [rad or m].
     Locked(f64),
 }
 
-/// One degree of freedom of a joint of any type, or of the base.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Freedom {
-    /// The motion that one unit of it causes, of the outer body relative to the inner one, in the
-    /// frame of the outer body with every freedom of the joint at zero. That of a helical joint has
-    /// both parts. A zero twist allows no motion.
-    pub twist: Motion,
-    /// How it moves.
-    pub motion: JointMotion,
-}
-
 /// How the base moves.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum BaseRegime {
     /// Freely.
     Free,
-    /// As if these joints held it to the world.
-    Restricted {
-        /// Physical gravity with all of them at zero, in base-link coordinates [m/s^2].
-        gravity: Vec3,
-        /// From the world to the base link; twists in base-link coordinates. Empty: the base is
-        /// fixed. One moving rotation about the vertical: a turntable. Posed rotations: the base is
-        /// tilted between measurements.
-        joints: Vec<Freedom>,
-    },
+    /// It is at rest, with this physical gravity in base-link coordinates [m/s^2].
+    Fixed(Vec3),
 }
 
 /// Motion of the base and the joints, and contacts, during the measurements.
@@ -80,10 +60,7 @@ impl Regime {
     pub fn fixed(model: &Model, base: usize, gravity: &Vec3) -> Self {
         Self {
             base,
-            motion: BaseRegime::Restricted {
-                gravity: *gravity,
-                joints: Vec::new(),
-            },
+            motion: BaseRegime::Fixed(*gravity),
             ..Self::free(model)
         }
     }
@@ -91,7 +68,7 @@ impl Regime {
 
 /// The measured quantities.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Measured {
+pub enum Measurement {
     /// The wrench: what the environment exerts on the whole tree, or the balance of a sub-tree
     /// between its F/T sensors (eq. (11)). The result does not depend on the link in whose
     /// coordinates it is (Lemma 1). All six components, minus those that [`Regime::contacts`]
@@ -117,8 +94,8 @@ pub enum Offsets {
 /// The part of the robot and the sensors.
 #[derive(Clone, Copy, Debug)]
 pub enum Scope<'a> {
-    /// All links, without regard to the sensors between them; the wrench is that on the base link,
-    /// without unknown contacts elsewhere. Its offset, if unknown, is in the base link's frame.
+    /// All links, without regard to the sensors between them, so without offsets; the wrench is
+    /// that on the base link, without unknown contacts elsewhere.
     Tree,
     /// One sub-tree between F/T sensors, by its number. Offsets are those of its sensors.
     SubTree(&'a Structure, usize),
@@ -128,9 +105,41 @@ pub enum Scope<'a> {
     SubTrees(&'a Structure),
 }
 
+impl<'a> Scope<'a> {
+    pub(super) fn structure(self) -> Option<&'a Structure> {
+        match self {
+            Scope::Tree => None,
+            Scope::SubTree(structure, _) | Scope::SubTrees(structure) => Some(structure),
+        }
+    }
+
+    /// The separately measured part to which a link belongs: the number of its sub-tree, or one
+    /// number for all links of a whole tree. `None` outside the scope.
+    pub(super) fn part_of(self, link: usize) -> Option<usize> {
+        match self {
+            Scope::Tree => Some(0),
+            Scope::SubTree(structure, number) => {
+                structure.subtree_of(link).filter(|&of| of == number)
+            }
+            Scope::SubTrees(structure) => structure.subtree_of(link),
+        }
+    }
+
+    /// The sensors whose offsets enter, ascending.
+    pub(super) fn sensors(self) -> Vec<usize> {
+        match self {
+            Scope::Tree => Vec::new(),
+            Scope::SubTree(structure, number) => {
+                structure.subtrees()[number].sensors.iter().collect()
+            }
+            Scope::SubTrees(structure) => (0..structure.sensors().len()).collect(),
+        }
+    }
+}
+
 /// The meaning of a column of the regressor, which is a row of the basis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Column {
+pub enum ParameterColumn {
     /// An inertial parameter.
     Inertial {
         /// The link.
@@ -140,36 +149,9 @@ pub enum Column {
     },
     /// A component of an offset: reading = true wrench + offset.
     Offset {
-        /// The sensor of the [`Structure`] (0 for the base wrench of a whole tree).
+        /// The sensor of the [`Structure`].
         sensor: usize,
         /// Its index among `[t_x, t_y, t_z, f_x, f_y, f_z]`, in the measurement frame.
         component: usize,
     },
-}
-
-/// The unobservable part of the inertia beyond a joint, with the contacts of the regime present.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Invisible {
-    /// The joint; `None` for the link where the pass through the tree, or sub-tree, begins. In a
-    /// mechanism: the number of the body beyond, minus one, as in a model.
-    pub joint: Option<usize>,
-    /// The link beyond it, seen from the base.
-    pub link: usize,
-    /// Number of unobservable transfers between the links of the joint. For the first link: number
-    /// of unobservable directions of the inertia of all bodies together, frozen.
-    pub directions: usize,
-}
-
-/// A rigid body of a mechanism with joints of any type. The data of the base, the first body, are
-/// ignored: see [`BaseRegime`].
-#[derive(Clone, Debug, PartialEq)]
-pub struct Body {
-    /// The inner body, with a smaller number; `None` for the first body, the base.
-    pub parent: Option<usize>,
-    /// Pose of this body in the inner one, `x_pc`, with every freedom of the joint at zero. Its
-    /// rotation must be orthonormal to the tolerance.
-    pub placement: Pose,
-    /// The joint, from the inner body to this one; several freedoms act in sequence, as if massless
-    /// bodies were between them.
-    pub joint: Vec<Freedom>,
 }
