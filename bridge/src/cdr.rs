@@ -8,17 +8,17 @@ const HEAD: [u8; 4] = [0, 1, 0, 0];
 
 /// A message that is being written.
 #[derive(Debug, Clone)]
-pub struct Message {
+pub struct CdrMessage {
     bytes: Vec<u8>,
 }
 
-impl Default for Message {
+impl Default for CdrMessage {
     fn default() -> Self {
         Self::new()
     }
 }
 
-impl Message {
+impl CdrMessage {
     /// An empty one.
     #[must_use]
     pub fn new() -> Self {
@@ -101,12 +101,12 @@ impl Message {
 
 /// A message that is being read.
 #[derive(Debug)]
-pub struct Parsed<'a> {
+pub struct CdrReader<'a> {
     body: &'a [u8],
     place: usize,
 }
 
-impl<'a> Parsed<'a> {
+impl<'a> CdrReader<'a> {
     /// `None` if it is no little-endian CDR.
     #[must_use]
     pub fn new(bytes: &'a [u8]) -> Option<Self> {
@@ -180,7 +180,7 @@ mod tests {
     /// The bytes of the example in the specification's spirit, counted by hand.
     #[test]
     fn numbers_are_aligned_to_their_size() {
-        let mut message = Message::new();
+        let mut message = CdrMessage::new();
         message.bool(true);
         message.u32(2);
         message.f64s(&[1.0]);
@@ -199,7 +199,7 @@ mod tests {
     proptest! {
         #[test]
         fn what_is_written_is_read(flag: bool, a: u32, b: i64, c: f64) {
-            let mut message = Message::new();
+            let mut message = CdrMessage::new();
             message.bool(flag);
             message.u32(a);
             message.bool(!flag);
@@ -207,7 +207,7 @@ mod tests {
             message.f64s(&[c]);
             message.text("caf\u{e9}");
             message.u8(a as u8);
-            let mut parsed = Parsed::new(message.bytes()).unwrap();
+            let mut parsed = CdrReader::new(message.bytes()).unwrap();
             prop_assert_eq!(parsed.bool(), Some(flag));
             prop_assert_eq!(parsed.u32(), Some(a));
             prop_assert_eq!(parsed.bool(), Some(!flag));
@@ -220,7 +220,7 @@ mod tests {
 
         #[test]
         fn any_bytes_are_legal_input(bytes: Vec<u8>) {
-            if let Some(mut parsed) = Parsed::new(&bytes) {
+            if let Some(mut parsed) = CdrReader::new(&bytes) {
                 let _ = (parsed.bool(), parsed.text(), parsed.i64(), parsed.u32(), parsed.f64());
             }
         }

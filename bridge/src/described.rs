@@ -47,13 +47,13 @@ pub fn first_of<T: Topic, R>(
 }
 
 /// The descriptions of one publisher, over its restarts.
-pub struct Described {
+pub struct DescriptionReader {
     reader: Reader<Description>,
     publisher: Publisher,
     newest: Description,
 }
 
-impl Described {
+impl DescriptionReader {
     /// Those of `publisher`; `None` if it does not run.
     ///
     /// # Errors

@@ -1,6 +1,6 @@
 //! How a robot's daemons, buses and devices are, as `diagnostic_msgs` say it.
 
-use crate::cdr::Message;
+use crate::cdr::CdrMessage;
 use proprio_topics::{
     BusHealth, Controller, Counter, DeviceHealth, DeviceState, EstimatorHealth, GatewayHealth,
     LinkState, Nanos, Refusal, axes,
@@ -24,7 +24,7 @@ pub enum Level {
 
 /// How one thing is.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Status {
+pub(crate) struct DiagnosticStatus {
     pub(crate) level: Level,
     pub(crate) name: String,
     pub(crate) message: String,
@@ -37,7 +37,7 @@ pub(crate) fn of(
     gateway: Option<&GatewayHealth>,
     estimator: Option<&EstimatorHealth>,
     now: Nanos,
-) -> Vec<Status> {
+) -> Vec<DiagnosticStatus> {
     let mut all = vec![daemon(
         robot,
         "gateway",
@@ -92,7 +92,7 @@ pub(crate) fn of(
     all
 }
 
-fn daemon(robot: &str, what: &str, published: Option<Nanos>, now: Nanos) -> Status {
+fn daemon(robot: &str, what: &str, published: Option<Nanos>, now: Nanos) -> DiagnosticStatus {
     let age = published.map(|published| now.saturating_sub(published));
     let (level, message) = match age {
         None => (Level::Stale, "not running".to_owned()),
@@ -102,7 +102,7 @@ fn daemon(robot: &str, what: &str, published: Option<Nanos>, now: Nanos) -> Stat
         }
         Some(_) => (Level::Ok, "running".to_owned()),
     };
-    Status {
+    DiagnosticStatus {
         level,
         name: format!("{robot}: {what}"),
         message,
@@ -127,13 +127,13 @@ pub fn bus_state(bus: &BusHealth) -> (Level, String) {
     (level, message)
 }
 
-fn bus(robot: &str, bus: &BusHealth) -> Status {
+fn bus(robot: &str, bus: &BusHealth) -> DiagnosticStatus {
     let (level, message) = bus_state(bus);
     let load = match bus.load.is_nan() {
         true => "unknown".to_owned(),
         false => format!("{:.1} %", bus.load * 100.0),
     };
-    Status {
+    DiagnosticStatus {
         level,
         name: format!("{robot}: bus {}", bus.name.as_str()),
         message,
@@ -169,10 +169,10 @@ pub fn device_state(device: &DeviceHealth) -> (Level, String) {
     (level, message)
 }
 
-fn device(robot: &str, device: &DeviceHealth) -> Status {
+fn device(robot: &str, device: &DeviceHealth) -> DiagnosticStatus {
     let (level, message) = device_state(device);
     let counts = Counter::ALL.into_iter().zip(device.counters);
-    Status {
+    DiagnosticStatus {
         level,
         name: format!("{robot}: device {}", device.name.as_str()),
         message,
@@ -183,8 +183,8 @@ fn device(robot: &str, device: &DeviceHealth) -> Status {
 }
 
 /// The `DiagnosticArray`.
-pub(crate) fn message(wall: u64, robot: &str, all: &[Status]) -> Message {
-    let mut message = Message::stamped(wall, "");
+pub(crate) fn message(wall: u64, robot: &str, all: &[DiagnosticStatus]) -> CdrMessage {
+    let mut message = CdrMessage::stamped(wall, "");
     message.count(all.len());
     for status in all {
         message.u8(status.level as u8);
@@ -217,7 +217,7 @@ mod tests {
         health
     }
 
-    fn levels(all: &[Status]) -> Vec<(&str, Level)> {
+    fn levels(all: &[DiagnosticStatus]) -> Vec<(&str, Level)> {
         all.iter()
             .map(|one| (one.name.as_str(), one.level))
             .collect()

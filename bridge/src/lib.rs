@@ -9,7 +9,7 @@
 //! - [`Listener`] follows one robot over restarts of its daemons, and damage of its domain.
 //! - [`Messages`] says what it hears in ROS 2's encoding (CDR), with the definitions of the
 //!   messages: standard ones where they exist, `proprio_msgs` where they would lose something.
-//! - [`Sink`] is where messages go.
+//! - [`MessageSink`] is where messages go.
 //!
 //! | topic | type | what |
 //! |---|---|---|
@@ -34,7 +34,7 @@ mod diagnostics;
 mod listener;
 mod messages;
 
-pub use described::{Described, first_of, next};
+pub use described::{DescriptionReader, first_of, next};
 pub use diagnostics::{Level, bus_state, device_state};
 pub use listener::{Event, Heard, ListenError, Listener, one_robot, open};
-pub use messages::{Messages, Sink};
+pub use messages::{MessageSink, Messages};

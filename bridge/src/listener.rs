@@ -1,7 +1,7 @@
 //! Follows one running robot: its samples, declarations, estimates and health, by name, over
 //! restarts of its daemons and damage of its domain.
 
-use crate::described::{Described, next};
+use crate::described::{DescriptionReader, next};
 use proprio_topics::csv::{Series, Value, What};
 use proprio_topics::ipc::{Domain, DomainConfig, DomainError, PortError, Reader, TakeError, Topic};
 use proprio_topics::{
@@ -121,7 +121,7 @@ pub struct Event {
 
 /// The names of an estimator, over its restarts.
 struct Names {
-    described: Described,
+    described: DescriptionReader,
     known: Option<Rc<Description>>,
 }
 
@@ -154,7 +154,7 @@ impl Estimates {
             drives: Reader::open(domain, robot).ok(),
             health: Reader::open(domain, robot).ok(),
             names: Names {
-                described: Described::to_come(domain, robot, Publisher::Estimator).ok()?,
+                described: DescriptionReader::to_come(domain, robot, Publisher::Estimator).ok()?,
                 known: None,
             },
         })
@@ -205,7 +205,7 @@ fn gather_health<T: Topic>(
 pub struct Listener {
     domain: Domain,
     robot: String,
-    gateway: Described,
+    gateway: DescriptionReader,
     samples: Reader<Sample>,
     declarations: Option<Reader<ContactDeclaration>>,
     health: Option<Reader<GatewayHealth>>,
@@ -269,8 +269,8 @@ impl Listener {
             PortError::NotYet { .. } => ListenError::NoGateway,
             error => error.into(),
         })?;
-        let gateway = Described::by(&domain, &robot, Publisher::Gateway)?;
-        let estimator = Described::by(&domain, &robot, Publisher::Estimator)?;
+        let gateway = DescriptionReader::by(&domain, &robot, Publisher::Gateway)?;
+        let estimator = DescriptionReader::by(&domain, &robot, Publisher::Estimator)?;
         let mut listener = Self {
             declarations: Reader::open(&domain, &robot).ok(),
             health: Reader::open(&domain, &robot).ok(),

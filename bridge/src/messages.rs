@@ -1,6 +1,6 @@
-//! What a robot sends, as messages for a [`Sink`].
+//! What a robot sends, as messages for a [`MessageSink`].
 
-use crate::cdr::Message;
+use crate::cdr::CdrMessage;
 use crate::definitions::{self, Definition};
 use crate::diagnostics;
 use crate::listener::Heard;
@@ -22,7 +22,7 @@ const LONGEST: Nanos = Nanos::from_millis(1000);
 const SECOND: Nanos = Nanos::from_millis(1000);
 
 /// Where messages go: a file, a viewer, a network.
-pub trait Sink {
+pub trait MessageSink {
     /// A topic of it.
     type Channel: Clone;
     /// Why it cannot take a message.
@@ -48,12 +48,12 @@ pub trait Sink {
         &mut self,
         channel: &Self::Channel,
         wall: u64,
-        message: &Message,
+        message: &CdrMessage,
     ) -> Result<(), Self::Error>;
 }
 
 /// A series of the table: its own topic, and the one of a standard message.
-struct Known<C> {
+struct KnownSeries<C> {
     series: Series,
     own: Option<C>,
     /// Of readings of other kinds than the main one, as temperatures.
@@ -66,12 +66,12 @@ struct Known<C> {
 }
 
 /// The topics of everything that is not a series, as they come to be needed.
-struct Topics<C> {
+struct TopicCache<C> {
     known: BTreeMap<String, Option<C>>,
 }
 
-impl<C: Clone> Topics<C> {
-    fn get<S: Sink<Channel = C>>(
+impl<C: Clone> TopicCache<C> {
+    fn get<S: MessageSink<Channel = C>>(
         &mut self,
         sink: &mut S,
         topic: String,
@@ -87,20 +87,20 @@ impl<C: Clone> Topics<C> {
 }
 
 /// Says what a robot sends.
-pub struct Messages<S: Sink> {
+pub struct Messages<S: MessageSink> {
     sink: S,
     robot: String,
     /// The wall clock minus CLOCK_MONOTONIC.
     offset: Nanos,
-    known: Vec<Known<S::Channel>>,
-    topics: Topics<S::Channel>,
+    known: Vec<KnownSeries<S::Channel>>,
+    topics: TopicCache<S::Channel>,
     gateway: Option<Box<GatewayHealth>>,
     estimator: Option<Box<EstimatorHealth>>,
     /// When it is said next how everything is.
     second: Nanos,
 }
 
-impl<S: Sink> Messages<S> {
+impl<S: MessageSink> Messages<S> {
     /// For this robot; `offset` is the wall clock minus CLOCK_MONOTONIC.
     pub fn new(sink: S, robot: &str, offset: Nanos) -> Self {
         Self {
@@ -108,7 +108,7 @@ impl<S: Sink> Messages<S> {
             robot: robot.to_owned(),
             offset,
             known: Vec::new(),
-            topics: Topics {
+            topics: TopicCache {
                 known: BTreeMap::new(),
             },
             gateway: None,
@@ -184,7 +184,7 @@ impl<S: Sink> Messages<S> {
                 Some((topic, definition)) => self.sink.add(&topic, &definition, None)?,
                 None => None,
             };
-            self.known.push(Known {
+            self.known.push(KnownSeries {
                 series: one.clone(),
                 own,
                 others: BTreeMap::new(),
@@ -229,7 +229,7 @@ impl<S: Sink> Messages<S> {
         topic: &str,
         definition: fn() -> Definition,
         t: Nanos,
-        message: impl FnOnce(u64) -> Message,
+        message: impl FnOnce(u64) -> CdrMessage,
     ) -> Result<(), S::Error> {
         let wall = self.wall(t);
         match self.topic(topic, definition)? {
@@ -328,7 +328,7 @@ impl<S: Sink> Messages<S> {
         let t = estimate.header.acquired;
         let joints: Vec<(&str, &JointTorque)> = joints(names, estimate).collect();
         self.send("/torques", definitions::torques, t, |_| {
-            let mut message = Message::new();
+            let mut message = CdrMessage::new();
             message.i64(t.0);
             message.count(joints.len());
             joints.iter().for_each(|(name, _)| message.text(name));
@@ -349,7 +349,7 @@ impl<S: Sink> Messages<S> {
         let states = joints.iter().map(|(name, _)| self.state(name, t));
         let states: Vec<JointState> = states.collect();
         self.send("/joint_states", definitions::joint_state, t, |wall| {
-            let mut message = Message::stamped(wall, "");
+            let mut message = CdrMessage::stamped(wall, "");
             message.count(joints.len());
             joints.iter().for_each(|(name, _)| message.text(name));
             message.count(states.len());
@@ -382,7 +382,7 @@ impl<S: Sink> Messages<S> {
                 let is_valid = joint.valid == 1;
                 let torque = if is_valid { joint.torque } else { f64::NAN };
                 let half = 2.0 * joint.standard_deviation;
-                let mut message = Message::new();
+                let mut message = CdrMessage::new();
                 message.i64(t.0);
                 message.f64s(&[torque, torque - half, torque + half]);
                 message.bool(is_valid);
@@ -398,7 +398,7 @@ impl<S: Sink> Messages<S> {
     /// and while its encoder is not to be trusted.
     #[must_use]
     pub fn state(&self, joint: &str, t: Nanos) -> JointState {
-        let is_joint = |known: &&Known<S::Channel>| {
+        let is_joint = |known: &&KnownSeries<S::Channel>| {
             known.series.what == What::Channel(Kind::Joint) && known.series.name == joint
         };
         let known = self.known.iter().find(is_joint);
@@ -419,7 +419,7 @@ impl<S: Sink> Messages<S> {
         let t = estimate.header.acquired;
         let entry = |number| names.find(Role::Contact, number);
         self.send("/contacts", definitions::contacts, t, |_| {
-            let mut message = Message::new();
+            let mut message = CdrMessage::new();
             message.i64(t.0);
             message.count(estimate.contacts().len());
             for (contact, number) in estimate.contacts().iter().zip(0..) {
@@ -469,7 +469,7 @@ impl<S: Sink> Messages<S> {
         let t = estimate.header.acquired;
         let (drives, candidates) = (estimate.drives(), estimate.candidates());
         self.send("/drives", definitions::drives, t, |_| {
-            let mut message = Message::new();
+            let mut message = CdrMessage::new();
             message.i64(t.0);
             message.count(drives.len());
             (drives.iter()).for_each(|own| message.text(name(names, Role::Joint, own.joint)));
@@ -566,8 +566,8 @@ fn reason(joint: &JointTorque) -> &'static str {
     joint.reason.get().map_or("?", |reason| reason.word())
 }
 
-fn sample(t: Nanos, reading: &Reading, quality: Quality) -> Message {
-    let mut message = Message::new();
+fn sample(t: Nanos, reading: &Reading, quality: Quality) -> CdrMessage {
+    let mut message = CdrMessage::new();
     message.i64(t.0);
     message.u32(quality.0);
     let count = reading.kind().fields().len();
@@ -575,8 +575,8 @@ fn sample(t: Nanos, reading: &Reading, quality: Quality) -> Message {
     message
 }
 
-fn declared(t: Nanos, state: &ContactState) -> Message {
-    let mut message = Message::new();
+fn declared(t: Nanos, state: &ContactState) -> CdrMessage {
+    let mut message = CdrMessage::new();
     message.i64(t.0);
     message.bool(state.active);
     message.f64s(&state.position);
@@ -585,15 +585,15 @@ fn declared(t: Nanos, state: &ContactState) -> Message {
     message
 }
 
-fn wrench_stamped(wall: u64, frame: &str, wrench: &Wrench) -> Message {
-    let mut message = Message::stamped(wall, frame);
+fn wrench_stamped(wall: u64, frame: &str, wrench: &Wrench) -> CdrMessage {
+    let mut message = CdrMessage::stamped(wall, frame);
     message.f64s(&wrench.force);
     message.f64s(&wrench.torque);
     message
 }
 
-fn imu(wall: u64, frame: &str, imu: &Imu) -> Message {
-    let mut message = Message::stamped(wall, frame);
+fn imu(wall: u64, frame: &str, imu: &Imu) -> CdrMessage {
+    let mut message = CdrMessage::stamped(wall, frame);
     let [w, x, y, z] = imu.orientation;
     // Of a covariance, -1 first says that there is no value, 0 that the covariance is not known.
     let is_known = !w.is_nan();
@@ -615,7 +615,7 @@ fn imu(wall: u64, frame: &str, imu: &Imu) -> Message {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cdr::Parsed;
+    use crate::cdr::CdrReader;
     use proprio_topics::{
         ContactWrench, Entry, Header, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Publisher,
         Reason, Residual,
@@ -628,7 +628,7 @@ mod tests {
         sent: Vec<(String, u64, Vec<u8>)>,
     }
 
-    impl Sink for Kept {
+    impl MessageSink for Kept {
         type Channel = String;
         type Error = std::convert::Infallible;
 
@@ -647,7 +647,7 @@ mod tests {
             &mut self,
             topic: &String,
             wall: u64,
-            message: &Message,
+            message: &CdrMessage,
         ) -> Result<(), Self::Error> {
             let bytes = message.bytes().to_vec();
             self.sent.push((topic.clone(), wall, bytes));
@@ -709,7 +709,7 @@ mod tests {
             expected.map(|topic| (topic.to_owned(), type_name.clone()))
         );
         let mut read = kept.sent.iter().map(|(topic, wall, bytes)| {
-            let mut parsed = Parsed::new(bytes).expect("CDR");
+            let mut parsed = CdrReader::new(bytes).expect("CDR");
             assert_eq!((parsed.i64(), *wall), (Some(7), 107));
             let band = [0; 3].map(|_| parsed.f64().expect("a number"));
             let valid = parsed.bool();
@@ -773,7 +773,7 @@ mod tests {
         sent.retain(|(topic, ..)| topic.starts_with("/external"));
         let topics: Vec<&str> = sent.iter().map(|(topic, ..)| topic.as_str()).collect();
         assert_eq!(topics, ["/external/l_upper_arm"]);
-        let mut message = Parsed::new(&sent[0].2).expect("CDR");
+        let mut message = CdrReader::new(&sent[0].2).expect("CDR");
         assert_eq!(message.time(), Some(Nanos::from_millis(2_500)));
         assert_eq!(message.text(), Some("l_upper_arm"));
         let values = [(); 6].map(|()| message.f64().expect("a number"));

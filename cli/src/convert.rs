@@ -14,7 +14,7 @@ use proprio_gateway::log::{LogFormat, Stamps};
 use proprio_gateway::offline::{self, DecodeReport};
 use proprio_gateway::plan::Plan;
 use proprio_identification::{Role, implausible};
-use proprio_topics::csv::{self, Columns, Report};
+use proprio_topics::csv::{self, Columns, TableReport};
 use serde_json::json;
 use std::fs::File;
 use std::io::{BufReader, BufWriter, IsTerminal, Read, Write};
@@ -166,9 +166,9 @@ impl Write for Marked {
 }
 
 /// A conversion's error with the file concerned.
-fn with_file(error: offline::OfflineError, input: &Path, output: &Path) -> anyhow::Error {
+fn with_file(error: offline::ConversionError, input: &Path, output: &Path) -> anyhow::Error {
     match error {
-        offline::OfflineError::Io(e)
+        offline::ConversionError::Io(e)
             if e.get_ref()
                 .and_then(|e| e.downcast_ref::<Unwritable>())
                 .is_some() =>
@@ -222,7 +222,7 @@ impl Output {
     }
 }
 
-fn report_table(log: &Path, report: &Report) {
+fn report_table(log: &Path, report: &TableReport) {
     for bad in &report.bad {
         eprintln!(
             "{}: line {}: skipped: {}",
@@ -419,7 +419,7 @@ pub(crate) fn check_columns(
     config: &Path,
     setup: &Setup,
 ) -> anyhow::Result<()> {
-    let reader = csv::Reader::new(header).with_context(|| log.display().to_string())?;
+    let reader = csv::TableReader::new(header).with_context(|| log.display().to_string())?;
     reading::check_columns(&setup.robot, reader.series(), |_| true)
         .map_err(|missing| unfit(config, log, &missing).into())
 }

@@ -3,7 +3,7 @@
 use crate::status::load;
 use anyhow::{Context, anyhow, bail};
 use proprio_gateway::control::{Server, ask, running};
-use proprio_gateway::plan::ConfigError;
+use proprio_gateway::plan::PlanError;
 use proprio_topics::ipc::DomainConfig;
 use serde_json::{Value as Json, json};
 use std::io;
@@ -92,7 +92,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     if answer["ok"] != true {
         let word = |key: &str| answer[key].as_str().map(str::to_owned);
         return Err(match (word("file"), word("problem")) {
-            (Some(file), Some(problem)) => ConfigError {
+            (Some(file), Some(problem)) => PlanError {
                 file: file.into(),
                 problem,
             }

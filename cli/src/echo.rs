@@ -3,7 +3,7 @@
 
 use crate::running::interrupted;
 use anyhow::{Context, bail};
-use proprio_bridge::{Described, next, one_robot, open};
+use proprio_bridge::{DescriptionReader, next, one_robot, open};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Topic, Unavailable, monotonic};
 use proprio_topics::{
     Code, ContactEstimate, ContactWrench, Description, Entry, Name, Nanos, Publisher, Reason, Role,
@@ -100,7 +100,7 @@ fn follow<T: Topic>(
     args: &Echo,
     mut domain: Domain,
     robot: &str,
-    mut described: Described,
+    mut described: DescriptionReader,
     mut print: impl FnMut(&mut Out, &Description, &T) -> io::Result<bool>,
 ) -> anyhow::Result<()> {
     let stop = interrupted()?;
@@ -130,7 +130,7 @@ fn follow<T: Topic>(
             look = monotonic() + LOOK;
             if let Some(Ok(new)) = domain.reopened()
                 && let Some(publisher) = described.newest().publisher.get()
-                && let Ok(names) = Described::to_come(&new, robot, publisher)
+                && let Ok(names) = DescriptionReader::to_come(&new, robot, publisher)
                 && let Ok(reader) = Reader::open(&new, robot)
             {
                 (payloads, described, domain) = (reader, names, new);
@@ -144,7 +144,7 @@ fn follow<T: Topic>(
 }
 
 fn channels(args: &Echo, domain: Domain, robot: &str, channel: &str) -> anyhow::Result<()> {
-    let described = Described::by(&domain, robot, Publisher::Gateway)?
+    let described = DescriptionReader::by(&domain, robot, Publisher::Gateway)?
         .context("the robot's gateway is not running")?;
     let wanted = [channel.to_owned()];
     check(described.newest(), Role::Channel, "channel", &wanted)?;
@@ -188,8 +188,8 @@ fn estimator(
     robot: &str,
     (role, what): (Role, &str),
     wanted: &[String],
-) -> anyhow::Result<Described> {
-    let described = Described::by(domain, robot, Publisher::Estimator)?
+) -> anyhow::Result<DescriptionReader> {
+    let described = DescriptionReader::by(domain, robot, Publisher::Estimator)?
         .context("the robot's estimator is not running")?;
     check(described.newest(), role, what, wanted)?;
     Ok(described)

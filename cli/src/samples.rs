@@ -3,7 +3,9 @@
 
 use anyhow::Context;
 use proprio_gateway::log::{Bytes, candump};
-use proprio_recording::{ReadError, Summary, about, frames, is_mcap, to_estimates, to_table};
+use proprio_recording::{
+    ReadError, RecordingSummary, about, frames, is_mcap, to_estimates, to_table,
+};
 use std::fs::{self, File};
 use std::io::{self, BufReader, BufWriter, Cursor, PipeReader, PipeWriter, Read, Write as _};
 use std::path::Path;
@@ -79,7 +81,7 @@ fn convert(mut input: impl Read + Send + 'static, path: &Path, what: Into) -> io
     }))
 }
 
-fn to_log(recording: impl Read, to: PipeWriter) -> Result<Summary, ReadError> {
+fn to_log(recording: impl Read, to: PipeWriter) -> Result<RecordingSummary, ReadError> {
     let mut log = candump::Writer::new(BufWriter::new(to));
     let summary = frames(recording, |bus, frame| log.write(bus, frame))?;
     log.finish()?.flush()?;
@@ -90,7 +92,7 @@ fn to_log(recording: impl Read, to: PipeWriter) -> Result<Summary, ReadError> {
 struct Converted {
     name: String,
     pipe: PipeReader,
-    thread: Option<JoinHandle<Result<Summary, ReadError>>>,
+    thread: Option<JoinHandle<Result<RecordingSummary, ReadError>>>,
 }
 
 impl Read for Converted {

@@ -5,13 +5,13 @@ use anyhow::Context as _;
 use proprio_drivers::recognise::Stream;
 use proprio_drivers::{Finding, Traffic};
 use proprio_gateway::clock::Monotonic;
-use proprio_gateway::config::Source;
+use proprio_gateway::config::FrameSource;
 use proprio_gateway::link::adapter;
 use proprio_gateway::link::interface::{Interfaces as _, Netlink};
 use proprio_gateway::link::socketcan::SocketCan;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, ListenOnly};
-use proprio_gateway::scan::{self, Device};
+use proprio_gateway::scan::{self, FoundDevice};
 use proprio_simulator::parse_bus;
 use proprio_topics::Nanos;
 use proprio_topics::ipc::DomainConfig;
@@ -87,17 +87,19 @@ fn asked_by_name(text: &str) -> Result<String, String> {
 
 /// Opens a bus; also returns the interface, of a bus of the kernel.
 pub(crate) fn open_bus(
-    source: &Source,
+    source: &FrameSource,
     domain: &DomainConfig,
 ) -> anyhow::Result<(Box<dyn Link>, Option<String>)> {
     Ok(match source {
-        Source::SocketCan(named) => {
+        FrameSource::SocketCan(named) => {
             let link = SocketCan::open_adapter(named, Path::new(adapter::SYS), &[])?;
             let interface = link.interface().to_owned();
             (Box::new(link), Some(interface))
         }
-        Source::Virtual { name } => (Box::new(VirtualBus::open(&domain.name, name, &[])?), None),
-        Source::Replay { log, .. } => anyhow::bail!("{} is a log", log.display()),
+        FrameSource::Virtual { name } => {
+            (Box::new(VirtualBus::open(&domain.name, name, &[])?), None)
+        }
+        FrameSource::Replay { log, .. } => anyhow::bail!("{} is a log", log.display()),
     })
 }
 
@@ -110,7 +112,11 @@ pub(crate) struct Heard {
 
 impl How {
     /// Listens to `source`, and asks if that is wanted.
-    pub(crate) fn scan(&self, source: &Source, domain: &DomainConfig) -> anyhow::Result<Heard> {
+    pub(crate) fn scan(
+        &self,
+        source: &FrameSource,
+        domain: &DomainConfig,
+    ) -> anyhow::Result<Heard> {
         let (mut link, interface) = open_bus(source, domain)?;
         let fd = interface.is_none_or(|interface| {
             let health = Netlink::default().ask(&interface);
@@ -180,7 +186,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
 }
 
 /// The tables of devices, to be copied.
-fn blocks(devices: &[Device], joints: &mut usize) -> String {
+fn blocks(devices: &[FoundDevice], joints: &mut usize) -> String {
     match scan::tables(devices, joints).as_str() {
         "" => String::new(),
         text => format!("\nfor gateway.toml:\n{text}\n"),
@@ -212,7 +218,7 @@ fn changing(stream: &Stream) -> String {
 }
 
 /// The names of the devices that explain a stream.
-fn explained<'d>(devices: &'d [Device], stream: &Stream) -> Vec<&'d str> {
+fn explained<'d>(devices: &'d [FoundDevice], stream: &Stream) -> Vec<&'d str> {
     let devices = devices.iter().filter(|device| device.explains(stream.id));
     devices.map(|device| device.name.as_str()).collect()
 }
@@ -226,7 +232,7 @@ fn sure(finding: &Finding) -> String {
     format!("{} ({})", certainty(finding), finding.percent())
 }
 
-fn as_text(name: &str, how: &str, heard: &Traffic, devices: &[Device]) -> String {
+fn as_text(name: &str, how: &str, heard: &Traffic, devices: &[FoundDevice]) -> String {
     let mut text = String::new();
     let frames: u64 = heard.streams().map(|s| s.frames + s.remote).sum();
     let count = heard.streams().count();
@@ -309,7 +315,7 @@ fn as_text(name: &str, how: &str, heard: &Traffic, devices: &[Device]) -> String
     text
 }
 
-fn as_json(name: &str, heard: &Traffic, devices: &[Device]) -> Value {
+fn as_json(name: &str, heard: &Traffic, devices: &[FoundDevice]) -> Value {
     let keys = |finding: &Finding| -> Value {
         let keys = finding.keys.iter().map(|key| {
             let value = (key.value.parse::<toml::Value>().ok())

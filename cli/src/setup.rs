@@ -3,11 +3,11 @@
 
 use crate::scan::{How, WARNING};
 use anyhow::{Context as _, bail};
-use proprio_gateway::config::Source;
+use proprio_gateway::config::FrameSource;
 use proprio_gateway::link::adapter::{self, Adapter};
 use proprio_gateway::link::interface::{Interfaces as _, Netlink};
 use proprio_gateway::plan::Plan;
-use proprio_gateway::scan::{Bus, devices, file};
+use proprio_gateway::scan::{ScannedBus, devices, file};
 use proprio_simulator::parse_bus;
 use proprio_topics::InterfaceHealth;
 use proprio_topics::ipc::DomainConfig;
@@ -56,7 +56,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     }
     if args.bus.is_empty() {
         let all = present.iter().map(|present| present.interface.clone());
-        sources.extend(all.map(|name| Source::SocketCan(Adapter::Interface(name))));
+        sources.extend(all.map(|name| FrameSource::SocketCan(Adapter::Interface(name))));
     }
     if sources.is_empty() {
         bail!(
@@ -67,9 +67,9 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     let mut buses = Vec::new();
     for source in &sources {
         let (interface, name) = match source {
-            Source::SocketCan(Adapter::Interface(name)) => (Some(name), name.clone()),
-            Source::Virtual { name } => (None, name.clone()),
-            Source::SocketCan(_) | Source::Replay { .. } => continue,
+            FrameSource::SocketCan(Adapter::Interface(name)) => (Some(name), name.clone()),
+            FrameSource::Virtual { name } => (None, name.clone()),
+            FrameSource::SocketCan(_) | FrameSource::Replay { .. } => continue,
         };
         let heard = match (args.how.scan(source, domain), args.bus.is_empty()) {
             (Ok(heard), _) => heard,
@@ -89,10 +89,10 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
             _ => format!("{name}_"),
         };
         let lasting = match (interface, source) {
-            (Some(name), _) => Source::SocketCan(Adapter::lasting(name, &present)),
+            (Some(name), _) => FrameSource::SocketCan(Adapter::lasting(name, &present)),
             (None, source) => source.clone(),
         };
-        let bus = Bus {
+        let bus = ScannedBus {
             interface: (interface.filter(|_| lasting != *source).cloned()).unwrap_or_default(),
             source: lasting,
             bit_rates: (health.bit_rate, health.data_bit_rate),

@@ -2,7 +2,7 @@
 
 use crate::echo::{of_joints, torque_json};
 use anyhow::bail;
-use proprio_bridge::{Described, first_of, open};
+use proprio_bridge::{DescriptionReader, first_of, open};
 use proprio_topics::ipc::{
     Domain, DomainConfig, PortError, Reader, RobotPresence, Topic, Unavailable, monotonic,
 };
@@ -75,9 +75,9 @@ struct Glance {
 impl Glance {
     fn take(domain: &Domain, presence: RobotPresence) -> anyhow::Result<Self> {
         let robot = presence.name.clone();
-        let description = Described::by(domain, &robot, Publisher::Gateway)?;
+        let description = DescriptionReader::by(domain, &robot, Publisher::Gateway)?;
         let description = description.map(|described| *described.newest());
-        let names = Described::by(domain, &robot, Publisher::Estimator)?;
+        let names = DescriptionReader::by(domain, &robot, Publisher::Estimator)?;
         let mut estimates = Reader::<TorqueEstimate>::open(domain, &robot).ok();
         let mut channels = vec![Seen::default(); MAX_CHANNELS];
         // Who publishes no description has no health either; each look for it takes half a second.

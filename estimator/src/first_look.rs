@@ -181,7 +181,7 @@ mod tests {
     use super::*;
     use crate::config::Config;
     use proprio_identification::FindingCode;
-    use proprio_topics::csv::{Item, Reader, Row, What};
+    use proprio_topics::csv::{Row, SeriesValue, TableReader, What};
     use std::path::Path;
 
     /// The samples of a recorded session, as they would be received; forces and torques multiplied
@@ -189,7 +189,7 @@ mod tests {
     fn received(setup: &Setup, by: f64) -> Vec<Received> {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/oracle/sessions");
         let log = std::fs::read_to_string(folder.join("train.csv")).expect("a session");
-        let mut reader = Reader::new(log.as_bytes()).expect("a log");
+        let mut reader = TableReader::new(log.as_bytes()).expect("a log");
         let series: Vec<Option<usize>> = reader
             .series()
             .iter()
@@ -200,7 +200,7 @@ mod tests {
             .collect();
         let (mut row, mut seen) = (Row::default(), Vec::new());
         while reader.next_row(&mut row).expect("a row") {
-            for Item {
+            for SeriesValue {
                 series: number,
                 value,
             } in &row.items

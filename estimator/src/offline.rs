@@ -36,7 +36,7 @@ use crate::pipeline::{Estimate, Pipeline};
 use crate::reading::{MissingChannels, Target, check_columns, check_skins, targets};
 use crate::setup::Setup;
 use proprio_identification::online::Hypothesis;
-use proprio_topics::csv::{Item, Reader, Report, Row, Value, What};
+use proprio_topics::csv::{Row, SeriesValue, TableReader, TableReport, Value, What};
 use proprio_topics::{
     Agreement, ContactWrench, DriveEstimate, DriveTorque, JointTorque, Kind, NO_CAUSE, Nanos,
     Reason, Residual,
@@ -51,7 +51,7 @@ use std::ops::ControlFlow;
 pub enum OfflineError {
     /// The log cannot be read.
     #[error(transparent)]
-    Log(#[from] proprio_topics::csv::Error),
+    Log(#[from] proprio_topics::csv::TableError),
     /// The estimates cannot be written.
     #[error("the estimates cannot be written")]
     Write(#[from] io::Error),
@@ -71,7 +71,7 @@ pub struct EstimateReport {
     /// Withheld torques in them, by reason ([`Reason::word`]).
     pub withheld: BTreeMap<&'static str, u64>,
     /// The rows that the reader skipped.
-    pub log: Report,
+    pub log: TableReport,
     /// Samples dropped: late, stamped no later than the last one, not finite.
     pub dropped: [u64; 3],
     /// The line of the first row with a dropped sample.
@@ -159,7 +159,7 @@ pub fn follow(
     log: impl Read,
     mut each: impl FnMut(&mut Pipeline, bool) -> Result<ControlFlow<()>, OfflineError>,
 ) -> Result<(EstimateReport, Pipeline), OfflineError> {
-    let mut reader = Reader::new(log)?;
+    let mut reader = TableReader::new(log)?;
     let mut report = EstimateReport::default();
     let mut pipeline = Pipeline::new(setup);
     let robot = &pipeline.setup().robot;
@@ -201,7 +201,7 @@ pub fn follow(
             pseudo += spacing;
             pseudo
         });
-        for Item { series, value } in &row.items {
+        for SeriesValue { series, value } in &row.items {
             match (targets.get(*series).copied().flatten(), value) {
                 (Some(Target::Channel(channel)), Value::Reading(reading, quality)) => {
                     pipeline.push(channel, t, reading, *quality);

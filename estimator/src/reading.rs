@@ -10,7 +10,7 @@ use proprio_identification::dataset::DatasetError;
 use proprio_identification::dataset::recording::SkippedRows;
 use proprio_identification::robot::Channel;
 use proprio_identification::{Dataset, Recording, Robot, Role, parallel};
-use proprio_topics::csv::{self, Item, Reader, Report, Row, Series, Value, What};
+use proprio_topics::csv::{self, Row, Series, SeriesValue, TableReader, TableReport, Value, What};
 use proprio_topics::{Kind, Nanos};
 use std::io::Read;
 use std::ops::Range;
@@ -21,7 +21,7 @@ use std::ops::Range;
 pub enum ReadingError {
     /// The log cannot be read.
     #[error(transparent)]
-    Log(#[from] csv::Error),
+    Log(#[from] csv::TableError),
     /// Without these channels there are no kinematics.
     #[error(transparent)]
     MissingChannels(#[from] MissingChannels),
@@ -48,7 +48,7 @@ impl ReadingError {
     fn is_empty(&self) -> bool {
         matches!(
             self,
-            Self::Dataset(_) | Self::Log(csv::Error::Empty | csv::Error::NoRow { .. })
+            Self::Dataset(_) | Self::Log(csv::TableError::Empty | csv::TableError::NoRow { .. })
         )
     }
 }
@@ -124,7 +124,7 @@ pub(crate) fn targets(robot: &Robot, series: &[Series]) -> Vec<Option<Target>> {
 struct PartialRecording {
     recording: Recording,
     is_stamped: bool,
-    report: Report,
+    report: TableReport,
 }
 
 /// [`recording`] with given sizes of blocks and segments.
@@ -137,13 +137,13 @@ fn read_in_segments(
     let mut text = Vec::new();
     let mut ended = fill(&mut text, &mut log, block)?;
     let Some((header, mut before)) = header(&text) else {
-        let mut rows = Reader::new(text.chain(log))?;
+        let mut rows = TableReader::new(text.chain(log))?;
         let (mut part, targets) = PartialRecording::new(robot, &rows)?;
         part.take(&mut rows, &targets)?;
         return Ok(part.finish());
     };
     let header: Vec<u8> = text.drain(..header).collect();
-    let table = Reader::new(header.as_slice())?;
+    let table = TableReader::new(header.as_slice())?;
     let (mut all, targets) = PartialRecording::new(robot, &table)?;
     let empty = all.clone();
     all.report = table.report().clone();
@@ -156,7 +156,7 @@ fn read_in_segments(
         let segments = segments(&text[..end], segment);
         let parts = parallel::map(
             segments.len(),
-            |number| -> Result<Option<(PartialRecording, u64)>, csv::Error> {
+            |number| -> Result<Option<(PartialRecording, u64)>, csv::TableError> {
                 let segment = &text[segments[number].clone()];
                 // None where the log cannot be cut.
                 if segment.contains(&b'"') {
@@ -190,7 +190,7 @@ fn read_in_segments(
 }
 
 /// Reads until there is a block of text. True if the log ended.
-fn fill(text: &mut Vec<u8>, log: &mut impl Read, block: usize) -> Result<bool, csv::Error> {
+fn fill(text: &mut Vec<u8>, log: &mut impl Read, block: usize) -> Result<bool, csv::TableError> {
     let missing = block.saturating_sub(text.len()) as u64;
     let read = log.by_ref().take(missing).read_to_end(text)?;
     Ok((read as u64) < missing)
@@ -241,7 +241,7 @@ impl PartialRecording {
     /// A recording without rows; and per series of the log its channel or contact, if it has one.
     fn new(
         robot: &Robot,
-        table: &Reader<impl Read>,
+        table: &TableReader<impl Read>,
     ) -> Result<(Self, Vec<Option<Target>>), ReadingError> {
         // A log may lack an F/T sensor, but no joint and no IMU.
         check_columns(robot, table.series(), |c| c.kind != Kind::Wrench)?;
@@ -249,16 +249,16 @@ impl PartialRecording {
         let part = Self {
             recording: Recording::new(robot),
             is_stamped: true,
-            report: Report::default(),
+            report: TableReport::default(),
         };
         Ok((part, targets))
     }
 
     fn take<R: Read>(
         &mut self,
-        rows: &mut Reader<R>,
+        rows: &mut TableReader<R>,
         targets: &[Option<Target>],
-    ) -> Result<(), csv::Error> {
+    ) -> Result<(), csv::TableError> {
         let (mut row, mut pseudo) = (Row::default(), Nanos::ZERO);
         while rows.next_row(&mut row)? {
             let t = row.t.unwrap_or_else(|| {
@@ -266,7 +266,7 @@ impl PartialRecording {
                 pseudo += self.recording.unstamped_spacing();
                 pseudo
             });
-            for Item { series, value } in &row.items {
+            for SeriesValue { series, value } in &row.items {
                 match (targets.get(*series).copied().flatten(), value) {
                     (Some(Target::Channel(channel)), Value::Reading(reading, quality)) => {
                         self.recording.push(channel, t, reading, *quality);
@@ -378,7 +378,7 @@ mod tests {
 
     /// The recording of a log that is not cut.
     fn read_whole(robot: &Robot, log: &str) -> Result<Recording, ReadingError> {
-        let mut rows = Reader::new(log.as_bytes())?;
+        let mut rows = TableReader::new(log.as_bytes())?;
         let (mut part, targets) = PartialRecording::new(robot, &rows)?;
         part.take(&mut rows, &targets)?;
         Ok(part.finish())

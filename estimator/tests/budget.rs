@@ -6,7 +6,7 @@ use proprio_estimator::differentiate::Window;
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
 use proprio_identification::prior::cad_root;
-use proprio_topics::csv::{Reader, Row, Value, What};
+use proprio_topics::csv::{Row, TableReader, Value, What};
 use proprio_topics::{Nanos, Reading, Source, TorqueBudget};
 use std::cell::{Cell, RefCell};
 use std::path::Path;
@@ -47,7 +47,7 @@ fn last(change: &Change<'_>) -> (Vec<f64>, Vec<TorqueBudget>) {
         change(&mut setup);
     }
     let mut pipeline = Pipeline::new(setup);
-    let mut reader = Reader::new(&log[..]).unwrap();
+    let mut reader = TableReader::new(&log[..]).unwrap();
     let (series, mut row, mut rows) = (reader.series().to_vec(), Row::default(), Vec::new());
     while reader.next_row(&mut row).unwrap() {
         rows.push(row.clone());

@@ -8,7 +8,7 @@ use proprio_estimator::config::{Config, ContactKind, Direction, Presence, Sensor
 use proprio_estimator::offline;
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
-use proprio_topics::csv::{Reader, Row, Value, What};
+use proprio_topics::csv::{Row, TableReader, Value, What};
 use proprio_topics::{ContactState, JointState, Kind, Nanos, Quality, Reading, Reason, Wrench};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -232,7 +232,7 @@ fn temperatures_count_by_their_stamps() {
             calibrate(config, &change);
             config.output.max_wait_ms = Some(40.0);
         }));
-        let mut reader = Reader::new(log.as_bytes()).unwrap();
+        let mut reader = TableReader::new(log.as_bytes()).unwrap();
         let series: Vec<_> = reader.series().to_vec();
         let (mut row, mut samples) = (Row::default(), Vec::new());
         while reader.next_row(&mut row).unwrap() {
@@ -354,7 +354,7 @@ fn without_a_temperature_torques_are_less_certain() {
                 Quality::GOOD,
             );
         }
-        let mut reader = Reader::new(log.as_bytes()).unwrap();
+        let mut reader = TableReader::new(log.as_bytes()).unwrap();
         let series: Vec<_> = reader.series().to_vec();
         let mut row = Row::default();
         assert!(reader.next_row(&mut row).unwrap());
@@ -486,7 +486,8 @@ fn recording(setup: &Setup, seconds: f64) -> Vec<Event> {
 
 /// The same with the phase of each channel [s] given.
 fn recording_with(setup: &Setup, seconds: f64, phase: impl Fn(usize) -> f64) -> Vec<Event> {
-    let mut reader = Reader::new(golden("icub_left_arm_mujoco.csv").leak().as_bytes()).unwrap();
+    let mut reader =
+        TableReader::new(golden("icub_left_arm_mujoco.csv").leak().as_bytes()).unwrap();
     let channel = |s: &proprio_topics::csv::Series| match s.what {
         What::Channel(kind) => setup.robot.channel(kind, &s.name),
         What::Contact => None,

@@ -12,7 +12,7 @@ use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
 use proprio_estimator::skin::{Taxel, TaxelMap};
 use proprio_identification::robot::BaseMotion;
-use proprio_topics::csv::{Columns, Series, Value, What, Writer};
+use proprio_topics::csv::{Columns, Series, TableWriter, Value, What};
 use proprio_topics::{
     ContactState, Imu, JointState as Encoder, Kind, Nanos, Quality, Reading, Reason, Skin,
     Wrench as ForceTorque,
@@ -435,7 +435,7 @@ fn a_table_gives_the_live_estimates() {
         what: What::Contact,
         name: "hand".into(),
     });
-    let mut table = Writer::new(Vec::new(), &series, Columns::All).unwrap();
+    let mut table = TableWriter::new(Vec::new(), &series, Columns::All).unwrap();
     let mut next = 1900;
     let (live, _) = run_with(setup.clone(), &all, |pipeline, t| {
         while Nanos::from_millis(next) <= t && next < 2300 {

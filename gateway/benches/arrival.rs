@@ -15,7 +15,7 @@ use proprio_gateway::link::{Link, Received, send_by};
 use proprio_gateway::log;
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
-use proprio_gateway::publish::Shared;
+use proprio_gateway::publish::SharedMemory;
 use proprio_gateway::status::BusStatus;
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Writer, monotonic};
 use proprio_topics::{Header, JointState, Nanos, Reading, Sample};
@@ -77,7 +77,7 @@ fn frames() -> Vec<Frame> {
     }
     let mut log = Vec::new();
     offline::encode(&plan("a"), table.as_bytes(), &mut log).expect("frames");
-    let mut reader = log::Reader::new(log.as_slice());
+    let mut reader = log::LogReader::new(log.as_slice());
     let mut frames = Vec::new();
     while let Some(record) = reader.next_record().expect("a log") {
         frames.push(record.frame);
@@ -151,7 +151,7 @@ fn main() {
                     let mut bus = Bus::new(
                         Box::new(link),
                         decoder,
-                        Shared::new(writer, "robot", Arc::default()),
+                        SharedMemory::new(writer, "robot", Arc::default()),
                         status,
                     );
                     let turn = || {

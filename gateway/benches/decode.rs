@@ -122,9 +122,9 @@ fn conversation(plan: &DevicePlan) -> Vec<(Nanos, Frame)> {
         }
         if board.period().is_some_and(|_| now >= due) {
             due = now + board.period().unwrap_or(STEP);
-            for route in &plan.routes {
-                if let Some(reading) = reading(route.kind, step) {
-                    let _ = board.encode(route.output, &reading, Quality::GOOD, &mut frames);
+            for output in &plan.outputs {
+                if let Some(reading) = reading(output.kind, step) {
+                    let _ = board.encode(output.number, &reading, Quality::GOOD, &mut frames);
                 }
             }
         }
@@ -141,9 +141,9 @@ fn conversation(plan: &DevicePlan) -> Vec<(Nanos, Frame)> {
 }
 
 fn present(plan: &DevicePlan, board: &mut dyn Board, step: i64) {
-    for route in &plan.routes {
-        if let Some(reading) = reading(route.kind, step) {
-            board.present(route.output, &reading, Quality::GOOD);
+    for output in &plan.outputs {
+        if let Some(reading) = reading(output.kind, step) {
+            board.present(output.number, &reading, Quality::GOOD);
         }
     }
 }

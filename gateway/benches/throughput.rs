@@ -11,11 +11,11 @@ use proprio_gateway::bus::{Bus, Turn};
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::link::virtual_bus::VirtualBus;
-use proprio_gateway::link::{Link, LinkCounters, Received, SendError, send_by};
+use proprio_gateway::link::{Link, LinkCounters, Received, TransmitError, send_by};
 use proprio_gateway::log;
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
-use proprio_gateway::publish::Shared;
+use proprio_gateway::publish::SharedMemory;
 use proprio_gateway::status::BusStatus;
 use proprio_topics::csv::Columns;
 use proprio_topics::ipc::{Domain, DomainConfig, Writer};
@@ -103,7 +103,7 @@ fn parse_log(bencher: Bencher<'_, '_>) {
     let log = log(300_000);
     let frames = log.iter().filter(|b| **b == b'\n').count();
     bencher.counter(ItemsCount::new(frames)).bench(|| {
-        let mut reader = log::Reader::new(log.as_slice());
+        let mut reader = log::LogReader::new(log.as_slice());
         let mut count = 0;
         while reader.next_record().unwrap().is_some() {
             count += 1;
@@ -114,7 +114,7 @@ fn parse_log(bencher: Bencher<'_, '_>) {
 
 fn frames() -> Vec<Frame> {
     let log = log(FRAMES + 3);
-    let mut reader = log::Reader::new(log.as_slice());
+    let mut reader = log::LogReader::new(log.as_slice());
     let mut frames = Vec::new();
     while let (Ok(Some(record)), true) = (reader.next_record(), (frames.len() as u64) < FRAMES) {
         frames.push(record.frame);
@@ -190,7 +190,7 @@ fn frames_to_shared_memory(bencher: Bencher<'_, '_>) {
     let bus = std::cell::RefCell::new(Bus::new(
         Box::new(link),
         decoder,
-        Shared::new(writer, "robot", Arc::default()),
+        SharedMemory::new(writer, "robot", Arc::default()),
         status,
     ));
     let frames = frames();
@@ -211,7 +211,7 @@ impl Link for Waiting {
     fn recv(&mut self, _: Nanos) -> Received {
         self.0.recv(Nanos::ZERO)
     }
-    fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
+    fn send(&mut self, frame: &Frame) -> Result<(), TransmitError> {
         self.0.send(frame)
     }
     fn state(&self) -> LinkState {

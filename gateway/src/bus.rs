@@ -23,7 +23,7 @@ use crate::clock::Clock;
 use crate::decoder::Decoder;
 use crate::inbox::Inbox;
 use crate::link::error_frame::ErrorFrame;
-use crate::link::{Link, Received, SendError};
+use crate::link::{Link, Received, TransmitError};
 use crate::publish::Sink;
 use crate::status::BusStatus;
 use proprio_drivers::{Frame, NotSent, Transmit};
@@ -54,7 +54,7 @@ pub struct Bus<S> {
     sink: S,
     status: Arc<BusStatus>,
     link_was_up: bool,
-    queue: Queue,
+    queue: SendQueue,
     inbox: Option<Inbox>,
 }
 
@@ -68,15 +68,15 @@ pub enum Turn {
 }
 
 /// The frames that wait to be sent, in the order in which the devices gave them.
-struct Queue {
-    waiting: VecDeque<Waiting>,
+struct SendQueue {
+    waiting: VecDeque<QueuedFrame>,
     /// Frames that found the queue full, until their devices have been told.
-    refused: Vec<Waiting>,
+    refused: Vec<QueuedFrame>,
     /// Time of the next attempt after the link's queue was full.
     retry: Nanos,
 }
 
-struct Waiting {
+struct QueuedFrame {
     device: u16,
     frame: Frame,
     /// \[ns\] of the clock.
@@ -93,7 +93,7 @@ impl<S: Sink> Bus<S> {
             sink,
             status,
             link_was_up,
-            queue: Queue {
+            queue: SendQueue {
                 waiting: VecDeque::with_capacity(QUEUE),
                 refused: Vec::with_capacity(QUEUE),
                 retry: Nanos::MIN,
@@ -201,7 +201,7 @@ impl<S: Sink> Bus<S> {
             .poll_transmit(then, |device, Transmit { frame, deadline }| {
                 // A device that lives in the past has as much time as it would have had then.
                 let behind = (clock.now() - then).max(Nanos::ZERO);
-                let waiting = Waiting {
+                let waiting = QueuedFrame {
                     device,
                     frame: *frame,
                     deadline: *deadline + behind,
@@ -216,7 +216,7 @@ impl<S: Sink> Bus<S> {
                     }
                 }
             });
-        for Waiting { device, frame, .. } in queue.refused.drain(..) {
+        for QueuedFrame { device, frame, .. } in queue.refused.drain(..) {
             self.decoder.on_sent(device, &frame, Err(NotSent::Deadline));
         }
     }
@@ -246,13 +246,17 @@ impl<S: Sink> Bus<S> {
                     self.status.on_wire(&waiting.frame);
                     Ok(then)
                 }
-                Err(SendError::Full) => {
+                Err(TransmitError::Full) => {
                     self.status.queue_full.fetch_add(1, Relaxed);
                     self.queue.retry = now + RETRY;
                     return;
                 }
-                Err(SendError::NotUp) => return self.give_up(),
-                Err(SendError::ListenOnly | SendError::Unsupported | SendError::System(_)) => {
+                Err(TransmitError::NotUp) => return self.give_up(),
+                Err(
+                    TransmitError::ListenOnly
+                    | TransmitError::Unsupported
+                    | TransmitError::System(_),
+                ) => {
                     self.status.send_failures.fetch_add(1, Relaxed);
                     Err(NotSent::Refused)
                 }
@@ -265,7 +269,7 @@ impl<S: Sink> Bus<S> {
 
     /// Drops everything that waits.
     fn give_up(&mut self) {
-        while let Some(Waiting { device, frame, .. }) = self.queue.waiting.pop_front() {
+        while let Some(QueuedFrame { device, frame, .. }) = self.queue.waiting.pop_front() {
             self.status.send_failures.fetch_add(1, Relaxed);
             self.decoder.on_sent(device, &frame, Err(NotSent::LinkLost));
         }

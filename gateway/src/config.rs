@@ -11,49 +11,49 @@ use toml::Spanned;
 #[derive(Debug, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
-pub struct Raw {
+pub struct GatewayConfig {
     /// The version of the file format: 1.
     pub schema: u32,
     /// The robot's name: the first part of every service's name.
     pub robot: String,
     /// The buses.
     #[serde(default)]
-    pub bus: Vec<RawBus>,
+    pub bus: Vec<BusConfig>,
 }
 
 /// `[[bus]]`.
 #[derive(Debug, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
-pub struct RawBus {
+pub struct BusConfig {
     /// The bus's name, in messages and in `proprio status`.
     pub name: String,
     /// The source of its frames.
-    pub source: Source,
+    pub source: FrameSource,
     /// Its bit rate \[bit/s\]; that of the arbitration phase for CAN FD. It is used to compute the
     /// load, where the interface does not tell it; it is not set.
     pub bit_rate: Option<u32>,
     /// The bit rate of the data phase of CAN FD \[bit/s\].
     pub data_bit_rate: Option<u32>,
     /// Scheduling of its thread.
-    pub realtime: Option<Realtime>,
+    pub realtime: Option<Scheduling>,
     /// Never send to it: every device of the bus has `listen_only`.
     #[serde(default)]
     pub listen_only: bool,
     /// `[[bus.device]]`: common keys and the driver's own keys in one table.
     #[serde(default)]
-    #[cfg_attr(test, schemars(with = "Vec<RawDevice>"))]
+    #[cfg_attr(test, schemars(with = "Vec<DeviceConfig>"))]
     pub device: Vec<Spanned<toml::Table>>,
     /// `[[bus.coupling]]`: joints that several motors move together.
     #[serde(default)]
-    pub coupling: Vec<RawCoupling>,
+    pub coupling: Vec<CouplingConfig>,
 }
 
 /// The source of a bus's frames.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
-pub enum Source {
+pub enum FrameSource {
     /// A CAN interface of the kernel: `interface = "can0"`, or its adapter by `serial = "..."` or
     /// `usb_port = "1-2.3"`, with `channel = 0` if that has several interfaces. The adapter is
     /// looked for whenever the link is opened.
@@ -92,7 +92,7 @@ pub enum Pace {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
-pub struct Realtime {
+pub struct Scheduling {
     /// The processor it is bound to.
     pub cpu: Option<usize>,
     /// Its SCHED_FIFO priority, 1 to 99.
@@ -102,7 +102,7 @@ pub struct Realtime {
 /// The keys common to all devices.
 #[derive(Debug, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
-pub struct RawDevice {
+pub struct DeviceConfig {
     /// The driver's name: a page of the book.
     pub driver: String,
     /// The device's name, in messages and in `proprio status`; for a sensor also the name of its
@@ -120,10 +120,10 @@ pub struct RawDevice {
     pub listen_only: bool,
     /// `[[bus.device.joint]]`.
     #[serde(default)]
-    pub joint: Vec<RawJoint>,
+    pub joint: Vec<JointConfig>,
 }
 
-impl RawDevice {
+impl DeviceConfig {
     /// The names of the keys above; all other keys are the driver's.
     pub const KEYS: [&str; 6] = [
         "driver",
@@ -144,7 +144,7 @@ const fn default_max_silence_ms() -> f64 {
 #[derive(Debug, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
-pub struct RawJoint {
+pub struct JointConfig {
     /// The name of the joint, or of the motor. Several devices of a bus may measure one joint if
     /// `takes` says which gives what.
     pub name: String,
@@ -161,7 +161,7 @@ pub struct RawJoint {
     #[serde(default)]
     pub offset_rad: f64,
     /// What is taken of this device; all by default.
-    pub takes: Option<Vec<Quantity>>,
+    pub takes: Option<Vec<JointQuantity>>,
     /// The ends of the range in which the device reports its angle and begins anew \[rad\], if the
     /// joint goes beyond: `[0.0, 6.283185307179586]` for one turn of the device. Needs the two keys
     /// below.
@@ -179,7 +179,7 @@ pub struct RawJoint {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "lowercase")]
-pub enum Quantity {
+pub enum JointQuantity {
     /// `"position"`.
     Position,
     /// `"velocity"`.
@@ -197,7 +197,7 @@ pub enum Quantity {
 #[derive(Debug, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
-pub struct RawCoupling {
+pub struct CouplingConfig {
     /// The joints' names.
     pub joints: Vec<String>,
     /// The motors, as many: names of `[[bus.device.joint]]` of this bus. `ratio`, `sign` and
@@ -206,7 +206,7 @@ pub struct RawCoupling {
     /// A row for each joint, a column for each motor.
     pub matrix: Vec<Vec<f64>>,
     /// What is taken of the motors; all by default. The rest comes from devices at the joints.
-    pub takes: Option<Vec<Quantity>>,
+    pub takes: Option<Vec<JointQuantity>>,
 }
 
 const fn one() -> f64 {
@@ -228,7 +228,7 @@ mod tests {
     #[test]
     fn the_reference_of_gateway_toml_is_new() {
         schema::check("gateway.schema.json", |old| {
-            let mut made = schema::of::<Raw>();
+            let mut made = schema::of::<GatewayConfig>();
             let mut device = json!({ "oneOf": [] });
             let place = "/properties/bus/items/properties/device/items";
             if let Some(place) = made.pointer_mut(place) {
@@ -240,7 +240,7 @@ mod tests {
             made.pointer_mut(place).expect("devices")["oneOf"] = one_of.into();
             let names = schema::entries(&mut device, "properties").keys();
             assert!(
-                names.eq(RawDevice::KEYS
+                names.eq(DeviceConfig::KEYS
                     .iter()
                     .collect::<std::collections::BTreeSet<_>>())
             );

@@ -1,8 +1,8 @@
 //! The control socket: what an operator asks of a running gateway, and the answers.
 //!
 //! It is `<robot>.gateway.sock` in the folder of the domain, for the user of the gateway alone
-//! (mode 0600). A recorder has one likewise, `<robot>.recorder.sock`, for [`Recorder`]'s order. A
-//! client sends one JSON object per line and gets one line for each:
+//! (mode 0600). A recorder has one likewise, `<robot>.recorder.sock`, for [`RecorderSocket`]'s
+//! order. A client sends one JSON object per line and gets one line for each:
 //!
 //! | line | answer |
 //! |---|---|
@@ -93,7 +93,7 @@ impl Server {
 
 /// What is asked.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Order {
+pub(crate) enum ControlOrder {
     Status,
     Devices,
     Tare { device: String },
@@ -103,7 +103,7 @@ pub(crate) enum Order {
 
 /// An order, and where its answer goes.
 pub(crate) struct Asked {
-    pub(crate) order: Order,
+    pub(crate) order: ControlOrder,
     pub(crate) answer: oneshot::Sender<Json>,
 }
 
@@ -112,18 +112,18 @@ pub(crate) fn refusal(error: &dyn std::fmt::Display) -> Json {
     json!({ "ok": false, "error": error.to_string() })
 }
 
-impl Order {
+impl ControlOrder {
     const WORDS: [&str; 5] = ["status", "devices", "tare", "calibration", "reload"];
 
     /// The order in a line.
     fn parse(line: &[u8]) -> Result<Self, String> {
         #[derive(Deserialize)]
         #[serde(deny_unknown_fields)]
-        struct Raw {
+        struct OrderLine {
             r#do: String,
             device: Option<String>,
         }
-        let Raw { r#do: word, device } = serde_json::from_slice(line)
+        let OrderLine { r#do: word, device } = serde_json::from_slice(line)
             .map_err(|e| format!("a line is a JSON object such as {{\"do\": \"status\"}}: {e}"))?;
         let order = match (word.as_str(), device) {
             ("tare", Some(device)) => return Ok(Self::Tare { device }),
@@ -151,7 +151,7 @@ impl Order {
 
 /// The socket of a running gateway; removed when dropped.
 pub(crate) struct Socket {
-    folder: Folder,
+    folder: DomainFolder,
     robot: String,
     server: JoinHandle<()>,
 }
@@ -187,8 +187,8 @@ fn bind(
     domain: &DomainConfig,
     server: Server,
     robot: &str,
-) -> io::Result<(Folder, net::UnixListener)> {
-    let folder = Folder::open(domain)?;
+) -> io::Result<(DomainFolder, net::UnixListener)> {
+    let folder = DomainFolder::open(domain)?;
     let home = folder.path(&format!("{robot}.{}.new", server.word()));
     match fs::remove_dir_all(&home) {
         // A process that was killed while it did the same.
@@ -209,7 +209,7 @@ fn bind(
 const TURN: Duration = Duration::from_millis(100);
 
 /// The socket of a recorder: hands on `{"do": "snapshot"}`, one client after the other.
-pub struct Recorder {
+pub struct RecorderSocket {
     asked: std_mpsc::Receiver<Asking>,
     stop: Arc<AtomicBool>,
     thread: Option<thread::JoinHandle<()>>,
@@ -229,7 +229,7 @@ impl Asking {
     }
 }
 
-impl Recorder {
+impl RecorderSocket {
     /// Makes the socket and listens, in a thread of its own, which makes it again if it is deleted.
     /// One that another recorder of this robot has made is replaced.
     ///
@@ -307,7 +307,7 @@ impl Recorder {
     }
 }
 
-impl Drop for Recorder {
+impl Drop for RecorderSocket {
     fn drop(&mut self) {
         self.stop.store(true, Relaxed);
         if let Some(thread) = self.thread.take() {
@@ -318,9 +318,9 @@ impl Drop for Recorder {
 
 /// The folder of a domain. Sockets are reached through its descriptor, because their paths may have
 /// at most 107 bytes, and those of folder and robot may be longer.
-struct Folder(File);
+struct DomainFolder(File);
 
-impl Folder {
+impl DomainFolder {
     fn open(domain: &DomainConfig) -> io::Result<Self> {
         File::open(domain.base.join(&domain.name)).map(Self)
     }
@@ -357,11 +357,11 @@ async fn serve(listener: UnixListener, orders: mpsc::Sender<Asked>) {
 
 /// Serves one client until it leaves, or is too slow.
 async fn attend(stream: &UnixStream, orders: &mpsc::Sender<Asked>) -> Option<()> {
-    let mut lines = Lines::default();
+    let mut lines = LineBuffer::default();
     loop {
         let line = timeout(PATIENCE, lines.next(stream)).await.ok()?.ok()??;
         let order = match line.len() {
-            0..=MAX_LINE => Order::parse(&line),
+            0..=MAX_LINE => ControlOrder::parse(&line),
             _ => Err(format!("a line has at most {MAX_LINE} bytes")),
         };
         let answer = match order {
@@ -373,7 +373,7 @@ async fn attend(stream: &UnixStream, orders: &mpsc::Sender<Asked>) -> Option<()>
 }
 
 /// The answer of the control plane.
-async fn carry_out(order: Order, orders: &mpsc::Sender<Asked>) -> Json {
+async fn carry_out(order: ControlOrder, orders: &mpsc::Sender<Asked>) -> Json {
     let (answer, answered) = oneshot::channel();
     let sent = orders.send(Asked { order, answer }).await;
     match answered.await {
@@ -402,11 +402,11 @@ async fn send(stream: &UnixStream, answer: &Json) -> Option<()> {
 
 /// The bytes of a client that are not yet taken as lines.
 #[derive(Default)]
-struct Lines {
+struct LineBuffer {
     waiting: Vec<u8>,
 }
 
-impl Lines {
+impl LineBuffer {
     /// The next line, without its end; `None` at the end of the stream. Of one that is too long,
     /// a part that is too long, too.
     async fn next(&mut self, stream: &UnixStream) -> io::Result<Option<Vec<u8>>> {
@@ -443,7 +443,7 @@ pub fn running(domain: &DomainConfig, server: Server) -> io::Result<Vec<String>>
         io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused => Ok(false),
         _ => Err(error),
     };
-    let folder = match Folder::open(domain) {
+    let folder = match DomainFolder::open(domain) {
         Ok(folder) => folder,
         Err(error) => return none(error).map(|_| Vec::new()),
     };
@@ -470,7 +470,7 @@ pub fn running(domain: &DomainConfig, server: Server) -> io::Result<Vec<String>>
 /// [`io::Error`]: none of this robot is there ([`io::ErrorKind::NotFound`],
 /// [`io::ErrorKind::ConnectionRefused`]), or it does not answer.
 pub fn ask(domain: &DomainConfig, server: Server, robot: &str, line: &str) -> io::Result<String> {
-    let mut stream = net::UnixStream::connect(Folder::open(domain)?.socket(server, robot))?;
+    let mut stream = net::UnixStream::connect(DomainFolder::open(domain)?.socket(server, robot))?;
     stream.set_read_timeout(Some(server.patience()))?;
     stream.set_write_timeout(Some(server.patience()))?;
     stream.write_all(format!("{line}\n").as_bytes())?;
@@ -512,7 +512,7 @@ mod tests {
                 )
             });
             let Asked { order, answer } = asked.recv().await.unwrap();
-            assert_eq!(order, Order::Status);
+            assert_eq!(order, ControlOrder::Status);
             answer.send(json!({ "ok": true })).unwrap();
             let (found, answer) = client.await.unwrap();
             assert_eq!(
@@ -529,15 +529,15 @@ mod tests {
     #[test]
     fn a_wrong_line_says_what_would_be_right() {
         let device = || "a".to_owned();
-        let tare = Order::Tare { device: device() };
-        let calibration = Order::Calibration { device: device() };
+        let tare = ControlOrder::Tare { device: device() };
+        let calibration = ControlOrder::Calibration { device: device() };
         for (line, order) in [
-            (r#"{"do": "status"}"#, Order::Status),
-            (r#" { "do" : "devices" } "#, Order::Devices),
+            (r#"{"do": "status"}"#, ControlOrder::Status),
+            (r#" { "do" : "devices" } "#, ControlOrder::Devices),
             (r#"{"device": "a", "do": "tare"}"#, tare),
             (r#"{"do": "calibration", "device": "a"}"#, calibration),
         ] {
-            assert_eq!(Order::parse(line.as_bytes()), Ok(order));
+            assert_eq!(ControlOrder::parse(line.as_bytes()), Ok(order));
         }
         for (line, parts) in [
             ("", &["a JSON object such as {\"do\": \"status\"}"][..]),
@@ -565,11 +565,11 @@ mod tests {
             ),
             (r#"{"do": "zzz"}"#, &["no order \"zzz\"; there is status"]),
         ] {
-            let error = Order::parse(line.as_bytes()).expect_err(line);
+            let error = ControlOrder::parse(line.as_bytes()).expect_err(line);
             for part in parts {
                 assert!(error.contains(part), "{line}: {error}");
             }
         }
-        assert!(Order::parse(&[0xFF, 0xFE]).is_err());
+        assert!(ControlOrder::parse(&[0xFF, 0xFE]).is_err());
     }
 }

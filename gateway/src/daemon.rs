@@ -9,14 +9,14 @@
 pub use crate::thread::open_link;
 
 use crate::clock::{Clock, Monotonic};
-use crate::config::Source;
+use crate::config::FrameSource;
 use crate::control;
 use crate::health::{HealthLog, Loads, fill_health};
 use crate::journal::Journal;
 use crate::link::adapter::{self, Adapter};
 use crate::link::interface::{Netlink, Observer};
 use crate::operator::Operator;
-use crate::plan::{ConfigError, Plan};
+use crate::plan::{Plan, PlanError};
 use crate::thread::{BusThread, join, statuses};
 use crate::watch;
 use anyhow::{Context, anyhow, bail};
@@ -40,7 +40,7 @@ const LOOK: Duration = Duration::from_millis(5);
 /// Runs the gateway until SIGTERM, SIGINT, or the end of its logs.
 ///
 /// # Errors
-/// An error chain with cause, place and remedy; its root is a [`ConfigError`] if the configuration
+/// An error chain with cause, place and remedy; its root is a [`PlanError`] if the configuration
 /// is wrong.
 pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<()> {
     let plan = Plan::load_live(config)?;
@@ -68,7 +68,7 @@ pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<
 /// That it is not there is no error of the configuration: it may be plugged in later.
 fn adapters(plan: &Plan, sys: &Path) -> String {
     let lines = plan.buses.iter().filter_map(|bus| match &bus.source {
-        Source::SocketCan(named @ (Adapter::Serial { .. } | Adapter::UsbPort { .. })) => {
+        FrameSource::SocketCan(named @ (Adapter::Serial { .. } | Adapter::UsbPort { .. })) => {
             Some(match named.resolve(sys) {
                 Ok(interface) => format!("bus {}: its adapter is {interface} now\n", bus.name),
                 Err(problem) => format!("bus {}: {problem}\n", bus.name),
@@ -82,7 +82,7 @@ fn adapters(plan: &Plan, sys: &Path) -> String {
 /// Whether an error of [`run`] is a wrong configuration (exit code 2, otherwise 1).
 pub fn is_configuration(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| {
-        cause.is::<ConfigError>()
+        cause.is::<PlanError>()
             || cause
                 .downcast_ref()
                 .is_some_and(DomainError::is_configuration)
@@ -94,7 +94,7 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
     let mut interrupt = signal(SignalKind::interrupt()).context("cannot catch SIGINT")?;
     let clock = Monotonic;
     let started = clock.now();
-    let mut ports = Ports::open(Domain::open(domain_config)?, &plan, clock.now())?;
+    let mut ports = ControlPorts::open(Domain::open(domain_config)?, &plan, clock.now())?;
 
     for bus in plan.buses.iter().filter(|bus| bus.load.is_high()) {
         tracing::warn!(
@@ -124,8 +124,8 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
         return Err(error);
     }
     let interfaces = plan.buses.iter().map(|bus| match &bus.source {
-        Source::SocketCan(adapter) => Some(adapter.clone()),
-        Source::Virtual { .. } | Source::Replay { .. } => None,
+        FrameSource::SocketCan(adapter) => Some(adapter.clone()),
+        FrameSource::Virtual { .. } | FrameSource::Replay { .. } => None,
     });
     let observer = Observer::start(
         interfaces.collect(),
@@ -200,7 +200,7 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
             if !std::mem::replace(&mut is_damaged, true) {
                 tracing::error!("{}", ports.domain.damage());
             }
-            Ports::open(domain?, operator.plan(), now)
+            ControlPorts::open(domain?, operator.plan(), now)
         });
         match renewed {
             Some(Ok(new)) => {
@@ -243,13 +243,13 @@ async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyho
 }
 
 /// The control plane's ports.
-struct Ports {
+struct ControlPorts {
     domain: Domain,
     health: Writer<GatewayHealth>,
     description: Writer<Description>,
 }
 
-impl Ports {
+impl ControlPorts {
     fn open(domain: Domain, plan: &Plan, now: Nanos) -> anyhow::Result<Self> {
         let epoch = domain.epoch();
         // Health first: it admits one writer, so this fails if the robot already has a gateway.

@@ -126,7 +126,7 @@ fn parts(statement: &str) -> Vec<Vec<&str>> {
 }
 
 /// A message as the file has it.
-struct Section<'t> {
+struct MessageStatement<'t> {
     number: &'t str,
     name: &'t str,
     size: &'t str,
@@ -136,8 +136,8 @@ struct Section<'t> {
 /// What other statements say of messages and signals, by the numbers of messages as they are
 /// written, and by short names.
 #[derive(Default)]
-struct File<'t> {
-    sections: Vec<Section<'t>>,
+struct Statements<'t> {
+    sections: Vec<MessageStatement<'t>>,
     floats: HashMap<(&'t str, &'t str), &'t str>,
     switches: HashMap<(&'t str, &'t str), Switch>,
     long_messages: HashMap<&'t str, &'t str>,
@@ -149,12 +149,12 @@ struct File<'t> {
     protocol: &'t str,
 }
 
-impl<'t> File<'t> {
+impl<'t> Statements<'t> {
     fn new(text: &'t str) -> Self {
         let mut this = Self::default();
         for statement in statements(text).flat_map(parts) {
             match *statement {
-                ["BO_", number, name, ":", size, ..] => this.sections.push(Section {
+                ["BO_", number, name, ":", size, ..] => this.sections.push(MessageStatement {
                     number,
                     name,
                     size,
@@ -220,7 +220,7 @@ impl<'t> File<'t> {
         }
     }
 
-    fn message(&self, section: &Section<'_>) -> Message {
+    fn message(&self, section: &MessageStatement<'_>) -> Message {
         let j1939 = self.is_j1939(section.number);
         let id = id_of(section.number);
         let j1939 = j1939 && matches!(id, Ok(Id::Extended(_)));
@@ -249,7 +249,7 @@ impl<'t> File<'t> {
     }
 
     /// A signal from the words behind its keyword; `None` if it has no name.
-    fn signal(&self, section: &Section<'_>, words: &[&str]) -> Option<Signal> {
+    fn signal(&self, section: &MessageStatement<'_>, words: &[&str]) -> Option<Signal> {
         let colon = words.iter().position(|word| *word == ":");
         let (head, body) = words.split_at(colon.unwrap_or(words.len()));
         let (name, mark) = (*head.first()?, head.get(1).copied().unwrap_or(""));
@@ -263,7 +263,8 @@ impl<'t> File<'t> {
                 &[":", start, "|", length, "@", ref kind @ ..],
                 &["(", factor, ",", offset, ")", ref rest @ ..],
             ) => {
-                let numbers = Numbers::new(float, start, length, &kind.concat(), factor, offset);
+                let numbers =
+                    SignalCoding::new(float, start, length, &kind.concat(), factor, offset);
                 numbers.map(|numbers| (numbers, rest))
             }
             _ => Err("it is not written name : start|length@order (factor,offset)".to_owned()),
@@ -299,7 +300,7 @@ impl<'t> File<'t> {
 }
 
 fn parse(text: &str) -> Result<Vec<Message>, String> {
-    let file = File::new(text);
+    let file = Statements::new(text);
     if file.sections.is_empty() {
         return Err("has no message (BO_): it is no .dbc file".into());
     }
@@ -333,14 +334,14 @@ fn id_of(number: &str) -> Result<Id, String> {
 }
 
 /// The numbers of a signal.
-struct Numbers {
+struct SignalCoding {
     bits: Bits,
     raw: Raw,
     factor: f64,
     offset: f64,
 }
 
-impl Numbers {
+impl SignalCoding {
     fn new(
         float: Option<&str>,
         start: &str,
@@ -399,7 +400,11 @@ fn switch_of(multiplexor: &str, ranges: &[&str]) -> Option<Switch> {
 
 /// The frames that have a signal with `mark`, of which no statement of extended multiplexing
 /// speaks: the message then has one multiplexor.
-fn simple_switch(section: &Section<'_>, name: &str, mark: &str) -> Result<Option<Switch>, String> {
+fn simple_switch(
+    section: &MessageStatement<'_>,
+    name: &str,
+    mark: &str,
+) -> Result<Option<Switch>, String> {
     let Some(page) = mark.strip_prefix('m') else {
         return Ok(None);
     };

@@ -3,11 +3,11 @@
 
 use crate::dispatch::Dispatch;
 use crate::inbox::{Replacement, Reply, Request};
-use crate::joints::Joints;
-use crate::plan::{BusPlan, DevicePlan, Route};
+use crate::joints::{Joints, ShaftState};
+use crate::plan::{BusPlan, DevicePlan, OutputPlan};
 use crate::status::BusStatus;
 use proprio_drivers::{
-    Claim, CommandFailed, Decoded, Device, Frame, Mode, NotSent, SpecError, State, Transmit,
+    Claim, CommandFailed, Decoded, Device, Frame, Mode, NotSent, Output, SpecError, State, Transmit,
 };
 use proprio_topics::sanity::Repeats;
 use proprio_topics::{
@@ -20,17 +20,11 @@ use std::sync::atomic::Ordering::Relaxed;
 /// one measurement several times, if they send faster than they measure.
 const LEAST_RUN: u32 = 16;
 
-/// The devices of one bus, their routes and counters.
+/// The devices of one bus, their outputs and counters.
 pub struct Decoder {
-    bus: u32,
     devices: Vec<Running>,
     dispatch: Dispatch,
-    joints: Joints,
-    /// Stamp of the last main reading per channel that is no joint's.
-    last: [Nanos; MAX_CHANNELS],
-    /// Channels, no joint's, whose next main reading has ZERO_CHANGED, because their device was
-    /// replaced.
-    replaced: [bool; MAX_CHANNELS],
+    channels: Channels,
     /// Number of devices with a request open.
     open: usize,
     decoded: Decoded,
@@ -39,14 +33,26 @@ pub struct Decoder {
 
 struct Running {
     device: Box<dyn Device>,
-    routes: Vec<Route>,
-    request: Open,
-    /// The past of its wrenches, per route.
+    outputs: Vec<OutputPlan>,
+    request: OpenRequest,
+    /// The past of its wrenches, per output.
     repeats: Vec<Repeats<6>>,
 }
 
+/// The channels of one bus: from readings to samples.
+struct Channels {
+    bus: u32,
+    joints: Joints,
+    /// Stamp of the last main reading per channel that is no joint's.
+    last: [Nanos; MAX_CHANNELS],
+    /// Channels, no joint's, whose next main reading has ZERO_CHANGED, because their device was
+    /// replaced.
+    replaced: [bool; MAX_CHANNELS],
+    status: Arc<BusStatus>,
+}
+
 /// The request of a device that has not been replied to.
-enum Open {
+enum OpenRequest {
     None,
     /// The command's outcome is waited for.
     Command,
@@ -75,6 +81,121 @@ fn beyond(wrench: &Wrench, full_scale: Option<[f64; 6]>) -> u16 {
     })
 }
 
+fn count_faults(status: &BusStatus, number: u16, decoded: &Decoded) {
+    for fault in &decoded.faults {
+        status.count(number, fault.counter, u64::from(fault.count));
+    }
+}
+
+impl Channels {
+    fn new(bus: u32, joints: Joints, status: Arc<BusStatus>) -> Self {
+        Self {
+            bus,
+            joints,
+            last: [Nanos::MIN; MAX_CHANNELS],
+            replaced: [false; MAX_CHANNELS],
+            status,
+        }
+    }
+
+    /// Takes a reading of device number `number`; calls `publish` for every sample that it
+    /// completes.
+    fn take(
+        &mut self,
+        number: u16,
+        running: &mut Running,
+        reading: &Output,
+        publish: &mut impl FnMut(&mut Sample),
+    ) {
+        let mut outputs = running.outputs.iter().zip(&mut running.repeats);
+        let Some((output, repeats)) = outputs.find(|(o, _)| o.number == reading.output) else {
+            return;
+        };
+        let header = Header {
+            acquired: reading.acquired,
+            device_time: reading.device_time,
+            device_counter: reading.device_counter,
+            quality: reading.quality,
+            stamp: reading.stamp.in_memory(),
+            bus: self.bus,
+            ..Header::default()
+        };
+        if let (Reading::Joint(state), Some(input)) = (reading.reading, &output.input) {
+            let complete = |channel, whole: &ShaftState| {
+                let header = Header {
+                    acquired: whole.acquired,
+                    device_time: whole.device_time,
+                    device_counter: whole.device_counter,
+                    quality: whole.quality,
+                    stamp: whole.stamp.in_memory(),
+                    ..header
+                };
+                let state = Reading::Joint(whole.state);
+                publish(&mut Sample::new(header, channel, &state));
+            };
+            let joints = &mut self.joints;
+            let taken = joints.push(input, &output.map, reading, state, complete);
+            let counter = [Counter::Backward, Counter::Readings][usize::from(taken)];
+            self.status.count(number, counter, 1);
+            return;
+        }
+        let Some(mut quality) = self.quality(output, reading) else {
+            self.status.count(number, Counter::Backward, 1);
+            return;
+        };
+        if let Reading::Wrench(wrench) = &reading.reading {
+            let ([fx, fy, fz], [tx, ty, tz]) = (wrench.force, wrench.torque);
+            let frozen = repeats.look(&[fx, fy, fz, tx, ty, tz], quality, LEAST_RUN);
+            let beyond = beyond(wrench, running.device.full_scale());
+            if frozen != 0 {
+                quality |= Quality::FROZEN;
+                self.status.count(number, Counter::Frozen, 1);
+            }
+            if beyond != 0 {
+                self.status.count(number, Counter::OutOfRange, 1);
+            }
+            self.status.set_axes(number, frozen, beyond);
+        }
+        let header = Header { quality, ..header };
+        self.status.count(number, Counter::Readings, 1);
+        publish(&mut Sample::new(header, output.channel, &reading.reading));
+    }
+
+    /// The flags of a reading that is no joint's state; `None`: it is a main reading whose stamp
+    /// runs backward.
+    fn quality(&mut self, output: &OutputPlan, reading: &Output) -> Option<Quality> {
+        let mut quality = match &output.input {
+            Some(input) => self.joints.flags(input, reading.quality),
+            None => reading.quality,
+        };
+        let is_main = reading.reading.kind() == output.kind;
+        if is_main && let Some(last) = self.last.get_mut(output.channel as usize) {
+            if reading.acquired < *last {
+                return None;
+            }
+            *last = reading.acquired;
+            if let Some(replaced) = self.replaced.get_mut(output.channel as usize)
+                && std::mem::take(replaced)
+            {
+                quality |= Quality::GAP_BEFORE | Quality::ZERO_CHANGED;
+            }
+        }
+        Some(quality)
+    }
+
+    /// The device of these outputs, or a conversion of theirs, was replaced: the zero may have
+    /// changed.
+    fn replaced(&mut self, outputs: &[OutputPlan]) {
+        for output in outputs {
+            if let Some(input) = &output.input {
+                self.joints.replaced(input);
+            } else if let Some(replaced) = self.replaced.get_mut(output.channel as usize) {
+                *replaced = true;
+            }
+        }
+    }
+}
+
 impl Decoder {
     /// Builds the devices of bus number `bus`; `mode`, if given, overrides their mode (with logs,
     /// devices only listen).
@@ -93,9 +214,9 @@ impl Decoder {
             .map(|device| {
                 Ok(Running {
                     device: build(device, mode)?,
-                    routes: device.routes.clone(),
-                    request: Open::None,
-                    repeats: vec![Repeats::default(); device.routes.len()],
+                    outputs: device.outputs.clone(),
+                    request: OpenRequest::None,
+                    repeats: vec![Repeats::default(); device.outputs.len()],
                 })
             })
             .collect::<Result<Vec<_>, SpecError>>()?;
@@ -105,14 +226,10 @@ impl Decoder {
 
     fn of(bus: u32, devices: Vec<Running>, joints: Joints, status: Arc<BusStatus>) -> Self {
         let dispatch = Dispatch::new(devices.iter().map(|d| d.device.claims()));
-        let last = [Nanos::MIN; MAX_CHANNELS];
         let this = Self {
-            bus,
             devices,
             dispatch,
-            joints,
-            last,
-            replaced: [false; MAX_CHANNELS],
+            channels: Channels::new(bus, joints, Arc::clone(&status)),
             open: 0,
             decoded: Decoded::new(),
             status,
@@ -147,80 +264,9 @@ impl Decoder {
             self.decoded.clear();
             running.device.on_frame(frame, &mut self.decoded);
             self.status.count(number, Counter::Frames, 1);
-            for fault in &self.decoded.faults {
-                self.status
-                    .count(number, fault.counter, u64::from(fault.count));
-            }
-            for output in &self.decoded.readings {
-                let mut routes = running.routes.iter().zip(0_usize..);
-                let Some((route, at)) = routes.find(|(r, _)| r.output == output.output) else {
-                    continue;
-                };
-                let header = Header {
-                    acquired: output.acquired,
-                    device_time: output.device_time,
-                    device_counter: output.device_counter,
-                    quality: output.quality,
-                    stamp: output.stamp.in_memory(),
-                    bus: self.bus,
-                    ..Header::default()
-                };
-                if let (Reading::Joint(state), Some(feed)) = (output.reading, &route.feed) {
-                    let joints = &mut self.joints;
-                    let taken = joints.push(feed, &route.map, output, state, |channel, whole| {
-                        let header = Header {
-                            acquired: whole.acquired,
-                            device_time: whole.device_time,
-                            device_counter: whole.device_counter,
-                            quality: whole.quality,
-                            stamp: whole.stamp.in_memory(),
-                            ..header
-                        };
-                        publish(&mut Sample::new(
-                            header,
-                            channel,
-                            &Reading::Joint(whole.state),
-                        ));
-                    });
-                    let counter = [Counter::Backward, Counter::Readings][usize::from(taken)];
-                    self.status.count(number, counter, 1);
-                    continue;
-                }
-                let main = output.reading.kind() == route.kind;
-                let mut quality = match &route.feed {
-                    Some(feed) => self.joints.flags(feed, output.quality),
-                    None => output.quality,
-                };
-                if main && let Some(last) = self.last.get_mut(route.channel as usize) {
-                    if output.acquired < *last {
-                        self.status.count(number, Counter::Backward, 1);
-                        continue;
-                    }
-                    *last = output.acquired;
-                    if let Some(replaced) = self.replaced.get_mut(route.channel as usize)
-                        && std::mem::take(replaced)
-                    {
-                        quality |= Quality::GAP_BEFORE | Quality::ZERO_CHANGED;
-                    }
-                }
-                if let Reading::Wrench(wrench) = &output.reading {
-                    let repeats = running.repeats.get_mut(at);
-                    let ([fx, fy, fz], [tx, ty, tz]) = (wrench.force, wrench.torque);
-                    let values = [fx, fy, fz, tx, ty, tz];
-                    let frozen = repeats.map_or(0, |r| r.look(&values, quality, LEAST_RUN));
-                    let beyond = beyond(wrench, running.device.full_scale());
-                    if frozen != 0 {
-                        quality |= Quality::FROZEN;
-                        self.status.count(number, Counter::Frozen, 1);
-                    }
-                    if beyond != 0 {
-                        self.status.count(number, Counter::OutOfRange, 1);
-                    }
-                    self.status.set_axes(number, frozen, beyond);
-                }
-                let header = Header { quality, ..header };
-                self.status.count(number, Counter::Readings, 1);
-                publish(&mut Sample::new(header, route.channel, &output.reading));
+            count_faults(&self.status, number, &self.decoded);
+            for reading in &self.decoded.readings {
+                self.channels.take(number, running, reading, &mut publish);
             }
             self.status.set_state(number, &*running.device);
         }
@@ -241,10 +287,7 @@ impl Decoder {
             if let Some(transmit) = running.device.poll_transmit(now, &mut self.decoded) {
                 send(number, &transmit);
             }
-            for fault in &self.decoded.faults {
-                self.status
-                    .count(number, fault.counter, u64::from(fault.count));
-            }
+            count_faults(&self.status, number, &self.decoded);
             self.status.set_state(number, &*running.device);
         }
     }
@@ -262,10 +305,7 @@ impl Decoder {
             for (other, number) in others.filter(|(_, number)| *number != device) {
                 self.decoded.clear();
                 other.device.overhear(&sent, &mut self.decoded);
-                for fault in &self.decoded.faults {
-                    let count = u64::from(fault.count);
-                    self.status.count(number, fault.counter, count);
-                }
+                count_faults(&self.status, number, &self.decoded);
             }
         }
         if outcome.is_err() {
@@ -303,12 +343,12 @@ impl Decoder {
                 return Some(Reply::Ended(Err(CommandFailed::NotSent)));
             }
             Request::Command { command, .. } => match running.device.command(command, now) {
-                Ok(()) => running.request = Open::Command,
+                Ok(()) => running.request = OpenRequest::Command,
                 Err(refused) => return Some(Reply::Refused(refused)),
             },
             Request::Replace(replacement) if replacement.device.is_some() => {
                 running.device.stop(now);
-                running.request = Open::Replacement(replacement);
+                running.request = OpenRequest::Replacement(replacement);
             }
             Request::Replace(replacement) => {
                 running.device.set_max_silence(replacement.max_silence);
@@ -329,17 +369,17 @@ impl Decoder {
             let Some(running) = self.devices.get_mut(usize::from(number)) else {
                 return;
             };
-            let ended = match std::mem::replace(&mut running.request, Open::None) {
-                Open::None => continue,
-                Open::Command => running
+            let ended = match std::mem::replace(&mut running.request, OpenRequest::None) {
+                OpenRequest::None => continue,
+                OpenRequest::Command => running
                     .device
                     .outcome()
                     .map(Reply::Ended)
-                    .ok_or(Open::Command),
-                Open::Replacement(new) if up && running.device.state() != State::Stopped => {
-                    Err(Open::Replacement(new))
+                    .ok_or(OpenRequest::Command),
+                OpenRequest::Replacement(new) if up && running.device.state() != State::Stopped => {
+                    Err(OpenRequest::Replacement(new))
                 }
-                Open::Replacement(new) => Ok(self.replace(number, new)),
+                OpenRequest::Replacement(new) => Ok(self.replace(number, new)),
             };
             match ended {
                 Ok(ended) => {
@@ -358,26 +398,21 @@ impl Decoder {
     /// Puts `new` in the place of what device number `number` has.
     fn replace(&mut self, number: u16, mut new: Replacement) -> Reply {
         if let Some(running) = self.devices.get_mut(usize::from(number)) {
-            if new.device.is_some() || new.routes != running.routes {
-                for route in &new.routes {
-                    match &route.feed {
-                        Some(feed) => self.joints.replaced(feed),
-                        None => {
-                            if let Some(replaced) = self.replaced.get_mut(route.channel as usize) {
-                                *replaced = true;
-                            }
-                        }
-                    }
-                }
+            if new.device.is_some() || new.outputs != running.outputs {
+                self.channels.replaced(&new.outputs);
             }
-            for feed in new.routes.iter().filter_map(|route| route.feed.as_ref()) {
-                self.joints.set_max_silence(feed, new.max_silence);
+            for input in new
+                .outputs
+                .iter()
+                .filter_map(|output| output.input.as_ref())
+            {
+                self.channels.joints.set_max_silence(input, new.max_silence);
             }
             if let Some(device) = &mut new.device {
                 std::mem::swap(device, &mut running.device);
                 running.repeats.fill(Repeats::default());
             }
-            std::mem::swap(&mut new.routes, &mut running.routes);
+            std::mem::swap(&mut new.outputs, &mut running.outputs);
             self.status.set_state(number, &*running.device);
         }
         Reply::Replaced(new)
@@ -498,8 +533,8 @@ mod tests {
                 answers: 0,
                 stopped: false,
             }),
-            routes: Vec::new(),
-            request: Open::None,
+            outputs: Vec::new(),
+            request: OpenRequest::None,
             repeats: Vec::new(),
         };
         let mut decoder = Decoder::of(0, vec![running], Joints::default(), Arc::clone(&status));
@@ -531,7 +566,7 @@ mod tests {
         // Its plan can be shown, and its health has a name.
         let mut plan = plan;
         plan.channels.clear();
-        plan.buses[0].devices[0].routes.clear();
+        plan.buses[0].devices[0].outputs.clear();
         assert!(plan.to_string().contains("master"), "{plan}");
         assert_eq!(status.devices().next().unwrap().name.as_str(), "master");
     }

@@ -31,7 +31,7 @@ pub(crate) fn read(file: &Path) -> Result<Objects, String> {
 }
 
 /// What a section's name says.
-enum Place {
+enum SectionName {
     /// `[1A00]`
     Object(u16),
     /// `[1A00sub1]`
@@ -40,7 +40,7 @@ enum Place {
     Values(u16),
 }
 
-impl Place {
+impl SectionName {
     fn of(name: &str) -> Option<Self> {
         let end = name
             .find(|c: char| !c.is_ascii_hexdigit())
@@ -71,13 +71,13 @@ fn parse(text: &str) -> Result<Objects, String> {
         .map_err(|e| format!("is no EDS or DCF file: {e}"))?;
     // In order, because explicit entries count before those of a short form.
     let sections: BTreeMap<String, Section> = sections.into_iter().collect();
-    let places: Vec<(Place, &String, &Section)> = sections
+    let places: Vec<(SectionName, &String, &Section)> = sections
         .iter()
-        .filter_map(|(name, section)| Some((Place::of(name)?, name, section)))
+        .filter_map(|(name, section)| Some((SectionName::of(name)?, name, section)))
         .collect();
     let mut objects = Objects::default();
     for (place, name, section) in &places {
-        let Place::Object(index) = *place else {
+        let SectionName::Object(index) = *place else {
             continue;
         };
         let template = entry(name, section);
@@ -96,8 +96,8 @@ fn parse(text: &str) -> Result<Objects, String> {
     }
     for (place, name, section) in &places {
         match *place {
-            Place::Sub(index, sub) => put(&mut objects, (index, sub), entry(name, section)),
-            Place::Values(index) => {
+            SectionName::Sub(index, sub) => put(&mut objects, (index, sub), entry(name, section)),
+            SectionName::Values(index) => {
                 for (key, value) in *section {
                     let (Ok(sub), Some(value)) = (key.parse::<u8>(), value) else {
                         continue;
@@ -115,7 +115,7 @@ fn parse(text: &str) -> Result<Objects, String> {
                     objects.entries.entry((index, 0)).or_insert(plain(count));
                 }
             }
-            Place::Object(_) => {}
+            SectionName::Object(_) => {}
         }
     }
     if objects.entries.is_empty() && objects.unreadable.is_empty() {

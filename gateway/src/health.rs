@@ -3,7 +3,7 @@
 
 use crate::clock::realtime_offset;
 use crate::link::error_frame::ErrorFrame;
-use crate::load::{BitRates, Load, Meter};
+use crate::load::{BitRates, BusLoad, Meter};
 use crate::plan::{BusPlan, Plan};
 use crate::status::BusStatus;
 use proprio_topics::{
@@ -421,7 +421,7 @@ fn log_blocked(bus: &BusHealth, before: Option<&BusHealth>, blocked: &mut u32) {
 /// Logs a bus that is nearly full, and when it is no longer.
 fn log_load(bus: &BusHealth, full: &mut bool) {
     let (name, was) = (bus.name.as_str(), *full);
-    *full = Load::stays_high(bus.load, was);
+    *full = BusLoad::stays_high(bus.load, was);
     match (was, *full) {
         (false, true) => tracing::warn!(
             bus = name,

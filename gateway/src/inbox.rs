@@ -10,7 +10,7 @@
 //! What a request replaces goes back with its reply, so that its memory is freed in the control
 //! plane.
 
-use crate::plan::Route;
+use crate::plan::OutputPlan;
 use proprio_drivers::{Command, CommandFailed, CommandOutcome, CommandRefused, Device};
 use proprio_topics::Nanos;
 use rtrb::{Consumer, Producer, RingBuffer};
@@ -35,8 +35,8 @@ pub struct Replacement {
     pub device: Option<Box<dyn Device>>,
     /// The maximum silence of a device that goes on \[ns\].
     pub max_silence: Nanos,
-    /// Its routes: the same outputs, channels and kinds.
-    pub routes: Vec<Route>,
+    /// Its outputs: the same numbers, channels and kinds.
+    pub outputs: Vec<OutputPlan>,
 }
 
 /// What became of a request.

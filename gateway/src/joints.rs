@@ -8,14 +8,16 @@
 //!
 //! - A device's angle is made continuous (`wrap`), and goes through its gear (`map`) to a *shaft*:
 //!   a joint, or a motor of a coupling.
-//! - A shaft may have several sources: the position of one device, the torque of another (`shaft`).
+//! - A shaft may have several inputs: the position of one device, the torque of another (`shaft`).
 //! - The motors of a coupling together give the states of its joints (`coupling`, `matrix`), which
-//!   are a source of the joints' shafts.
+//!   are an input of the joints' shafts.
 //! - What belongs to a motor and not to a joint, its current and its drive's state, is found at the
 //!   joint of the same place in the coupling's list.
 //!
-//! [`Layout`] says which leads where; `Joints` does it while the bus runs, without allocation;
-//! [`Layout::inverse`] is the way back, for boards that encode.
+//! Three nouns: an *output* of a device is an *input* of a shaft ([`ShaftInput`]), and so is what a
+//! *coupling* makes of its motors. [`JointsPlan`] says which leads where; `Joints` does it while
+//! the bus runs, without allocation; [`JointsPlan::inverse`] is the way back, for boards that
+//! encode.
 
 mod coupling;
 mod map;
@@ -27,21 +29,21 @@ mod wrap;
 pub use map::JointMap;
 pub use matrix::{MOST, Matrix, MatrixError};
 pub use shaft::Takes;
-pub(crate) use track::Measured;
+pub(crate) use track::ShaftState;
 pub use wrap::Wrap;
 
-use crate::config::Quantity;
-use coupling::Coupling;
+use crate::config::JointQuantity;
+use coupling::CoupledMotors;
 use proprio_drivers::Output;
 use proprio_topics::{JointState, Nanos, Quality};
-use shaft::{Shaft, Source};
+use shaft::{RunningInput, Shaft};
 
-/// Where a device's output leads.
+/// Which input of which shaft.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Feed {
-    /// The number of the shaft in [`Layout::shafts`].
+pub struct ShaftInput {
+    /// The number of the shaft in [`JointsPlan::shafts`].
     pub shaft: usize,
-    /// Its place among the shaft's sources.
+    /// Its place among the shaft's inputs.
     pub place: usize,
     /// The range of the device's angle, if its turns are to be counted.
     pub wrap: Option<Wrap>,
@@ -49,7 +51,7 @@ pub struct Feed {
 
 /// The shafts and couplings of a bus.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Layout {
+pub struct JointsPlan {
     /// The joints, and the motors of couplings.
     pub shafts: Vec<ShaftPlan>,
     /// The couplings.
@@ -61,24 +63,33 @@ pub struct Layout {
 pub struct ShaftPlan {
     /// Its name.
     pub name: String,
-    /// Where its state goes.
-    pub target: Target,
-    /// Its sources.
-    pub sources: Vec<SourcePlan>,
+    /// Which of the two it is.
+    pub role: ShaftRole,
+    /// Its inputs.
+    pub inputs: Vec<InputPlan>,
 }
 
-/// Where a shaft's state goes.
+impl ShaftPlan {
+    /// The input that gives its position.
+    #[must_use]
+    pub fn position(&self) -> Option<&InputPlan> {
+        let mut inputs = self.inputs.iter();
+        inputs.find(|input| input.takes.has(JointQuantity::Position))
+    }
+}
+
+/// What a shaft is, and so where its state goes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Target {
-    /// To the channel of this number.
-    Channel(u32),
-    /// To a coupling: its number, and the place among its motors.
+pub enum ShaftRole {
+    /// A joint: to the channel of this number.
+    Joint(u32),
+    /// A motor of the coupling of this number, at this place among its motors.
     Motor(usize, usize),
 }
 
-/// A source of a shaft.
+/// An input of a shaft.
 #[derive(Debug, Clone, PartialEq)]
-pub struct SourcePlan {
+pub struct InputPlan {
     /// What gives it.
     pub origin: Origin,
     /// What is taken of it.
@@ -99,53 +110,59 @@ pub enum Origin {
 /// A coupling.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CouplingPlan {
-    /// The shafts of its joints, and its place among the sources of each.
-    pub joints: Vec<(usize, usize)>,
+    /// The inputs of its joints' shafts that it gives.
+    pub joints: Vec<ShaftInput>,
     /// The shafts of its motors.
     pub motors: Vec<usize>,
     /// joints = matrix * motors.
     pub matrix: Matrix,
 }
 
-impl Layout {
-    /// The source that a feed leads to.
+impl CouplingPlan {
+    /// What is taken of its motors.
+    pub(crate) fn takes(&self, plan: &JointsPlan) -> Takes {
+        let input = self.joints.first().and_then(|joint| plan.input(joint));
+        input.map_or(Takes::ALL, |input| input.takes)
+    }
+}
+
+impl JointsPlan {
+    /// What an input is.
     #[must_use]
-    pub fn source(&self, feed: &Feed) -> Option<&SourcePlan> {
-        self.shafts.get(feed.shaft)?.sources.get(feed.place)
+    pub fn input(&self, at: &ShaftInput) -> Option<&InputPlan> {
+        self.shafts.get(at.shaft)?.inputs.get(at.place)
     }
 
-    /// Whether a reading of this feed can complete a sample: it gives a position that the channel
+    /// Whether a reading at this input can complete a sample: it gives a position that the channel
     /// takes. The others must come before it to be in the sample of the same instant.
     #[must_use]
-    pub fn completes(&self, feed: &Feed) -> bool {
-        let has_position = |source: Option<&SourcePlan>| {
-            source.is_some_and(|source| source.takes.has(Quantity::Position))
+    pub fn completes(&self, at: &ShaftInput) -> bool {
+        let has_position = |at: &ShaftInput| {
+            self.input(at)
+                .is_some_and(|input| input.takes.has(JointQuantity::Position))
         };
-        let coupled = match self.shafts.get(feed.shaft).map(|shaft| shaft.target) {
-            Some(Target::Motor(coupling, _)) => (self.couplings.get(coupling))
-                .and_then(|c| c.joints.first())
-                .is_some_and(|(shaft, place)| {
-                    let shaft = self.shafts.get(*shaft);
-                    has_position(shaft.and_then(|s| s.sources.get(*place)))
-                }),
-            Some(Target::Channel(_)) => true,
+        let is_taken = match self.shafts.get(at.shaft).map(|shaft| shaft.role) {
+            Some(ShaftRole::Motor(coupling, _)) => (self.couplings.get(coupling))
+                .and_then(|coupling| coupling.joints.first())
+                .is_some_and(has_position),
+            Some(ShaftRole::Joint(_)) => true,
             None => false,
         };
-        coupled && has_position(self.source(feed))
+        is_taken && has_position(at)
     }
 
-    /// The way from joints to the device of a feed with this gear.
+    /// The way from joints to the device of an input with this gear.
     #[must_use]
-    pub fn inverse(&self, feed: &Feed, map: JointMap) -> Option<Inverse> {
-        let channel = |shaft: usize| match self.shafts.get(shaft)?.target {
-            Target::Channel(channel) => Some(channel),
-            Target::Motor(..) => None,
+    pub fn inverse(&self, at: &ShaftInput, map: JointMap) -> Option<Inverse> {
+        let channel = |shaft: usize| match self.shafts.get(shaft)?.role {
+            ShaftRole::Joint(channel) => Some(channel),
+            ShaftRole::Motor(..) => None,
         };
-        let (channels, motor) = match self.shafts.get(feed.shaft)?.target {
-            Target::Channel(channel) => (vec![channel], None),
-            Target::Motor(coupling, place) => {
+        let (channels, motor) = match self.shafts.get(at.shaft)?.role {
+            ShaftRole::Joint(channel) => (vec![channel], None),
+            ShaftRole::Motor(coupling, place) => {
                 let coupling = self.couplings.get(coupling)?;
-                let joints = coupling.joints.iter().map(|(shaft, _)| channel(*shaft));
+                let joints = coupling.joints.iter().map(|joint| channel(joint.shaft));
                 let motor = (coupling.matrix.clone(), place);
                 (joints.collect::<Option<_>>()?, Some(motor))
             }
@@ -154,7 +171,7 @@ impl Layout {
             channels,
             motor,
             map,
-            wrap: feed.wrap,
+            wrap: at.wrap,
         })
     }
 }
@@ -205,55 +222,55 @@ impl Inverse {
 /// The shafts and couplings of a running bus.
 #[derive(Debug, Default)]
 pub(crate) struct Joints {
-    shafts: Vec<(Shaft, Target)>,
-    couplings: Vec<(Coupling, Vec<(usize, usize)>)>,
+    shafts: Vec<(Shaft, ShaftRole)>,
+    couplings: Vec<(CoupledMotors, Vec<ShaftInput>)>,
 }
 
 impl Joints {
     /// Without readings.
-    pub(crate) fn new(layout: &Layout) -> Self {
+    pub(crate) fn new(plan: &JointsPlan) -> Self {
         let shaft = |plan: &ShaftPlan| {
-            let sources = plan.sources.iter().map(|s| (s.takes, s.max_silence));
-            (Shaft::new(sources), plan.target)
+            let inputs = plan.inputs.iter().map(|s| (s.takes, s.max_silence));
+            (Shaft::new(inputs), plan.role)
         };
         let coupling = |plan: &CouplingPlan| {
-            let coupling = Coupling::new(plan.matrix.clone(), plan.motors.len());
+            let coupling = CoupledMotors::new(plan.matrix.clone(), plan.motors.len());
             (coupling, plan.joints.clone())
         };
         Self {
-            shafts: layout.shafts.iter().map(shaft).collect(),
-            couplings: layout.couplings.iter().map(coupling).collect(),
+            shafts: plan.shafts.iter().map(shaft).collect(),
+            couplings: plan.couplings.iter().map(coupling).collect(),
         }
     }
 
-    fn source(&mut self, feed: &Feed) -> Option<&mut Source> {
-        let (shaft, _) = self.shafts.get_mut(feed.shaft)?;
-        shaft.sources.get_mut(feed.place)
+    fn input(&mut self, at: &ShaftInput) -> Option<&mut RunningInput> {
+        let (shaft, _) = self.shafts.get_mut(at.shaft)?;
+        shaft.inputs.get_mut(at.place)
     }
 
-    /// The maximum silence of a feed's device \[ns\].
-    pub(crate) fn set_max_silence(&mut self, feed: &Feed, max_silence: Nanos) {
-        if let Some(source) = self.source(feed) {
-            source.max_silence = max_silence;
+    /// The maximum silence of an input's device \[ns\].
+    pub(crate) fn set_max_silence(&mut self, at: &ShaftInput, max_silence: Nanos) {
+        if let Some(input) = self.input(at) {
+            input.max_silence = max_silence;
         }
     }
 
-    /// The device of a feed, or its conversion, was replaced: the zero may have changed.
-    pub(crate) fn replaced(&mut self, feed: &Feed) {
-        if let Some(source) = self.source(feed) {
-            source.replaced = true;
+    /// The device of an input, or its conversion, was replaced: the zero may have changed.
+    pub(crate) fn replaced(&mut self, at: &ShaftInput) {
+        if let Some(input) = self.input(at) {
+            input.replaced = true;
         }
     }
 
     /// The flags, for its joint's channel, of a reading that is no joint's state, such as a
     /// drive's.
-    /// Where the device is not the joint's only source, what spoils its own readings does not spoil
+    /// Where the device is not the joint's only input, what spoils its own readings does not spoil
     /// the joint's.
-    pub(crate) fn flags(&self, feed: &Feed, quality: Quality) -> Quality {
-        let alone = |(shaft, target): &(Shaft, Target)| {
-            shaft.sources.len() == 1 && matches!(target, Target::Channel(_))
+    pub(crate) fn flags(&self, at: &ShaftInput, quality: Quality) -> Quality {
+        let alone = |(shaft, role): &(Shaft, ShaftRole)| {
+            shaft.inputs.len() == 1 && matches!(role, ShaftRole::Joint(_))
         };
-        match self.shafts.get(feed.shaft).is_some_and(alone) {
+        match self.shafts.get(at.shaft).is_some_and(alone) {
             true => quality,
             false => Quality(quality.0 & Quality::DRIVE_FAULT.0),
         }
@@ -264,45 +281,45 @@ impl Joints {
     /// and it was not taken.
     pub(crate) fn push(
         &mut self,
-        feed: &Feed,
+        at: &ShaftInput,
         map: &JointMap,
         output: &Output,
         mut state: JointState,
-        mut publish: impl FnMut(u32, &Measured),
+        mut publish: impl FnMut(u32, &ShaftState),
     ) -> bool {
-        let Some(source) = self.source(feed) else {
+        let Some(input) = self.input(at) else {
             return true;
         };
-        if output.acquired < source.last {
+        if output.acquired < input.last {
             return false;
         }
-        source.last = output.acquired;
+        input.last = output.acquired;
         let mut quality = output.quality;
-        if std::mem::take(&mut source.replaced) {
-            source.turns = wrap::Turns::default();
+        if std::mem::take(&mut input.replaced) {
+            input.turns = wrap::Turns::default();
             quality |= Quality::GAP_BEFORE | Quality::ZERO_CHANGED;
         }
-        if let Some(wrap) = &feed.wrap {
+        if let Some(wrap) = &at.wrap {
             let trusted = !quality.intersects(Quality::UNTRUSTED_ENCODER);
             let anew;
             (state.position, anew) =
-                (source.turns).unwrap(wrap, output.acquired, state.position, trusted);
+                (input.turns).unwrap(wrap, output.acquired, state.position, trusted);
             if anew {
                 quality |= Quality::GAP_BEFORE | Quality::ZERO_CHANGED;
             }
         }
-        let measured = Measured {
+        let measured = ShaftState {
             acquired: output.acquired,
             stamp: output.stamp,
             device_time: output.device_time,
             device_counter: output.device_counter,
             quality,
             state: map.joint(state),
-            max_silence: source.max_silence,
+            max_silence: input.max_silence,
         };
-        match self.give(feed.shaft, feed.place, measured) {
-            Some((Target::Channel(channel), whole)) => publish(channel, &whole),
-            Some((Target::Motor(coupling, place), whole)) => {
+        match self.advance(at, measured) {
+            Some((ShaftRole::Joint(channel), whole)) => publish(channel, &whole),
+            Some((ShaftRole::Motor(coupling, place), whole)) => {
                 self.couple(coupling, place, whole, publish);
             }
             None => {}
@@ -310,10 +327,10 @@ impl Joints {
         true
     }
 
-    /// The new state of shaft number `shaft`, if there is one, and where it goes.
-    fn give(&mut self, shaft: usize, place: usize, of: Measured) -> Option<(Target, Measured)> {
-        let (shaft, target) = self.shafts.get_mut(shaft)?;
-        Some((*target, shaft.give(place, of)?))
+    /// Takes what an input gives: the new state of its shaft, if there is one, and what that is.
+    fn advance(&mut self, at: &ShaftInput, given: ShaftState) -> Option<(ShaftRole, ShaftState)> {
+        let (shaft, role) = self.shafts.get_mut(at.shaft)?;
+        Some((*role, shaft.push(at.place, given)?))
     }
 
     /// Takes the state of a motor, and gives those of the joints.
@@ -321,24 +338,23 @@ impl Joints {
         &mut self,
         number: usize,
         motor: usize,
-        state: Measured,
-        mut publish: impl FnMut(u32, &Measured),
+        state: ShaftState,
+        mut publish: impl FnMut(u32, &ShaftState),
     ) {
         let Some((coupling, joints)) = self.couplings.get_mut(number) else {
             return;
         };
-        if !coupling.give(motor, state) {
+        if !coupling.push(motor, state) {
             return;
         }
         for joint in 0..joints.len() {
             let Some((coupling, joints)) = self.couplings.get(number) else {
                 return;
             };
-            let (Some(&(shaft, place)), Some(state)) = (joints.get(joint), coupling.joint(joint))
-            else {
+            let (Some(&at), Some(state)) = (joints.get(joint), coupling.joint(joint)) else {
                 continue;
             };
-            if let Some((Target::Channel(channel), whole)) = self.give(shaft, place, state) {
+            if let Some((ShaftRole::Joint(channel), whole)) = self.advance(&at, state) {
                 publish(channel, &whole);
             }
         }

@@ -48,7 +48,7 @@ impl Journal {
         })
     }
 
-    fn put(&self, mut line: Line, level: Level) {
+    fn put(&self, mut line: JournalEntry, level: Level) {
         let lost = self.lost.swap(0, Ordering::Relaxed);
         if lost > 0 {
             line.fields.push(("lost_lines", lost.to_string()));
@@ -67,7 +67,7 @@ impl Journal {
 
 impl<S: Subscriber> Layer<S> for Journal {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
-        let mut line = Line::default();
+        let mut line = JournalEntry::default();
         event.record(&mut line);
         self.put(line, *event.metadata().level());
     }
@@ -75,12 +75,12 @@ impl<S: Subscriber> Layer<S> for Journal {
 
 /// What a line says: its message and its fields.
 #[derive(Default)]
-struct Line {
+struct JournalEntry {
     message: String,
     fields: Vec<(&'static str, String)>,
 }
 
-impl Visit for Line {
+impl Visit for JournalEntry {
     fn record_debug(&mut self, field: &Field, value: &dyn Debug) {
         match field.name() {
             "message" => self.message = format!("{value:?}"),
@@ -96,7 +96,7 @@ impl Visit for Line {
     }
 }
 
-impl Line {
+impl JournalEntry {
     fn text(&self) -> String {
         let mut text = self.message.clone();
         for (name, value) in &self.fields {
@@ -142,7 +142,7 @@ mod tests {
 
     #[test]
     fn a_line_has_its_fields_in_its_text_and_apart() {
-        let line = Line {
+        let line = JournalEntry {
             message: "silent".to_owned(),
             fields: vec![("device", "imu".to_owned()), ("error", "a\nb".to_owned())],
         };
@@ -165,7 +165,7 @@ mod tests {
         reader.set_nonblocking(true).unwrap();
         let journal = Journal::at(place).unwrap();
         let log = || {
-            let line = Line {
+            let line = JournalEntry {
                 message: "x".repeat(1000),
                 fields: vec![],
             };

@@ -22,7 +22,7 @@ pub struct BitRates {
 
 /// The load of a bus.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Load {
+pub struct BusLoad {
     /// Frames per second.
     pub frames: f64,
     /// The share of time that they need, with as many stuff bits as a frame can have; 1 is all of
@@ -30,7 +30,7 @@ pub struct Load {
     pub share: f64,
 }
 
-impl Load {
+impl BusLoad {
     /// A usual limit in design: above it frames of low priority may wait for several periods, and
     /// commands and repeated frames find no room.
     const HIGH: f64 = 0.7;
@@ -59,7 +59,7 @@ impl Load {
 
 /// The most bits that a frame can have on a bus, with the interframe space.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Bits {
+pub struct WireBits {
     /// At the nominal rate.
     pub nominal: u32,
     /// At the rate of the data phase of CAN FD.
@@ -79,14 +79,14 @@ pub struct Bits {
 /// has 19 bits more in arbitration.
 #[must_use]
 #[allow(clippy::cast_possible_truncation)] // at most 64 bytes
-pub fn bits_on_wire(frame: &Frame) -> Bits {
+pub fn bits_on_wire(frame: &Frame) -> WireBits {
     let bytes = frame.data().len() as u32;
     let extended = matches!(frame.id, Id::Extended(_));
     let stuffed = |bits: u32| (bits - 1) / 4;
     match frame.format {
         Format::Classic | Format::Remote | Format::Error => {
             let bits = if extended { 54 } else { 34 } + 8 * bytes;
-            Bits {
+            WireBits {
                 nominal: bits + 13 + stuffed(bits),
                 data: 0,
             }
@@ -101,11 +101,11 @@ pub fn bits_on_wire(frame: &Frame) -> Bits {
                 - stuffed(arbitration);
             let slow = arbitration + stuffed(arbitration) + 13;
             match bit_rate_switch {
-                true => Bits {
+                true => WireBits {
                     nominal: slow,
                     data: fast,
                 },
-                false => Bits {
+                false => WireBits {
                     nominal: slow + fast,
                     data: 0,
                 },
@@ -117,7 +117,7 @@ pub fn bits_on_wire(frame: &Frame) -> Bits {
 /// The longest time that `frame` needs on a bus \[s\], with the interframe space.
 #[must_use]
 pub fn seconds_on_wire(frame: &Frame, rates: BitRates) -> f64 {
-    let Bits { nominal, data } = bits_on_wire(frame);
+    let WireBits { nominal, data } = bits_on_wire(frame);
     f64::from(nominal) / f64::from(rates.nominal) + f64::from(data) / f64::from(rates.data)
 }
 
@@ -147,7 +147,7 @@ pub struct Meter {
     /// The newest first.
     past: VecDeque<(Nanos, Totals)>,
     /// The last load that was far enough apart to be measured.
-    load: Load,
+    load: BusLoad,
 }
 
 impl Meter {
@@ -161,7 +161,7 @@ impl Meter {
     pub const fn new() -> Self {
         Self {
             past: VecDeque::new(),
-            load: Load {
+            load: BusLoad {
                 frames: 0.0,
                 share: f64::NAN,
             },
@@ -170,7 +170,7 @@ impl Meter {
 
     /// The load of the time before `now`, with the totals until then. Without `rates` the share is
     /// NaN.
-    pub fn measure(&mut self, now: Nanos, totals: Totals, rates: Option<BitRates>) -> Load {
+    pub fn measure(&mut self, now: Nanos, totals: Totals, rates: Option<BitRates>) -> BusLoad {
         // An interface that was set up again counts from zero; one that was not asked yet, or did
         // not answer, tells zero.
         if let Some((_, last)) = self.past.front()
@@ -200,7 +200,7 @@ impl Meter {
             let hidden = (55.25 * all + 10.0 * bytes) / nominal;
             own.max(hidden) / seconds
         });
-        self.load = Load {
+        self.load = BusLoad {
             frames: of(|t| t.frames).max(all) / seconds,
             share,
         };
@@ -216,14 +216,14 @@ impl Default for Meter {
 
 /// A device: its driver with its keys, its settings, and the numbers and kinds of its outputs in
 /// use.
-#[derive(Debug, Clone, Copy)]
-pub struct Member<'p> {
+#[derive(Debug, Clone)]
+pub struct Participant<'p> {
     /// The driver with its keys.
     pub options: &'p Options,
     /// Address, silence, joints.
     pub spec: &'p Spec,
     /// The outputs in use.
-    pub outputs: &'p [(u8, Kind)],
+    pub outputs: Vec<(u8, Kind)>,
 }
 
 /// The load of a bus with these devices: boards that stream send each period; what the others send,
@@ -231,8 +231,8 @@ pub struct Member<'p> {
 ///
 /// # Errors
 /// [`SpecError`]: a device that its driver cannot build.
-pub fn of_bus(members: &[Member<'_>], rates: BitRates) -> Result<Load, SpecError> {
-    let mut all = Load::default();
+pub fn of_bus(members: &[Participant<'_>], rates: BitRates) -> Result<BusLoad, SpecError> {
+    let mut all = BusLoad::default();
     let mut add = |frames: &[Frame], period: f64| {
         all.frames += frames.len() as f64 / period;
         let time: f64 = frames.iter().map(|f| seconds_on_wire(f, rates)).sum();
@@ -248,8 +248,8 @@ pub fn of_bus(members: &[Member<'_>], rates: BitRates) -> Result<Load, SpecError
             ..member.spec.clone()
         })?;
         match board.period() {
-            Some(period) => add(&at_once(member.outputs, &mut *board), period.seconds()),
-            None => polled.push(*member),
+            Some(period) => add(&at_once(&member.outputs, &mut *board), period.seconds()),
+            None => polled.push(member),
         }
     }
     if !polled.is_empty() {
@@ -286,7 +286,7 @@ fn at_once(outputs: &[(u8, Kind)], board: &mut dyn Board) -> Vec<Frame> {
 }
 
 /// The frames of a second between devices that ask, or that others ask, and their boards.
-fn conversation(members: &[Member<'_>]) -> Result<Vec<Frame>, SpecError> {
+fn conversation(members: &[&Participant<'_>]) -> Result<Vec<Frame>, SpecError> {
     const STEP: Nanos = Nanos::from_micros(500);
     const BEGIN: i64 = 20_000;
     const END: i64 = BEGIN + 2_000;
@@ -299,7 +299,7 @@ fn conversation(members: &[Member<'_>]) -> Result<Vec<Frame>, SpecError> {
         };
         hosts.push(member.options.device(&spec)?);
         let mut board = member.options.board(&spec)?;
-        for &(output, kind) in member.outputs {
+        for &(output, kind) in &member.outputs {
             board.present(output, &at_rest(kind), Quality::GOOD);
         }
         boards.push(board);
@@ -548,7 +548,7 @@ mod tests {
             measure(100, traffic(100)).share.is_nan(),
             "too short a time"
         );
-        let close = |load: Load, frames: f64, share: f64| {
+        let close = |load: BusLoad, frames: f64, share: f64| {
             assert!((load.frames - frames).abs() < 1e-6, "{load:?}");
             assert!((load.share - share).abs() < 1e-9, "{load:?}");
         };
@@ -583,7 +583,7 @@ mod tests {
             ..Totals::default()
         };
         let mut meter = Meter::new();
-        let mut load = Load::default();
+        let mut load = BusLoad::default();
         for second in 0..3 {
             let now = Nanos::from_seconds(second as f64);
             load = meter.measure(now, at(second), Some(RATES));
@@ -615,7 +615,7 @@ mod tests {
             f64::NAN,
         ]
         .map(|share| {
-            high = Load::stays_high(share, high);
+            high = BusLoad::stays_high(share, high);
             high
         });
         let expected = [

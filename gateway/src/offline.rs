@@ -1,16 +1,16 @@
 //! Converts a recorded log to a table of samples and back: `proprio decode` and `proprio encode`.
 //! No daemon, no clock.
 
-use crate::config::Source;
+use crate::config::FrameSource;
 use crate::decoder::Decoder;
 use crate::joints::Inverse;
 use crate::link::adapter::Adapter;
 use crate::link::replay::{self, Matching};
 use crate::log::{self, LogFormat, Stamps, candump};
-use crate::plan::{BusPlan, ChannelPlan, Plan};
+use crate::plan::{BusPlan, ChannelPlan, DevicePlan, Plan};
 use crate::status::BusStatus;
 use proprio_drivers::{Board, Format, Frame, Frames, Mode, Spec};
-use proprio_topics::csv::{self, Columns, Item, Series, Value, What};
+use proprio_topics::csv::{self, Columns, Series, SeriesValue, Value, What};
 use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Refusal, Sample, StampKind};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt::Display;
@@ -25,13 +25,13 @@ const REORDER: Nanos = log::REORDER;
 /// Why a log or table cannot be converted at all.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum OfflineError {
+pub enum ConversionError {
     /// A file could not be read or written.
     #[error(transparent)]
     Io(#[from] io::Error),
     /// The table cannot be read.
     #[error(transparent)]
-    Table(#[from] csv::Error),
+    Table(#[from] csv::TableError),
     /// A device cannot be built.
     #[error("{device}: {cause}")]
     Device {
@@ -189,13 +189,13 @@ impl<T> InOrder<T> {
 /// in the log, it takes those of all.
 ///
 /// # Errors
-/// [`OfflineError`]: a file that cannot be read or written, or a log without a frame.
+/// [`ConversionError`]: a file that cannot be read or written, or a log without a frame.
 pub fn decode(
     plan: &Plan,
     log: impl BufRead,
     table: impl Write,
     columns: Columns,
-) -> Result<DecodeReport, OfflineError> {
+) -> Result<DecodeReport, ConversionError> {
     decode_with(plan, log, Stamps::Detect, table, columns)
 }
 
@@ -209,65 +209,27 @@ pub fn decode_with(
     stamps: Stamps,
     table: impl Write,
     columns: Columns,
-) -> Result<DecodeReport, OfflineError> {
-    let series: Vec<Series> = plan
-        .channels
-        .iter()
+) -> Result<DecodeReport, ConversionError> {
+    let series: Vec<Series> = (plan.channels.iter())
         .map(|c| Series {
             what: What::Channel(c.kind),
             name: c.name.clone(),
         })
         .collect();
-    let mut writer = csv::Writer::new(table, &series, columns)?;
-    let mut reader = log::Reader::with_stamps(log, stamps);
-    let mut buses = Vec::new();
-    for (bus, number) in plan.buses.iter().zip(0..) {
-        let status = Arc::new(BusStatus::new(number, bus));
-        let decoder = Decoder::new(number, bus, Some(Mode::Listen), Arc::clone(&status)).map_err(
-            |cause| OfflineError::Device {
-                device: bus.name.clone(),
-                cause,
-            },
-        )?;
-        let matching = plan.matching(number as usize);
-        let matching = matching.map_or(Ok(None), |matching| matching.in_log(&mut reader))?;
-        buses.push((matching, decoder, status));
-    }
+    let mut writer = csv::TableWriter::new(table, &series, columns)?;
+    let mut reader = log::LogReader::with_stamps(log, stamps);
+    let mut buses = LogBuses::open(plan, &mut reader)?;
     let mut report = DecodeReport::default();
     let mut order = InOrder::new(REORDER);
     let mut failure = None;
-    let mut last_bus = 0;
-    let takes = |matching: &Option<Matching>, interface: &str| {
-        matching.as_ref().is_none_or(|m| m.takes(interface))
-    };
     while let Some(record) = reader.next_record()? {
         report.frames += 1;
         if record.frame.format == Format::Error {
             report.error_frames += 1;
             continue;
         }
-        // Frames of one interface come in series: try the bus of the last frame first.
-        if buses
-            .get(last_bus)
-            .is_none_or(|(matching, ..)| !takes(matching, record.interface))
-        {
-            match buses
-                .iter()
-                .position(|(matching, ..)| takes(matching, record.interface))
-            {
-                Some(bus) => last_bus = bus,
-                None => {
-                    report.other_interfaces += 1;
-                    let name = record.interface;
-                    let names = &mut report.other_names;
-                    if names.len() < 8 && names.iter().all(|known| known != name) {
-                        names.push(name.to_owned());
-                    }
-                    continue;
-                }
-            }
-        }
-        let Some((_, decoder, _)) = buses.get_mut(last_bus) else {
+        let Some(decoder) = buses.decoder(record.interface) else {
+            report.other_interface(record.interface);
             continue;
         };
         // As live: the devices see the time pass, so that silences are seen.
@@ -293,48 +255,112 @@ pub fn decode_with(
     }
     order.finish(|_, sample| write_sample(&mut writer, sample))?;
     writer.finish()?;
+    if report.frames == 0 {
+        return Err(ConversionError::NoFrame(reader.why_empty()));
+    }
     report.out_of_order = order.out_of_order();
     (report.bad_lines, report.dropped) = (reader.report().bad, reader.report().dropped);
     report.format = reader.format();
     report.step_back = reader.step_back();
-    if buses.iter().any(|(matching, ..)| matching.is_none()) {
-        report.several = replay::several(reader.interfaces());
-    }
     report.bad = reader.bad().collect();
     (report.stamps, report.doubt) = (reader.stamps(), reader.doubt(log::STAMPS_OPTION));
-    if report.frames == 0 {
-        return Err(OfflineError::NoFrame(reader.why_empty()));
+    if buses.all.iter().any(|bus| bus.matching.is_none()) {
+        report.several = replay::several(reader.interfaces());
     }
-    for ((_, decoder, status), bus) in buses.iter().zip(&plan.buses) {
-        report.unclaimed += status.unclaimed.load(Relaxed);
-        for ((device, health), state) in bus
-            .devices
-            .iter()
-            .zip(status.devices())
-            .zip(decoder.states())
-        {
-            let count = |c: Counter| health.counters.get(c as usize).copied().unwrap_or(0);
-            report.devices.push(DeviceReport {
-                name: device.name.clone(),
-                frames: count(Counter::Frames),
-                readings: count(Counter::Readings),
-                counts: Counter::ALL
-                    .into_iter()
-                    .skip(2)
-                    .map(|c| (c, count(c)))
-                    .filter(|(_, n)| *n > 0)
-                    .collect(),
-                refusal: state.refusal().map(|refusal| refusal.to_string()),
-                lack: Refusal::from_code(health.refusal)
-                    .filter(|_| state.refusal().is_none())
-                    .map(|lack| lack.to_string()),
-            });
-        }
+    for (bus, plan) in buses.all.iter().zip(&plan.buses) {
+        report.unclaimed += bus.status.unclaimed.load(Relaxed);
+        report.devices.extend(bus.devices(plan));
     }
     Ok(report)
 }
 
-fn write_sample<W: Write>(writer: &mut csv::Writer<W>, sample: &Sample) -> io::Result<()> {
+/// A bus of the plan, and which frames of the log are its.
+struct LogBus {
+    /// `None`: all.
+    matching: Option<Matching>,
+    decoder: Decoder,
+    status: Arc<BusStatus>,
+}
+
+impl LogBus {
+    fn takes(&self, interface: &str) -> bool {
+        self.matching.as_ref().is_none_or(|m| m.takes(interface))
+    }
+
+    /// The results per device.
+    fn devices(&self, plan: &BusPlan) -> impl Iterator<Item = DeviceReport> {
+        let devices = plan.devices.iter().zip(self.status.devices());
+        devices
+            .zip(self.decoder.states())
+            .map(|((device, health), state)| {
+                let count = |c: Counter| health.counters.get(c as usize).copied().unwrap_or(0);
+                let others = Counter::ALL.into_iter().skip(2).map(|c| (c, count(c)));
+                DeviceReport {
+                    name: device.name.clone(),
+                    frames: count(Counter::Frames),
+                    readings: count(Counter::Readings),
+                    counts: others.filter(|(_, n)| *n > 0).collect(),
+                    refusal: state.refusal().map(|refusal| refusal.to_string()),
+                    lack: Refusal::from_code(health.refusal)
+                        .filter(|_| state.refusal().is_none())
+                        .map(|lack| lack.to_string()),
+                }
+            })
+    }
+}
+
+/// The buses that share a log.
+struct LogBuses {
+    all: Vec<LogBus>,
+    /// That of the last frame: frames of one interface come in series.
+    last: usize,
+}
+
+impl LogBuses {
+    fn open(
+        plan: &Plan,
+        reader: &mut log::LogReader<impl BufRead>,
+    ) -> Result<Self, ConversionError> {
+        let mut all = Vec::new();
+        for (bus, number) in plan.buses.iter().zip(0..) {
+            let status = Arc::new(BusStatus::new(number, bus));
+            let decoder = Decoder::new(number, bus, Some(Mode::Listen), Arc::clone(&status));
+            let decoder = decoder.map_err(|cause| ConversionError::Device {
+                device: bus.name.clone(),
+                cause,
+            })?;
+            let matching = plan.matching(number as usize);
+            let matching = matching.map_or(Ok(None), |matching| matching.in_log(reader))?;
+            all.push(LogBus {
+                matching,
+                decoder,
+                status,
+            });
+        }
+        Ok(Self { all, last: 0 })
+    }
+
+    /// The decoder of the bus that takes the frames of this interface.
+    fn decoder(&mut self, interface: &str) -> Option<&mut Decoder> {
+        let takes = |bus: &LogBus| bus.takes(interface);
+        if !self.all.get(self.last).is_some_and(takes) {
+            self.last = self.all.iter().position(takes)?;
+        }
+        self.all.get_mut(self.last).map(|bus| &mut bus.decoder)
+    }
+}
+
+impl DecodeReport {
+    fn other_interface(&mut self, name: &str) {
+        self.other_interfaces += 1;
+        let names = &mut self.other_names;
+        if names.len() < 8 && names.iter().all(|known| known != name) {
+            names.push(name.to_owned());
+        }
+    }
+}
+
+fn write_sample<W: Write>(writer: &mut csv::TableWriter<W>, sample: &Sample) -> io::Result<()> {
     let t = (sample.header.stamp != StampKind::None).then_some(sample.header.acquired);
     let Some(reading) = sample.reading() else {
         return Ok(());
@@ -357,7 +383,7 @@ pub struct EncodeReport {
     /// Channels of the table that are not in the configuration.
     pub unknown_channels: Vec<String>,
     /// The report of the table's reader.
-    pub table: csv::Report,
+    pub table: csv::TableReport,
 }
 
 impl EncodeReport {
@@ -369,14 +395,15 @@ impl EncodeReport {
 }
 
 /// The frames of an encoded log, sorted by their stamps.
-struct Encoded<'p> {
+struct EncodedLog<'p, W> {
     /// Per bus.
     interfaces: Vec<&'p str>,
     waiting: VecDeque<(Nanos, usize, Frame)>,
     frames: u64,
+    out: W,
 }
 
-impl Encoded<'_> {
+impl<W: Write> EncodedLog<'_, W> {
     /// Adds the frames of a reading of instant `t`, at intervals of `spacing`.
     fn push(
         &mut self,
@@ -384,7 +411,6 @@ impl Encoded<'_> {
         bus: usize,
         frames: &Frames,
         spacing: Nanos,
-        log: &mut impl Write,
     ) -> io::Result<()> {
         let interface = self.interfaces.get(bus).unwrap_or(&"can0");
         let mut next = t.unwrap_or(Nanos::ZERO);
@@ -392,7 +418,7 @@ impl Encoded<'_> {
             self.frames += 1;
             if t.is_none() {
                 // The log format without a stamp: only the order is known.
-                writeln!(log, "{interface} {frame}")?;
+                writeln!(self.out, "{interface} {frame}")?;
                 continue;
             }
             let last = self.waiting.iter().rposition(|(other, ..)| *other <= next);
@@ -404,12 +430,12 @@ impl Encoded<'_> {
     }
 
     /// Writes the frames before `t`.
-    fn write_before(&mut self, t: Option<Nanos>, log: &mut impl Write) -> io::Result<()> {
+    fn write_before(&mut self, t: Option<Nanos>) -> io::Result<()> {
         while let Some((stamp, bus, frame)) = self.waiting.front()
             && t.is_some_and(|t| *stamp < t)
         {
             let interface = self.interfaces.get(*bus).unwrap_or(&"can0");
-            candump::write_log_line(&mut *log, *stamp, interface, frame)?;
+            candump::write_log_line(&mut self.out, *stamp, interface, frame)?;
             self.waiting.pop_front();
         }
         Ok(())
@@ -421,44 +447,44 @@ impl Encoded<'_> {
 const FRAME_TIME: Nanos = Nanos::from_micros(130);
 
 /// Where a joint's state goes in a log: to an output of a device, which measures it.
-struct Measures {
+struct JointOutput {
     bus: usize,
     device: usize,
-    output: u8,
+    number: u8,
     inverse: Inverse,
     /// Its reading completes a sample, and follows those that do not.
     completes: bool,
 }
 
 /// The outputs that measure the plan's joints, in the order in which a row's readings are encoded.
-fn measures(plan: &Plan) -> Vec<Measures> {
+fn joint_outputs(plan: &Plan) -> Vec<JointOutput> {
     let mut all = Vec::new();
     for (bus, bus_plan) in plan.buses.iter().enumerate() {
         for (device, device_plan) in bus_plan.devices.iter().enumerate() {
-            for route in &device_plan.routes {
-                let Some(feed) = &route.feed else { continue };
-                let inverse = bus_plan.joints.inverse(feed, route.map);
-                all.extend(inverse.map(|inverse| Measures {
+            for output in &device_plan.outputs {
+                let Some(input) = &output.input else { continue };
+                let inverse = bus_plan.joints.inverse(input, output.map);
+                all.extend(inverse.map(|inverse| JointOutput {
                     bus,
                     device,
-                    output: route.output,
+                    number: output.number,
                     inverse,
-                    completes: bus_plan.joints.completes(feed),
+                    completes: bus_plan.joints.completes(input),
                 }));
             }
         }
     }
-    all.sort_by_key(|measures| measures.completes);
+    all.sort_by_key(|output| output.completes);
     all
 }
 
 /// The joints of a row: state and quality by channel.
-type Joints = BTreeMap<u32, (JointState, Quality)>;
+type RowJoints = BTreeMap<u32, (JointState, Quality)>;
 
-impl Measures {
+impl JointOutput {
     /// What the device reports of the joints of a row. `None`: it measures none of them. An error:
     /// not all of them are there.
-    fn reading(&self, joints: &Joints) -> Option<Result<(Reading, Quality), &'static str>> {
+    fn reading(&self, joints: &RowJoints) -> Option<Result<(Reading, Quality), &'static str>> {
         let channels = self.inverse.channels.iter();
         let states: Vec<_> = channels
             .filter_map(|channel| joints.get(channel).copied())
@@ -494,130 +520,166 @@ impl Measures {
 /// one that makes it, all with the row's stamp.
 ///
 /// # Errors
-/// [`OfflineError`]: a file that cannot be read or written, or a device that cannot be built.
+/// [`ConversionError`]: a file that cannot be read or written, or a device that cannot be built.
 pub fn encode(
     plan: &Plan,
     table: impl io::Read,
     mut log: impl Write,
-) -> Result<EncodeReport, OfflineError> {
-    let mut reader = csv::Reader::new(table)?;
-    let mut report = EncodeReport::default();
+) -> Result<EncodeReport, ConversionError> {
+    let mut reader = csv::TableReader::new(table)?;
+    let mut encoder = TableEncoder::new(plan, &mut log)?;
     // Per series, its channel.
-    let mut channels = Vec::new();
-    for series in reader.series() {
-        let matches =
-            |c: &&ChannelPlan| What::Channel(c.kind) == series.what && c.name == series.name;
-        let channel = plan.channels.iter().find(matches);
-        if channel.is_none() && series.what != What::Contact {
-            report.unknown_channels.push(series.name.clone());
+    let channels: Vec<_> = (reader.series().iter())
+        .map(|series| encoder.channel(series))
+        .collect();
+    let mut row = csv::Row::default();
+    let mut joints = RowJoints::new();
+    while reader.next_row(&mut row)? {
+        joints.clear();
+        for SeriesValue { series, value } in &row.items {
+            let (Some(Some((number, channel))), Value::Reading(reading, quality)) =
+                (channels.get(*series), value)
+            else {
+                continue;
+            };
+            match reading {
+                Reading::Joint(state) => drop(joints.insert(*number, (*state, *quality))),
+                _ => encoder.sensor(&row, (*number, channel), reading, *quality)?,
+            }
         }
-        channels.push(channel.and_then(|c| Some((plan.channel(&c.name)?, c))));
+        encoder.joints(&row, &joints)?;
+        encoder.log.write_before(row.t.map(|now| now - REORDER))?;
     }
-    let joint_outputs = measures(plan);
-    let mut boards: Vec<Vec<Box<dyn Board>>> = Vec::new();
-    for bus in &plan.buses {
-        let mut of_bus = Vec::new();
-        for device in &bus.devices {
+    encoder.log.write_before(Some(Nanos::MAX))?;
+    let TableEncoder {
+        mut report,
+        log: written,
+        ..
+    } = encoder;
+    report.frames = written.frames;
+    log.flush()?;
+    report.table = reader.report().clone();
+    Ok(report)
+}
+
+/// Encodes the rows of a table.
+struct TableEncoder<'p, W> {
+    plan: &'p Plan,
+    /// Per bus and device.
+    boards: Vec<Vec<Box<dyn Board>>>,
+    joint_outputs: Vec<JointOutput>,
+    frames: Frames,
+    log: EncodedLog<'p, W>,
+    report: EncodeReport,
+}
+
+impl<'p, W: Write> TableEncoder<'p, W> {
+    fn new(plan: &'p Plan, log: W) -> Result<Self, ConversionError> {
+        let board = |device: &DevicePlan| {
             let spec = Spec {
                 // Nobody has started it: it encodes what the table holds, not a stream.
                 mode: Mode::Supervise,
                 ..device.spec.clone()
             };
             let board = device.options.board(&spec);
-            of_bus.push(board.map_err(|cause| OfflineError::Device {
+            board.map_err(|cause| ConversionError::Device {
                 device: device.name.clone(),
                 cause,
-            })?);
-        }
-        boards.push(of_bus);
+            })
+        };
+        let boards = (plan.buses.iter())
+            .map(|bus| bus.devices.iter().map(board).collect())
+            .collect::<Result<_, _>>()?;
+        Ok(Self {
+            plan,
+            boards,
+            joint_outputs: joint_outputs(plan),
+            frames: Frames::new(),
+            log: EncodedLog {
+                interfaces: plan.buses.iter().map(interface).collect(),
+                waiting: VecDeque::new(),
+                frames: 0,
+                out: log,
+            },
+            report: EncodeReport::default(),
+        })
     }
-    let mut output = Encoded {
-        interfaces: plan.buses.iter().map(interface).collect(),
-        waiting: VecDeque::new(),
-        frames: 0,
-    };
-    let mut row = csv::Row::default();
-    let mut frames = Frames::new();
-    let mut joints = Joints::new();
-    while reader.next_row(&mut row)? {
-        joints.clear();
-        for Item { series, value } in &row.items {
-            let (Some(Some((number, channel))), Value::Reading(reading, quality)) =
-                (channels.get(*series), value)
-            else {
-                continue;
-            };
-            if let Reading::Joint(state) = reading {
-                joints.insert(*number, (*state, *quality));
-                continue;
-            }
-            let routes = plan
-                .buses
-                .get(channel.bus)
-                .and_then(|b| b.devices.get(channel.device));
-            let route = routes.and_then(|d| d.routes.iter().find(|r| r.channel == *number));
-            let board = boards
-                .get_mut(channel.bus)
-                .and_then(|b| b.get_mut(channel.device));
-            let (Some(route), Some(board)) = (route, board) else {
-                continue;
-            };
-            frames.clear();
-            if let Err(error) = board.encode(route.output, reading, *quality, &mut frames) {
-                report.refused += 1;
-                report.reason(row.line, &error);
-                continue;
-            }
-            report.samples += 1;
-            output.push(row.t, channel.bus, &frames, FRAME_TIME, &mut log)?;
+
+    /// The channel of a series, with its number.
+    fn channel(&mut self, series: &Series) -> Option<(u32, &'p ChannelPlan)> {
+        let is_it =
+            |c: &&ChannelPlan| What::Channel(c.kind) == series.what && c.name == series.name;
+        let channel = self.plan.channels.iter().find(is_it);
+        if channel.is_none() && series.what != What::Contact {
+            self.report.unknown_channels.push(series.name.clone());
         }
+        let channel = channel?;
+        Some((self.plan.channel(&channel.name)?, channel))
+    }
+
+    /// Encodes a sensor's reading.
+    fn sensor(
+        &mut self,
+        row: &csv::Row,
+        (number, channel): (u32, &ChannelPlan),
+        reading: &Reading,
+        quality: Quality,
+    ) -> io::Result<()> {
+        let device =
+            (self.plan.buses.get(channel.bus)).and_then(|bus| bus.devices.get(channel.device));
+        let output = device.and_then(|d| d.outputs.iter().find(|o| o.channel == number));
+        let board =
+            (self.boards.get_mut(channel.bus)).and_then(|boards| boards.get_mut(channel.device));
+        let (Some(output), Some(board)) = (output, board) else {
+            return Ok(());
+        };
+        self.frames.clear();
+        if let Err(error) = board.encode(output.number, reading, quality, &mut self.frames) {
+            self.report.refused += 1;
+            self.report.reason(row.line, &error);
+            return Ok(());
+        }
+        self.report.samples += 1;
+        (self.log).push(row.t, channel.bus, &self.frames, FRAME_TIME)
+    }
+
+    /// Encodes the readings of all devices that measure the joints of a row.
+    fn joints(&mut self, row: &csv::Row, joints: &RowJoints) -> io::Result<()> {
         let mut refused = BTreeSet::new();
-        for measures in &joint_outputs {
-            let Some(reading) = measures.reading(&joints) else {
+        for output in &self.joint_outputs {
+            let Some(reading) = output.reading(joints) else {
                 continue;
             };
-            let board = boards
-                .get_mut(measures.bus)
-                .and_then(|b| b.get_mut(measures.device));
+            let board =
+                (self.boards.get_mut(output.bus)).and_then(|boards| boards.get_mut(output.device));
             let Some(board) = board else { continue };
-            frames.clear();
-            let encoded = reading
-                .map_err(str::to_owned)
-                .and_then(|(reading, quality)| {
-                    let encoded = board.encode(measures.output, &reading, quality, &mut frames);
-                    encoded.map_err(|error| error.to_string())
-                });
+            self.frames.clear();
+            let encoded = (reading.map_err(str::to_owned)).and_then(|(reading, quality)| {
+                let encoded = board.encode(output.number, &reading, quality, &mut self.frames);
+                encoded.map_err(|error| error.to_string())
+            });
             if let Err(error) = encoded {
-                let channels = measures.inverse.channels.iter();
-                refused.extend(
-                    channels
-                        .copied()
-                        .filter(|channel| joints.contains_key(channel)),
-                );
-                report.reason(row.line, &error);
+                let channels = output.inverse.channels.iter().copied();
+                refused.extend(channels.filter(|channel| joints.contains_key(channel)));
+                self.report.reason(row.line, &error);
                 continue;
             }
-            let spacing = match measures.completes {
+            let spacing = match output.completes {
                 true => FRAME_TIME,
                 false => Nanos::ZERO,
             };
-            output.push(row.t, measures.bus, &frames, spacing, &mut log)?;
+            (self.log).push(row.t, output.bus, &self.frames, spacing)?;
         }
-        report.refused += refused.len() as u64;
-        report.samples += (joints.len() - refused.len()) as u64;
-        output.write_before(row.t.map(|now| now - REORDER), &mut log)?;
+        self.report.refused += refused.len() as u64;
+        self.report.samples += (joints.len() - refused.len()) as u64;
+        Ok(())
     }
-    output.write_before(Some(Nanos::MAX), &mut log)?;
-    log.flush()?;
-    report.frames = output.frames;
-    report.table = reader.report().clone();
-    Ok(report)
 }
 
 /// The interface name of `bus` in a log.
 fn interface(bus: &BusPlan) -> &str {
     match &bus.source {
-        Source::SocketCan(Adapter::Interface(name)) | Source::Virtual { name } => name,
-        Source::SocketCan(_) | Source::Replay { .. } => &bus.name,
+        FrameSource::SocketCan(Adapter::Interface(name)) | FrameSource::Virtual { name } => name,
+        FrameSource::SocketCan(_) | FrameSource::Replay { .. } => &bus.name,
     }
 }

@@ -1,11 +1,11 @@
 //! Carries out the orders of the control socket: passes them to the devices by the inboxes of their
 //! buses, and answers when the devices have replied.
 
-use crate::control::{Asked, Order, refusal};
+use crate::control::{Asked, ControlOrder, refusal};
 use crate::decoder::build;
 use crate::inbox::{Busy, Replacement, Reply, Request};
 use crate::plan::{Plan, did_you_mean};
-use crate::reload::{Change, changes};
+use crate::reload::{DeviceChange, changes};
 use crate::thread::BusThread;
 use anyhow::{Context as _, ensure};
 use proprio_drivers::{COMMAND_TIME, Calibration, Command, CommandOutcome, Mode};
@@ -38,13 +38,13 @@ fn free(threads: &mut [BusThread], device: (usize, u16)) -> anyhow::Result<&mut 
 pub(crate) struct Operator {
     config: PathBuf,
     plan: Plan,
-    waiting: Vec<Waiting>,
+    waiting: Vec<PendingOrder>,
     /// Whether the plan has changed and nobody was told.
     reloaded: bool,
 }
 
 /// An order whose devices have not all replied.
-struct Waiting {
+struct PendingOrder {
     /// The number of the bus, and of the device on it.
     open: Vec<(usize, u16)>,
     /// Given up after this.
@@ -90,24 +90,24 @@ impl Operator {
     ) {
         let Asked { order, answer } = asked;
         let begun = match &order {
-            Order::Status => {
+            ControlOrder::Status => {
                 // An operator who has gone needs no answer; nor below.
                 let _ = answer.send(self.status(health, now));
                 return;
             }
-            Order::Devices => {
+            ControlOrder::Devices => {
                 let _ = answer.send(self.devices(threads, health));
                 return;
             }
-            Order::Tare { device } => self.command(device, Command::Tare, threads, now),
-            Order::Calibration { device } => {
+            ControlOrder::Tare { device } => self.command(device, Command::Tare, threads, now),
+            ControlOrder::Calibration { device } => {
                 self.command(device, Command::Calibration, threads, now)
             }
-            Order::Reload => self.reload(threads),
+            ControlOrder::Reload => self.reload(threads),
         };
         match begun {
             Ok((open, done)) if open.is_empty() => drop(answer.send(done)),
-            Ok((open, done)) => self.waiting.push(Waiting {
+            Ok((open, done)) => self.waiting.push(PendingOrder {
                 open,
                 limit: now + REPLY_TIME,
                 answer,
@@ -124,9 +124,9 @@ impl Operator {
                 self.replied(bus, device, reply);
             }
         }
-        let late = |waiting: &mut Waiting| now > waiting.limit;
+        let late = |waiting: &mut PendingOrder| now > waiting.limit;
         let late: Vec<_> = self.waiting.extract_if(.., late).collect();
-        for Waiting { open, answer, .. } in late {
+        for PendingOrder { open, answer, .. } in late {
             let names = open.into_iter().map(|(bus, device)| self.name(bus, device));
             let names: Vec<_> = names.collect();
             let _ = answer.send(refusal(&format!(
@@ -155,7 +155,7 @@ impl Operator {
             tracing::warn!(device = name, "not done: {error}");
             refusal(&format!("device {name:?}: {error}"))
         });
-        let own = |waiting: &Waiting| waiting.open.contains(&(bus, device));
+        let own = |waiting: &PendingOrder| waiting.open.contains(&(bus, device));
         if let Some(at) = self.waiting.iter().position(own) {
             let _ = self.waiting.swap_remove(at).answer.send(answer);
         }
@@ -169,7 +169,7 @@ impl Operator {
         let done = self
             .waiting
             .extract_if(.., |waiting| waiting.open.is_empty());
-        for Waiting { answer, done, .. } in done {
+        for PendingOrder { answer, done, .. } in done {
             let _ = answer.send(done);
         }
     }
@@ -248,7 +248,7 @@ impl Operator {
         })?;
         // Everything that can fail comes before the first change.
         let mut requests = Vec::new();
-        for Change {
+        for DeviceChange {
             device, restarts, ..
         } in &changes
         {
@@ -264,7 +264,7 @@ impl Operator {
             let replacement = Replacement {
                 device: built.map_err(|why| failed(&why))?,
                 max_silence: plan.spec.max_silence,
-                routes: plan.routes.clone(),
+                outputs: plan.outputs.clone(),
             };
             requests.push((*device, Request::Replace(replacement)));
         }
@@ -277,7 +277,7 @@ impl Operator {
         self.plan = new;
         self.reloaded = !changes.is_empty();
         let mut changed = Vec::new();
-        for Change {
+        for DeviceChange {
             device,
             what,
             restarts,
@@ -326,8 +326,8 @@ impl Operator {
         let devices: Vec<_> = devices
             .zip(health.devices())
             .map(|((bus, device, mode), health)| {
-                let channels: Vec<_> = (device.routes.iter())
-                    .filter_map(|route| self.plan.channels.get(route.channel as usize))
+                let channels: Vec<_> = (device.outputs.iter())
+                    .filter_map(|output| self.plan.channels.get(output.channel as usize))
                     .map(|channel| channel.name.as_str())
                     .collect();
                 let count = |counter: Counter| health.counters.get(counter as usize);
@@ -450,7 +450,7 @@ full_scale_nm = [31.0, 31.0, 31.0]
             }
         }
 
-        fn begin(&mut self, order: Order, now: Nanos) -> oneshot::Receiver<Json> {
+        fn begin(&mut self, order: ControlOrder, now: Nanos) -> oneshot::Receiver<Json> {
             let (answer, answered) = oneshot::channel();
             let (asked, health) = (Asked { order, answer }, &self.health);
             self.operator.begin(asked, &mut self.threads, health, now);
@@ -462,7 +462,7 @@ full_scale_nm = [31.0, 31.0, 31.0]
     fn who_asks_a_bus_that_is_stuck_is_told_so() {
         let mut rig = Rig::new(FILE);
         let now = Nanos::from_millis(1000);
-        let tare = || Order::Tare {
+        let tare = || ControlOrder::Tare {
             device: "ft".to_owned(),
         };
         let mut answered = rig.begin(tare(), now);
@@ -488,7 +488,7 @@ full_scale_nm = [31.0, 31.0, 31.0]
             let mut rig = Rig::new(&file);
             let changed = file.replace("address = 1", "address = 1\nperiod_ms = 2");
             std::fs::write(&rig.config, changed).unwrap();
-            let _answered = rig.begin(Order::Reload, Nanos::ZERO);
+            let _answered = rig.begin(ControlOrder::Reload, Nanos::ZERO);
             let Some((0, Request::Replace(new))) = rig.inbox.take() else {
                 panic!("nothing is replaced")
             };

@@ -40,13 +40,13 @@ impl Sink for Memory {
 
 /// Shared memory: `<robot>/samples`.
 #[derive(Debug)]
-pub struct Shared {
+pub struct SharedMemory {
     writer: Writer<Sample>,
     robot: String,
     renewing: Renewing,
 }
 
-impl Shared {
+impl SharedMemory {
     /// Publishes the samples of `robot` with `writer`, until a `renewal`.
     pub fn new(writer: Writer<Sample>, robot: &str, renewal: Arc<Renewal>) -> Self {
         Self {
@@ -71,7 +71,7 @@ impl Shared {
     }
 }
 
-impl Sink for Shared {
+impl Sink for SharedMemory {
     fn publish(&mut self, sample: &mut Sample, now: Nanos) -> Result<u32, SinkError> {
         self.look(now);
         let sent = self.writer.send(sample, now).map_err(|_| SinkError)?;

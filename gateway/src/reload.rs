@@ -5,14 +5,14 @@
 //! rest on needs a restart of the gateway: also which device gives what of a joint (`takes`), and
 //! couplings.
 
-use crate::joints::{Layout, Matrix, Takes, Target};
-use crate::plan::{BusPlan, DevicePlan, Plan, Route};
+use crate::joints::{JointsPlan, Matrix, ShaftRole, Takes};
+use crate::plan::{BusPlan, DevicePlan, OutputPlan, Plan};
 use proprio_drivers::Claim;
 use std::collections::BTreeSet;
 
 /// What changes of a device.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Change {
+pub(crate) struct DeviceChange {
     /// The number of the bus, and of the device on it.
     pub(crate) device: (usize, u16),
     /// Its keys, in words.
@@ -25,7 +25,7 @@ pub(crate) struct Change {
 ///
 /// # Errors
 /// The places in the file whose change needs a restart of the gateway.
-pub(crate) fn changes(old: &Plan, new: &Plan) -> Result<Vec<Change>, Vec<String>> {
+pub(crate) fn changes(old: &Plan, new: &Plan) -> Result<Vec<DeviceChange>, Vec<String>> {
     let mut blocked = Vec::new();
     if old.robot != new.robot {
         blocked.push("robot".to_owned());
@@ -105,26 +105,26 @@ fn compare_buses(old: (&Plan, &BusPlan), new: (&Plan, &BusPlan), blocked: &mut V
             Some(built.claims().to_vec())
         };
         let channels = |plan: &Plan, bus: &BusPlan, device: &DevicePlan| -> Vec<_> {
-            let routes = device.routes.iter();
-            routes
-                .map(|route| {
-                    let channel = plan.channels.get(route.channel as usize);
-                    let feed = route.feed.as_ref();
-                    let shaft = feed.and_then(|feed| bus.joints.shafts.get(feed.shaft));
-                    let takes = feed
-                        .and_then(|feed| bus.joints.source(feed))
+            let outputs = device.outputs.iter();
+            outputs
+                .map(|output| {
+                    let channel = plan.channels.get(output.channel as usize);
+                    let input = output.input.as_ref();
+                    let shaft = input.and_then(|input| bus.joints.shafts.get(input.shaft));
+                    let takes = input
+                        .and_then(|input| bus.joints.input(input))
                         .map(|s| s.takes);
                     let names = (
                         channel.map(|c| c.name.clone()),
                         shaft.map(|s| s.name.clone()),
                     );
                     (
-                        route.output,
-                        route.kind,
+                        output.number,
+                        output.kind,
                         names,
                         shaft
-                            .filter(|s| matches!(s.target, Target::Motor(..)))
-                            .map(|s| s.target),
+                            .filter(|s| matches!(s.role, ShaftRole::Motor(..)))
+                            .map(|s| s.role),
                         takes,
                     )
                 })
@@ -149,38 +149,29 @@ struct Coupled<'p> {
     joints: Vec<&'p str>,
     motors: Vec<&'p str>,
     matrix: &'p Matrix,
-    takes: Option<Takes>,
+    takes: Takes,
 }
 
 /// The couplings of a bus.
-fn couplings(layout: &Layout) -> Vec<Coupled<'_>> {
+fn couplings(plan: &JointsPlan) -> Vec<Coupled<'_>> {
     let name = |shaft: usize| {
-        let shaft = layout.shafts.get(shaft);
+        let shaft = plan.shafts.get(shaft);
         shaft.map_or("", |shaft| shaft.name.as_str())
     };
-    let source = |(shaft, place): &(usize, usize)| layout.shafts.get(*shaft)?.sources.get(*place);
-    let each = layout.couplings.iter().map(|coupling| Coupled {
-        joints: coupling
-            .joints
-            .iter()
-            .map(|(joint, _)| name(*joint))
-            .collect(),
+    let each = plan.couplings.iter().map(|coupling| Coupled {
+        joints: coupling.joints.iter().map(|at| name(at.shaft)).collect(),
         motors: coupling.motors.iter().map(|motor| name(*motor)).collect(),
         matrix: &coupling.matrix,
-        takes: coupling
-            .joints
-            .first()
-            .and_then(source)
-            .map(|source| source.takes),
+        takes: coupling.takes(plan),
     });
     each.collect()
 }
 
 /// What changes of one device of the same name, driver, address and channels.
-fn change(device: (usize, u16), old: &DevicePlan, new: &DevicePlan) -> Option<Change> {
+fn change(device: (usize, u16), old: &DevicePlan, new: &DevicePlan) -> Option<DeviceChange> {
     let maps = |plan: &DevicePlan| -> Vec<_> {
-        let wrap = |route: &Route| route.feed.and_then(|feed| feed.wrap);
-        plan.routes.iter().map(|r| (r.map, wrap(r))).collect()
+        let wrap = |output: &OutputPlan| output.input.and_then(|input| input.wrap);
+        plan.outputs.iter().map(|r| (r.map, wrap(r))).collect()
     };
     let keys = [
         ("keys of the driver", old.options != new.options),
@@ -197,7 +188,7 @@ fn change(device: (usize, u16), old: &DevicePlan, new: &DevicePlan) -> Option<Ch
         .map(|(key, _)| *key)
         .collect();
     let restarts = keys.iter().take(2).any(|(_, differs)| *differs);
-    (!what.is_empty()).then_some(Change {
+    (!what.is_empty()).then_some(DeviceChange {
         device,
         what,
         restarts,
@@ -235,7 +226,7 @@ name = "elbow"
 ratio = 100.0
 "#;
 
-    fn compared(changed: &str) -> Result<Vec<Change>, Vec<String>> {
+    fn compared(changed: &str) -> Result<Vec<DeviceChange>, Vec<String>> {
         let plan = |text| Plan::parse(text, Path::new(".")).unwrap();
         assert_ne!(changed, FILE, "the text is not in the file");
         changes(&plan(FILE), &plan(changed))
@@ -243,7 +234,7 @@ ratio = 100.0
 
     #[test]
     fn a_device_can_change_what_nobody_else_rests_on() {
-        let change = |device, what: &[&'static str], restarts| Change {
+        let change = |device, what: &[&'static str], restarts| DeviceChange {
             device,
             what: what.to_vec(),
             restarts,

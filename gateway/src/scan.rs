@@ -10,11 +10,11 @@
 mod found;
 mod tables;
 
-pub use found::{Device, devices};
-pub use tables::{Bus, FILL_IN, file, placeholders, tables};
+pub use found::{FoundDevice, devices};
+pub use tables::{FILL_IN, ScannedBus, file, placeholders, tables};
 
 use crate::clock::Clock;
-use crate::link::{Link, Received, SendError, send_by};
+use crate::link::{Link, Received, TransmitError, send_by};
 use crate::log;
 use proprio_drivers::{Format, Traffic, questions};
 use proprio_topics::{LinkState, Nanos};
@@ -39,7 +39,7 @@ pub enum ScanError {
     Link(LinkState),
     /// A question could not be sent.
     #[error("a question could not be sent: {0}")]
-    Send(SendError),
+    Send(TransmitError),
 }
 
 /// Listens to `link` until `end` and adds what is heard to `heard`.
@@ -111,7 +111,7 @@ pub fn log(
     stamps: log::Stamps,
 ) -> io::Result<(BTreeMap<String, Traffic>, Vec<String>)> {
     let mut buses: BTreeMap<String, Traffic> = BTreeMap::new();
-    let mut reader = log::Reader::with_stamps(file, stamps);
+    let mut reader = log::LogReader::with_stamps(file, stamps);
     while let Some(record) = reader.next_record()? {
         match buses.get_mut(record.interface) {
             Some(heard) => heard.on_frame(&record.frame),
@@ -186,7 +186,7 @@ mod tests {
             }
         }
 
-        fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
+        fn send(&mut self, frame: &Frame) -> Result<(), TransmitError> {
             self.sent.push(*frame);
             for board in &mut self.boards {
                 let mut answers = Frames::new();
@@ -205,7 +205,7 @@ mod tests {
         }
     }
 
-    fn names(devices: &[Device]) -> Vec<&str> {
+    fn names(devices: &[FoundDevice]) -> Vec<&str> {
         devices.iter().map(|device| device.name.as_str()).collect()
     }
 
@@ -277,7 +277,7 @@ mod tests {
         bus.state = LinkState::Up;
         let mut closed = ListenOnly(Box::new(bus));
         let refused = ask(&mut closed, &Monotonic, &[], true, &mut Traffic::new());
-        assert_eq!(refused, Err(ScanError::Send(SendError::ListenOnly)));
+        assert_eq!(refused, Err(ScanError::Send(TransmitError::ListenOnly)));
     }
 
     #[test]

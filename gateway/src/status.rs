@@ -3,7 +3,7 @@
 
 use crate::link::LinkCounters;
 use crate::link::error_frame::ErrorFrame;
-use crate::load::{Bits, Totals, bits_on_wire};
+use crate::load::{Totals, WireBits, bits_on_wire};
 use crate::plan::BusPlan;
 use proprio_drivers::{Device, Frame, State};
 use proprio_topics::{
@@ -174,7 +174,7 @@ impl BusStatus {
 
     /// Counts what `frame`, received or sent, can have taken of the bus. For one writer.
     pub fn on_wire(&self, frame: &Frame) {
-        let Bits { nominal, data } = bits_on_wire(frame);
+        let WireBits { nominal, data } = bits_on_wire(frame);
         for (cell, bits) in self
             .bits
             .iter()

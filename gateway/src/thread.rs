@@ -2,7 +2,7 @@
 
 use crate::bus::{Bus, Turn};
 use crate::clock::Monotonic;
-use crate::config::Source;
+use crate::config::FrameSource;
 use crate::decoder::Decoder;
 use crate::inbox::{Requests, inbox};
 use crate::link::adapter::{self, Adapter};
@@ -12,7 +12,7 @@ use crate::link::socketcan::SocketCan;
 use crate::link::virtual_bus::VirtualBus;
 use crate::link::{Link, ListenOnly, OpenError};
 use crate::plan::{BusPlan, Plan};
-use crate::publish::Shared;
+use crate::publish::SharedMemory;
 use crate::status::BusStatus;
 use anyhow::{Context, anyhow};
 use proprio_drivers::{Claim, Mode};
@@ -108,10 +108,11 @@ impl BusThread {
         let status = Arc::new(BusStatus::new(number, bus));
         // A log is not interactive: its boards answered the program that commanded them during the
         // recording.
-        let listens = bus.listen_only || matches!(bus.source, Source::Replay { .. });
+        let listens = bus.listen_only || matches!(bus.source, FrameSource::Replay { .. });
         let mode = listens.then_some(Mode::Listen);
         let decoder = Decoder::new(number, bus, mode, Arc::clone(&status))?;
-        let mut link: Box<dyn Link> = if let Source::Replay { log, pace, stamps } = &bus.source {
+        let mut link: Box<dyn Link> = if let FrameSource::Replay { log, pace, stamps } = &bus.source
+        {
             let matching = plan.matching(number as usize);
             let mut replay = Replay::open_with(log, *pace, *stamps, matching, &decoder.claims())?;
             replay.start_at(replay_start);
@@ -123,7 +124,7 @@ impl BusThread {
             link = Box::new(ListenOnly(link));
         }
         let claim = match &bus.source {
-            Source::SocketCan(adapter) if !listens => claim_interface(adapter),
+            FrameSource::SocketCan(adapter) if !listens => claim_interface(adapter),
             _ => None,
         };
         let ended = Arc::new(AtomicBool::new(false));
@@ -147,7 +148,7 @@ impl BusThread {
                 .unwrap_or_default();
             let _ = ready.send(Ok(refused));
             let clock = Monotonic;
-            let sink = Shared::new(writer, &robot, renewal_there);
+            let sink = SharedMemory::new(writer, &robot, renewal_there);
             let mut bus = Bus::new(link, decoder, sink, status_there).with_inbox(inbox);
             while !stop.load(Acquire) {
                 if bus.turn(&clock) == Turn::Ended {
@@ -224,13 +225,13 @@ pub fn open_link(
     claims: &[Claim],
 ) -> Result<Box<dyn Link>, OpenError> {
     Ok(match &bus.source {
-        Source::SocketCan(named) => {
+        FrameSource::SocketCan(named) => {
             let link = SocketCan::open_adapter(named, Path::new(adapter::SYS), claims)?;
             check_fd(bus, link.interface(), &mut Netlink::default())?;
             Box::new(link)
         }
-        Source::Virtual { name } => Box::new(VirtualBus::open(domain, name, claims)?),
-        Source::Replay { log, pace, stamps } => {
+        FrameSource::Virtual { name } => Box::new(VirtualBus::open(domain, name, claims)?),
+        FrameSource::Replay { log, pace, stamps } => {
             Box::new(Replay::open_with(log, *pace, *stamps, None, claims)?)
         }
     })
@@ -263,7 +264,7 @@ impl BusThread {
             requests,
             renewal: Arc::default(),
             _claim: None,
-            mode: matches!(bus.source, Source::Replay { .. }).then_some(Mode::Listen),
+            mode: matches!(bus.source, FrameSource::Replay { .. }).then_some(Mode::Listen),
             thread: Finished(None),
         };
         (this, inbox)

@@ -17,7 +17,7 @@
 //!   unpaired readings, which health counts.
 
 use crate::clock::{Clock, Monotonic, sleep_until};
-use crate::config::Source;
+use crate::config::FrameSource;
 use crate::decoder::Decoder;
 use crate::link::adapter;
 use crate::link::socketcan::SocketCan;
@@ -46,10 +46,14 @@ const PAUSE: Nanos = Nanos::from_millis(50);
 const TRIPLES: usize = 20;
 
 /// The plan that the buses are compared with; a reload replaces it.
-pub(crate) type Shared = Arc<Mutex<Plan>>;
+pub(crate) type WatchedPlan = Arc<Mutex<Plan>>;
 
 /// Starts the thread. It ends after `stop`.
-pub(crate) fn start(plan: Shared, domain: String, stop: Arc<AtomicBool>) -> std::io::Result<()> {
+pub(crate) fn start(
+    plan: WatchedPlan,
+    domain: String,
+    stop: Arc<AtomicBool>,
+) -> std::io::Result<()> {
     let body = move || {
         let mut told = BTreeSet::new();
         let mut next = Monotonic.now() + FIRST;
@@ -80,14 +84,14 @@ pub(crate) fn start(plan: Shared, domain: String, stop: Arc<AtomicBool>) -> std:
 }
 
 /// The frames of a look; `None` of a log, or if there is no link.
-fn listen(source: &Source, domain: &str, stop: &AtomicBool) -> Option<Vec<Frame>> {
+fn listen(source: &FrameSource, domain: &str, stop: &AtomicBool) -> Option<Vec<Frame>> {
     let link: Box<dyn Link> = match source {
-        Source::SocketCan(named) => {
+        FrameSource::SocketCan(named) => {
             let path = Path::new(adapter::SYS);
             Box::new(SocketCan::open_adapter(named, path, &[]).ok()?)
         }
-        Source::Virtual { name } => Box::new(VirtualBus::open(domain, name, &[]).ok()?),
-        Source::Replay { .. } => return None,
+        FrameSource::Virtual { name } => Box::new(VirtualBus::open(domain, name, &[]).ok()?),
+        FrameSource::Replay { .. } => return None,
     };
     let mut link = ListenOnly(link);
     let end = Monotonic.now() + TIME;

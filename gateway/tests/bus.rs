@@ -6,7 +6,7 @@ use proprio_gateway::bus::{Bus, QUEUE, RETRY};
 use proprio_gateway::clock::Manual;
 use proprio_gateway::decoder::{Decoder, build};
 use proprio_gateway::inbox::{Replacement, Reply, Request, Requests, inbox};
-use proprio_gateway::link::{Link, LinkCounters, ListenOnly, Received, SendError};
+use proprio_gateway::link::{Link, LinkCounters, ListenOnly, Received, TransmitError};
 use proprio_gateway::plan::{BusPlan, Plan};
 use proprio_gateway::publish::Memory;
 use proprio_gateway::status::BusStatus;
@@ -24,7 +24,7 @@ struct Script {
     /// What `recv` returns; then a time-out.
     receives: VecDeque<Received>,
     /// How attempts to send end; then all succeed.
-    answers: VecDeque<Result<(), SendError>>,
+    answers: VecDeque<Result<(), TransmitError>>,
     sent: Vec<Frame>,
     attempts: usize,
     /// The last deadline of `recv`.
@@ -39,7 +39,7 @@ impl Link for Scripted {
         script.deadline = deadline;
         script.receives.pop_front().unwrap_or(Received::TimedOut)
     }
-    fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
+    fn send(&mut self, frame: &Frame) -> Result<(), TransmitError> {
         let mut script = self.0.lock().unwrap();
         script.attempts += 1;
         let answer = script.answers.pop_front().unwrap_or(Ok(()));
@@ -130,13 +130,13 @@ impl Rig {
         self.clock.set(self.now);
     }
 
-    /// What replaces board `number`: a new device, or only the routes.
+    /// What replaces board `number`: a new device, or only the outputs.
     fn replacement(&self, number: u16, whole: bool) -> Request {
         let plan = &self.plan.devices[usize::from(number)];
         Request::Replace(Replacement {
             device: whole.then(|| build(plan, None).expect("a device")),
             max_silence: Nanos::from_millis(77),
-            routes: plan.routes.clone(),
+            outputs: plan.outputs.clone(),
         })
     }
 
@@ -192,8 +192,8 @@ fn tare(until: Nanos) -> Request {
 }
 
 /// Attempts that find the link's queue full.
-fn full(count: usize) -> VecDeque<Result<(), SendError>> {
-    vec![Err(SendError::Full); count].into()
+fn full(count: usize) -> VecDeque<Result<(), TransmitError>> {
+    vec![Err(TransmitError::Full); count].into()
 }
 
 #[test]
@@ -215,7 +215,7 @@ fn a_full_queue_is_tried_again_in_order_while_frames_are_received() {
     rig.turns(1);
     assert_eq!((rig.attempts(), rig.sent().len()), (2, 0));
     // Full again after the second frame.
-    rig.script().answers = [Ok(()), Ok(()), Err(SendError::Full)].into();
+    rig.script().answers = [Ok(()), Ok(()), Err(TransmitError::Full)].into();
     rig.pass(RETRY);
     rig.turns(1);
     assert_eq!(rig.sent().len(), 2);
@@ -304,7 +304,7 @@ fn what_waits_is_dropped_when_the_link_is_lost() {
         rig.script().answers = full(1);
         rig.turns(2);
         if !by_state {
-            rig.script().answers = [Err(SendError::NotUp)].into();
+            rig.script().answers = [Err(TransmitError::NotUp)].into();
             rig.pass(RETRY);
             rig.turns(1);
             assert_eq!(rig.unsent(), (failures, failures), "at once");
@@ -355,7 +355,7 @@ fn nobody_streams_over_a_lost_link() {
 fn what_the_link_refuses_is_told_to_its_device_alone() {
     let wanted = start_commands(2);
     let mut rig = Rig::new(2);
-    rig.script().answers = [Err(SendError::Unsupported)].into();
+    rig.script().answers = [Err(TransmitError::Unsupported)].into();
     rig.turns(START);
     let of_board = |address: u16| -> Vec<Frame> {
         let id = Id::standard(0x200 | address);
@@ -424,13 +424,13 @@ fn a_replaced_device_stops_its_board_before_the_new_one_starts_it() {
     rig.pass(Nanos::from_millis(10));
     rig.readings(boards);
 
-    // New routes alone: the device goes on, and nothing is sent. Only a different one leaves a gap.
+    // New outputs alone: the device goes on, nothing is sent. Only a different one leaves a gap.
     for offset in [0.0, 1.0] {
         rig.script().sent.clear();
         let Request::Replace(mut part) = rig.replacement(1, false) else {
             unreachable!()
         };
-        part.routes[0].map.offset = offset;
+        part.outputs[0].map.offset = offset;
         assert_eq!(rig.requests.send(1, Request::Replace(part)), Ok(()));
         rig.turns(2);
         assert!(matches!(rig.requests.take(), Some((1, Reply::Replaced(_)))));

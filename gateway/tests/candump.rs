@@ -2,7 +2,7 @@
 
 use proprio_drivers::{Format, Frame, Id};
 use proprio_gateway::log::candump::{Line, Writer, parse_frame, write_log_line};
-use proprio_gateway::log::{Direction, LineError, Reader, Record, Stamps};
+use proprio_gateway::log::{FrameDirection, LineError, LogReader, Record, Stamps};
 use proprio_topics::{Nanos, StampKind};
 use proptest::prelude::*;
 use std::io::{BufReader, Cursor};
@@ -194,7 +194,7 @@ const STAMPS_US: [i64; 12] = [
 struct Owned {
     stamp: Option<Nanos>,
     interface: String,
-    direction: Option<Direction>,
+    direction: Option<FrameDirection>,
     frame: Frame,
 }
 
@@ -209,8 +209,8 @@ impl From<Record<'_>> for Owned {
     }
 }
 
-fn read(log: &[u8]) -> (Vec<Owned>, Reader<Cursor<&[u8]>>) {
-    let mut reader = Reader::new(Cursor::new(log));
+fn read(log: &[u8]) -> (Vec<Owned>, LogReader<Cursor<&[u8]>>) {
+    let mut reader = LogReader::new(Cursor::new(log));
     let mut records = Vec::new();
     while let Some(record) = reader.next_record().unwrap() {
         records.push(record.into());
@@ -219,7 +219,7 @@ fn read(log: &[u8]) -> (Vec<Owned>, Reader<Cursor<&[u8]>>) {
 }
 
 /// Frame and stamp, without the CAN FD flags, which the screen format shows only with `-x`.
-fn expected(stamped: bool, flags: bool, direction: Option<Direction>) -> Vec<Owned> {
+fn expected(stamped: bool, flags: bool, direction: Option<FrameDirection>) -> Vec<Owned> {
     let without_flags = |frame: Frame| match frame.format {
         Format::Fd { .. } if !flags => {
             let format = Format::Fd {
@@ -248,7 +248,7 @@ fn expected(stamped: bool, flags: bool, direction: Option<Direction>) -> Vec<Own
 
 #[test]
 fn what_candump_prints_is_read() {
-    let sent = Some(Direction::Sent);
+    let sent = Some(FrameDirection::Sent);
     for (log, expected) in [
         (LOG, expected(true, true, None)),
         (LOG_X, expected(true, true, sent)),
@@ -316,7 +316,7 @@ fn relative_stamps_are_told_apart() {
         assert_eq!(reader.report().backwards, 0);
     }
     // An explicit meaning is used even if the stamps look otherwise.
-    let mut reader = Reader::with_stamps(Cursor::new(SCREEN_T_ZERO), Stamps::SincePrevious);
+    let mut reader = LogReader::with_stamps(Cursor::new(SCREEN_T_ZERO), Stamps::SincePrevious);
     let mut last = Nanos::ZERO;
     while let Some(record) = reader.next_record().unwrap() {
         last = record.stamp.unwrap();
@@ -433,7 +433,7 @@ fn the_whole_log_tells_relative_stamps_apart() {
     // It does not depend on the buffer.
     let text = screen(&turns);
     let small = BufReader::with_capacity(64, text.as_bytes());
-    let mut reader = Reader::new(small);
+    let mut reader = LogReader::new(small);
     while reader.next_record().unwrap().is_some() {}
     assert_eq!(
         (reader.stamps(), reader.report().bad),
@@ -445,7 +445,7 @@ fn the_whole_log_tells_relative_stamps_apart() {
 #[test]
 fn a_stated_meaning_holds_for_short_stamps_of_both_formats() {
     let log = "(1.0) can0 123#\n(0.5) can0 123#\n(1436509052.0) can0 123#\n";
-    let mut reader = Reader::with_stamps(log.as_bytes(), Stamps::SincePrevious);
+    let mut reader = LogReader::with_stamps(log.as_bytes(), Stamps::SincePrevious);
     let mut stamps = Vec::new();
     while let Some(record) = reader.next_record().unwrap() {
         stamps.push(record.stamp.unwrap().to_string());
@@ -515,7 +515,7 @@ fn a_stamp_out_of_range_costs_one_frame() {
     let mut log = screen(&[10_000; 12]);
     let far = " (999999999.0)  can0  123   [1]  00\n (9223372036.0)  can0  123   [1]  00\n";
     log.insert_str(log.len() / 2, far);
-    let mut reader = Reader::with_stamps(log.as_bytes(), Stamps::SincePrevious);
+    let mut reader = LogReader::with_stamps(log.as_bytes(), Stamps::SincePrevious);
     let mut count = 0;
     while let Some(record) = reader.next_record().unwrap() {
         count += 1;
@@ -830,7 +830,7 @@ proptest! {
         for (frame, t, interface) in &records {
             write_log_line(&mut log, Nanos(*t), interface, frame).unwrap();
         }
-        let mut reader = Reader::new(BufReader::with_capacity(buffer, Cursor::new(&log)));
+        let mut reader = LogReader::new(BufReader::with_capacity(buffer, Cursor::new(&log)));
         for (frame, t, interface) in &records {
             let record = reader.next_record().unwrap().unwrap();
             let t = Nanos(*t);

@@ -12,7 +12,7 @@ use proprio_gateway::link::interface::{Interfaces as _, Netlink};
 use proprio_gateway::link::replay::{Matching, Pace, Replay};
 use proprio_gateway::link::socketcan::SocketCan;
 use proprio_gateway::link::virtual_bus::VirtualBus;
-use proprio_gateway::link::{Link, ListenOnly, OpenError, Received, SendError, send_by};
+use proprio_gateway::link::{Link, ListenOnly, OpenError, Received, TransmitError, send_by};
 use proprio_gateway::log::Stamps;
 use proprio_gateway::log::candump::write_log_line;
 use proprio_topics::{BusError, Controller, LinkState, Nanos, StampKind};
@@ -438,11 +438,11 @@ fn what_a_flood_drops_is_counted(bus: &dyn Fixture) {
 fn what_can_not_be_sent_is_refused(bus: &dyn Fixture) {
     let mut link = bus.play(&[], &[]);
     let error = Frame::with_format(Id::extended(4), Format::Error, &[0; 8]).unwrap();
-    assert_eq!(link.send(&error), Err(SendError::Unsupported));
+    assert_eq!(link.send(&error), Err(TransmitError::Unsupported));
     if !bus.live() {
         assert_eq!(
             link.send(&Frame::new(Id::standard(1), &[])),
-            Err(SendError::Unsupported)
+            Err(TransmitError::Unsupported)
         );
     }
     assert_eq!(link.counters().sent, 0);
@@ -484,7 +484,7 @@ fn a_link_that_only_listens_sends_nothing(bus: &dyn Fixture) {
     let mut link = ListenOnly(bus.join(&[]));
     let mut peer = bus.join(&[]);
     let frame = Frame::new(Id::standard(1), &[1]);
-    assert_eq!(link.send(&frame), Err(SendError::ListenOnly));
+    assert_eq!(link.send(&frame), Err(TransmitError::ListenOnly));
     silent(&mut *peer);
     assert_eq!((link.state(), link.counters().sent), (LinkState::Up, 0));
     send(&mut *peer, &frame);
@@ -930,7 +930,7 @@ fn a_lost_interface_is_told_and_found_again() {
     own.ip("link set dev NAME down");
     assert_eq!(link.recv(now() + PATIENCE), Received::StateChanged);
     assert_eq!(link.state(), LinkState::Down);
-    assert_eq!(link.send(&wanted), Err(SendError::NotUp));
+    assert_eq!(link.send(&wanted), Err(TransmitError::NotUp));
     // Down from the start.
     assert_eq!(
         SocketCan::open(&own.name, &[]).unwrap().state(),
@@ -951,7 +951,7 @@ fn a_lost_interface_is_told_and_found_again() {
         own.ip("link del dev NAME");
         assert_eq!(link.recv(now() + PATIENCE), Received::StateChanged);
         assert_eq!(link.state(), LinkState::Gone);
-        assert_eq!(link.send(&wanted), Err(SendError::NotUp));
+        assert_eq!(link.send(&wanted), Err(TransmitError::NotUp));
         silent(&mut link);
         assert_eq!(link.recv(Nanos::ZERO), Received::TimedOut);
         own.create();
@@ -963,7 +963,7 @@ fn a_lost_interface_is_told_and_found_again() {
     }
     // Detected when sending, reported when receiving.
     own.ip("link del dev NAME");
-    assert_eq!(link.send(&wanted), Err(SendError::NotUp));
+    assert_eq!(link.send(&wanted), Err(TransmitError::NotUp));
     assert_eq!(
         (link.state(), link.recv(Nanos::ZERO)),
         (LinkState::Gone, Received::StateChanged)
@@ -976,7 +976,7 @@ fn a_lost_interface_is_told_and_found_again() {
     // Without mtu 72 there is no CAN FD.
     assert_eq!(
         link.send(&fd(Id::standard(7), false, false, &[])),
-        Err(SendError::Unsupported)
+        Err(TransmitError::Unsupported)
     );
     assert_eq!(link.send(&wanted), Ok(()));
     let counters = link.counters();
@@ -1080,12 +1080,12 @@ fn error_frames_are_handed_on_and_set_the_state() {
     assert!(error_frame(&mut link).reports(BusError::BusOff));
     assert_eq!(
         link.send(&Frame::new(Id::standard(7), &[])),
-        Err(SendError::Full)
+        Err(TransmitError::Full)
     );
     changes_to(&mut link, LinkState::BusOff);
     assert_eq!(
         link.send(&Frame::new(Id::standard(7), &[])),
-        Err(SendError::NotUp)
+        Err(TransmitError::NotUp)
     );
     error("20000100", none);
     assert!(error_frame(&mut link).reports(BusError::Restarted));
@@ -1168,7 +1168,7 @@ fn an_interface_without_a_carrier_is_not_up() {
     let mut link = SocketCan::open(&own.name, &[]).unwrap();
     assert_eq!(link.state(), LinkState::NoCarrier);
     let frame = Frame::new(Id::standard(7), &[1]);
-    assert_eq!(link.send(&frame), Err(SendError::NotUp));
+    assert_eq!(link.send(&frame), Err(TransmitError::NotUp));
     peer.ip("link set dev NAME up");
     changes_to(&mut link, LinkState::Up);
     assert_eq!(link.send(&frame), Ok(()));
@@ -1197,12 +1197,12 @@ fn a_full_queue_is_told_at_once() {
     }
     let mut link = SocketCan::open(&own.name, &[]).unwrap();
     let frame = Frame::new(Id::standard(7), &[1]);
-    let full = (0..40).find(|_| link.send(&frame) == Err(SendError::Full));
+    let full = (0..40).find(|_| link.send(&frame) == Err(TransmitError::Full));
     assert!((8..20).contains(&full.unwrap()), "{full:?}");
     let mut took: Vec<Nanos> = (0..20)
         .map(|_| {
             let before = now();
-            assert_eq!(link.send(&frame), Err(SendError::Full));
+            assert_eq!(link.send(&frame), Err(TransmitError::Full));
             now() - before
         })
         .collect();

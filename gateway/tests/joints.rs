@@ -175,8 +175,11 @@ impl Rig {
         joints: &BTreeMap<&str, JointState>,
     ) -> Vec<Sample> {
         let bus = &self.plan.buses[0];
-        let route = bus.devices[device].routes[0];
-        let inverse = bus.joints.inverse(&route.feed.unwrap(), route.map).unwrap();
+        let output = bus.devices[device].outputs[0];
+        let inverse = bus
+            .joints
+            .inverse(&output.input.unwrap(), output.map)
+            .unwrap();
         let of = |channel: &u32| joints[self.plan.channels[*channel as usize].name.as_str()];
         let states: Vec<JointState> = inverse.channels.iter().map(of).collect();
         let state = inverse.device(inverse.shaft(&states));
@@ -192,7 +195,7 @@ impl Rig {
         let request = Request::Replace(Replacement {
             device: whole.then(|| build(&new, Some(Mode::Listen)).unwrap()),
             max_silence: new.spec.max_silence,
-            routes: new.routes,
+            outputs: new.outputs,
         });
         let number = u16::try_from(device).unwrap();
         let reply = self.decoder.request(number, request, Nanos::ZERO);

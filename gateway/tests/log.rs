@@ -7,7 +7,7 @@ use flate2::write::ZlibEncoder;
 use proprio_drivers::{Format, Frame, Id};
 use proprio_gateway::link::replay::{Matching, Pace, Replay};
 use proprio_gateway::link::{Link, Received};
-use proprio_gateway::log::{Direction, LineError, LogFormat, Reader, Report};
+use proprio_gateway::log::{FrameDirection, LineError, LogFormat, LogReader, LogReport};
 use proprio_topics::{Nanos, StampKind};
 use proptest::prelude::*;
 use std::io::{BufReader, Cursor, Write as _};
@@ -19,7 +19,7 @@ use std::process::Command;
 struct Entry {
     t: Option<Nanos>,
     interface: String,
-    direction: Option<Direction>,
+    direction: Option<FrameDirection>,
     frame: Frame,
 }
 
@@ -27,12 +27,12 @@ struct Entry {
 struct Read {
     entries: Vec<Entry>,
     format: Option<LogFormat>,
-    report: Report,
+    report: LogReport,
     why_empty: String,
 }
 
 fn read_with(log: &[u8], buffer: usize) -> Read {
-    let mut reader = Reader::new(BufReader::with_capacity(buffer, Cursor::new(log)));
+    let mut reader = LogReader::new(BufReader::with_capacity(buffer, Cursor::new(log)));
     let mut entries = Vec::new();
     while let Some(record) = reader.next_record().unwrap() {
         let stamp = record.stamp.map_or(StampKind::None, |_| StampKind::Log);
@@ -274,7 +274,7 @@ fn what_vector_writes_as_text_is_read() {
         let interfaces: Vec<&str> = found.entries.iter().map(|e| e.interface.as_str()).collect();
         let numbers = [0, 1, 1, 2, 3, 0, 5, 6, 2, 2, 2, 4];
         assert_eq!(interfaces, numbers.map(|n| format!("can{n}")));
-        let (r, t) = (Some(Direction::Received), Some(Direction::Sent));
+        let (r, t) = (Some(FrameDirection::Received), Some(FrameDirection::Sent));
         let directions: Vec<_> = found.entries.iter().map(|e| e.direction).collect();
         assert_eq!(directions, [r, t, r, t, r, None, r, t, t, r, r, None]);
     }
@@ -687,7 +687,7 @@ fn every_version_of_peak_is_read() {
             assert_eq!(found.entries[1].interface, second, "{version}");
             assert_eq!(found.entries[0].interface, "can0");
             let directions = [found.entries[0].direction, found.entries[1].direction];
-            let expected = [Some(Direction::Received), Some(Direction::Sent)];
+            let expected = [Some(FrameDirection::Received), Some(FrameDirection::Sent)];
             let expected = if version == "1.0" {
                 [None; 2]
             } else {
@@ -1029,7 +1029,7 @@ fn every_object_of_vector_with_a_frame_is_read() {
         (interfaces[0], interfaces[10], interfaces[17]),
         ("can1", "can2", "can0")
     );
-    let (r, t) = (Some(Direction::Received), Some(Direction::Sent));
+    let (r, t) = (Some(FrameDirection::Received), Some(FrameDirection::Sent));
     let directions: Vec<_> = found.entries.iter().map(|e| e.direction).collect();
     assert_eq!((directions[0], directions[1], directions[9]), (t, r, t));
     // Without a start.

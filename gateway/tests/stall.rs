@@ -5,7 +5,7 @@ use proprio_drivers::{Frame, Id};
 use proprio_gateway::bus::Bus;
 use proprio_gateway::clock::Manual;
 use proprio_gateway::decoder::Decoder;
-use proprio_gateway::link::{Link, LinkCounters, Received, SendError};
+use proprio_gateway::link::{Link, LinkCounters, Received, TransmitError};
 use proprio_gateway::plan::Plan;
 use proprio_gateway::publish::Memory;
 use proprio_gateway::status::BusStatus;
@@ -26,7 +26,7 @@ impl Link for Script {
             .pop_front()
             .map_or(Received::TimedOut, Received::Frame)
     }
-    fn send(&mut self, _: &Frame) -> Result<(), SendError> {
+    fn send(&mut self, _: &Frame) -> Result<(), TransmitError> {
         self.sent += 1;
         Ok(())
     }

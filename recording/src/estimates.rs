@@ -1,9 +1,9 @@
 //! The estimates of a recording as a table: the columns of `proprio estimate`'s that tell torques
 //! and contacts.
 
-use crate::read::{ReadError, Summary, walk};
+use crate::read::{ReadError, RecordingSummary, walk};
 use mcap::records::Record;
-use proprio_bridge::cdr::Parsed;
+use proprio_bridge::cdr::CdrReader;
 use proprio_topics::Nanos;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Read, Write};
@@ -18,7 +18,7 @@ type ReadMessage = fn(&[u8]) -> Option<(i64, Row)>;
 const LOOK: usize = 1000;
 
 /// The table that is being made.
-struct Table<W: Write> {
+struct EstimateTable<W: Write> {
     channels: BTreeMap<u16, ReadMessage>,
     output: csv::Writer<W>,
     /// The place of each column; none before the first row is written.
@@ -27,7 +27,7 @@ struct Table<W: Write> {
     rows: Vec<(i64, Row)>,
     /// How many of the topics have had a message.
     seen: BTreeSet<u16>,
-    summary: Summary,
+    summary: RecordingSummary,
 }
 
 /// Writes the torques and contacts of a recording as a table: a row per instant, an empty cell
@@ -35,16 +35,19 @@ struct Table<W: Write> {
 ///
 /// # Errors
 /// [`ReadError`]; [`ReadError::NoEstimates`] if it has none.
-pub fn to_estimates<W: Write>(recording: impl Read, output: W) -> Result<Summary, ReadError> {
-    let mut table = Table {
+pub fn to_estimates<W: Write>(
+    recording: impl Read,
+    output: W,
+) -> Result<RecordingSummary, ReadError> {
+    let mut table = EstimateTable {
         channels: BTreeMap::new(),
         output: csv::Writer::from_writer(output),
         columns: BTreeMap::new(),
         rows: Vec::new(),
         seen: BTreeSet::new(),
-        summary: Summary::default(),
+        summary: RecordingSummary::default(),
     };
-    let is_known = |table: &Table<W>| !table.channels.is_empty();
+    let is_known = |table: &EstimateTable<W>| !table.channels.is_empty();
     table.summary.is_cut = walk(recording, &mut table, is_known, |table, record| {
         match record {
             Record::Channel(channel) => {
@@ -78,7 +81,7 @@ pub fn to_estimates<W: Write>(recording: impl Read, output: W) -> Result<Summary
     Ok(table.summary)
 }
 
-impl<W: Write> Table<W> {
+impl<W: Write> EstimateTable<W> {
     /// Cells of the instant `t`.
     fn take(&mut self, t: i64, cells: Row) -> Result<(), ReadError> {
         match self.rows.last_mut() {
@@ -147,14 +150,14 @@ fn why(reason: &str, cause: &str) -> String {
 
 /// The instant and the cells of a message of torques.
 fn torques(message: &[u8]) -> Option<(i64, Row)> {
-    let mut parsed = Parsed::new(message)?;
+    let mut parsed = CdrReader::new(message)?;
     let t = parsed.i64()?;
-    let names = parsed.list(Parsed::text)?;
-    let torques = parsed.list(Parsed::f64)?;
-    let deviations = parsed.list(Parsed::f64)?;
-    let valid = parsed.list(Parsed::bool)?;
-    let reasons = parsed.list(Parsed::text)?;
-    let causes = parsed.list(Parsed::text)?;
+    let names = parsed.list(CdrReader::text)?;
+    let torques = parsed.list(CdrReader::f64)?;
+    let deviations = parsed.list(CdrReader::f64)?;
+    let valid = parsed.list(CdrReader::bool)?;
+    let reasons = parsed.list(CdrReader::text)?;
+    let causes = parsed.list(CdrReader::text)?;
     let mut row = Row::new();
     let mut add = |what: &str, cells: Vec<String>| {
         let columns = names.iter().map(|name| format!("{what}/{name}"));
@@ -179,7 +182,7 @@ fn torques(message: &[u8]) -> Option<(i64, Row)> {
 
 /// The instant and the cells of a message of contacts.
 fn contacts(message: &[u8]) -> Option<(i64, Row)> {
-    let mut parsed = Parsed::new(message)?;
+    let mut parsed = CdrReader::new(message)?;
     let t = parsed.i64()?;
     let mut row = Row::new();
     for _ in 0..parsed.u32()? {
@@ -193,7 +196,7 @@ fn contacts(message: &[u8]) -> Option<(i64, Row)> {
         for axis in axes {
             add(&format!("{axis}_std"), number(parsed.f64()?));
         }
-        let flag = |parsed: &mut Parsed<'_>| Some(u8::from(parsed.bool()?).to_string());
+        let flag = |parsed: &mut CdrReader<'_>| Some(u8::from(parsed.bool()?).to_string());
         add("valid", flag(&mut parsed)?);
         let (reason, cause) = (parsed.text()?, parsed.text()?);
         add("reason", why(reason, cause));

@@ -24,6 +24,6 @@ mod ring;
 mod write;
 
 pub use estimates::to_estimates;
-pub use read::{ReadError, Summary, about, frames, is_mcap, to_table};
-pub use ring::{Ring, Snapshot};
-pub use write::{About, File, Recorder, WriteError};
+pub use read::{ReadError, RecordingSummary, about, frames, is_mcap, to_table};
+pub use ring::{Ring, RingSnapshot};
+pub use write::{About, McapFile, Recorder, WriteError};

@@ -4,9 +4,9 @@ use crate::write::{About, PROPRIO};
 use mcap::records::{Channel, Record};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{McapError, parse_record};
-use proprio_bridge::cdr::Parsed;
+use proprio_bridge::cdr::CdrReader;
 use proprio_drivers::{Format, Frame, Id};
-use proprio_topics::csv::{Columns, Series, Value, What, Writer};
+use proprio_topics::csv::{Columns, Series, TableWriter, Value, What};
 use proprio_topics::{ContactState, Kind, Nanos, Quality, Reading, StampKind, VALUES};
 use std::collections::BTreeMap;
 use std::io::{self, Read, Write};
@@ -41,7 +41,7 @@ pub enum ReadError {
 
 /// What was in a recording.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Summary {
+pub struct RecordingSummary {
     /// Samples and declarations in the table; frames.
     pub values: u64,
     /// Samples and declarations of channels that came to be known after the first message: the
@@ -100,30 +100,30 @@ pub(crate) fn walk<S>(
 }
 
 /// The table that is being made.
-struct Table<W: Write> {
+struct SampleTable<W: Write> {
     /// Of each channel: the number of its series in the recording, its place among the columns once
     /// they are known, and its kind.
     channels: BTreeMap<u16, (usize, Option<usize>, What)>,
     /// By their number in the recording.
     series: BTreeMap<usize, Series>,
     output: Option<W>,
-    writer: Option<Writer<W>>,
-    summary: Summary,
+    writer: Option<TableWriter<W>>,
+    summary: RecordingSummary,
 }
 
 /// Writes the samples and declarations of a recording as a table, all columns.
 ///
 /// # Errors
-/// [`ReadError`]. A file that is cut is none: see [`Summary::is_cut`].
-pub fn to_table<W: Write>(recording: impl Read, output: W) -> Result<Summary, ReadError> {
-    let mut table = Table {
+/// [`ReadError`]. A file that is cut is none: see [`RecordingSummary::is_cut`].
+pub fn to_table<W: Write>(recording: impl Read, output: W) -> Result<RecordingSummary, ReadError> {
+    let mut table = SampleTable {
         channels: BTreeMap::new(),
         series: BTreeMap::new(),
         output: Some(output),
         writer: None,
-        summary: Summary::default(),
+        summary: RecordingSummary::default(),
     };
-    let is_known = |table: &Table<W>| !table.series.is_empty();
+    let is_known = |table: &SampleTable<W>| !table.series.is_empty();
     let is_cut = walk(recording, &mut table, is_known, |table, record| {
         match record {
             Record::Channel(channel) => table.know(&channel),
@@ -140,7 +140,7 @@ pub fn to_table<W: Write>(recording: impl Read, output: W) -> Result<Summary, Re
     table.finish()
 }
 
-impl<W: Write> Table<W> {
+impl<W: Write> SampleTable<W> {
     fn know(&mut self, channel: &Channel) {
         let number = channel.metadata.get("series");
         let number = number.and_then(|number| number.parse().ok());
@@ -167,7 +167,7 @@ impl<W: Write> Table<W> {
     fn begin(&mut self) -> Result<(), ReadError> {
         if let Some(output) = self.output.take() {
             let series: Vec<Series> = self.series.values().cloned().collect();
-            self.writer = Some(Writer::new(output, &series, Columns::All)?);
+            self.writer = Some(TableWriter::new(output, &series, Columns::All)?);
             for (number, place, _) in self.channels.values_mut() {
                 *place = self.series.keys().position(|known| known == number);
             }
@@ -198,7 +198,7 @@ impl<W: Write> Table<W> {
         Ok(())
     }
 
-    fn finish(mut self) -> Result<Summary, ReadError> {
+    fn finish(mut self) -> Result<RecordingSummary, ReadError> {
         if self.series.is_empty() {
             return Err(ReadError::Foreign);
         }
@@ -218,8 +218,11 @@ impl<W: Write> Table<W> {
 pub fn frames(
     recording: impl Read,
     mut take: impl FnMut(&str, &Frame) -> io::Result<()>,
-) -> Result<Summary, ReadError> {
-    let mut state = (BTreeMap::<u16, (String, bool)>::new(), Summary::default());
+) -> Result<RecordingSummary, ReadError> {
+    let mut state = (
+        BTreeMap::<u16, (String, bool)>::new(),
+        RecordingSummary::default(),
+    );
     let is_known = |(channels, _): &(BTreeMap<u16, (String, bool)>, _)| !channels.is_empty();
     let is_cut = walk(
         recording,
@@ -295,7 +298,7 @@ pub fn about(recording: impl Read) -> Result<About, ReadError> {
 
 /// The frame in a message of `can_msgs` or `ros2_socketcan_msgs`; `None` if it has none.
 fn frame(is_fd: bool, message: &[u8]) -> Option<Frame> {
-    let mut parsed = Parsed::new(message)?;
+    let mut parsed = CdrReader::new(message)?;
     let t = parsed.time()?;
     let _frame_id = parsed.text()?;
     let id = parsed.u32()?;
@@ -345,9 +348,9 @@ fn series_of(topic: &str) -> Option<Series> {
 
 /// A message's stamp and value; `None` if it is none of its kind.
 fn value(what: What, message: &[u8]) -> Option<(Nanos, Value)> {
-    let mut parsed = Parsed::new(message)?;
+    let mut parsed = CdrReader::new(message)?;
     let t = Nanos(parsed.i64()?);
-    let three = |parsed: &mut Parsed<'_>| Some([parsed.f64()?, parsed.f64()?, parsed.f64()?]);
+    let three = |parsed: &mut CdrReader<'_>| Some([parsed.f64()?, parsed.f64()?, parsed.f64()?]);
     let value = match what {
         What::Channel(kind) => {
             let quality = Quality(parsed.u32()?);

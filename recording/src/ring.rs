@@ -89,10 +89,10 @@ impl Ring {
     ///
     /// # Errors
     /// A part cannot be ended or begun.
-    pub fn snapshot(&mut self, series: &[Series]) -> Result<Snapshot, WriteError> {
+    pub fn snapshot(&mut self, series: &[Series]) -> Result<RingSnapshot, WriteError> {
         self.turn()?;
         let files = self.files.clone();
-        Ok(Snapshot {
+        Ok(RingSnapshot {
             about: About {
                 files,
                 ..self.about.clone()
@@ -108,13 +108,13 @@ impl Ring {
 }
 
 /// What a ring held at an instant. To write it takes a while: another thread can do that.
-pub struct Snapshot {
+pub struct RingSnapshot {
     about: About,
     series: Vec<Series>,
     parts: Vec<Arc<[u8]>>,
 }
 
-impl Snapshot {
+impl RingSnapshot {
     /// Writes it as one recording, with its files.
     ///
     /// # Errors

@@ -2,9 +2,9 @@
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
-use proprio_bridge::cdr::Message;
+use proprio_bridge::cdr::CdrMessage;
 use proprio_bridge::definitions::{self, Definition, MESSAGE, SCHEMA};
-use proprio_bridge::{Messages, Sink};
+use proprio_bridge::{MessageSink, Messages};
 use proprio_drivers::{Format, Frame, Id};
 use proprio_topics::Nanos;
 use proprio_topics::csv::Series;
@@ -35,14 +35,14 @@ pub struct About {
 }
 
 /// The file.
-pub struct File<W: Write + Seek> {
+pub struct McapFile<W: Write + Seek> {
     mcap: Writer<W>,
     sequence: u32,
     /// Of topics that were copied: their channel here.
     copied: BTreeMap<String, u16>,
 }
 
-impl<W: Write + Seek> File<W> {
+impl<W: Write + Seek> McapFile<W> {
     fn begin(output: W, about: &About) -> Result<Self, WriteError> {
         let mut mcap = WriteOptions::new()
             .profile("ros2")
@@ -82,7 +82,7 @@ impl<W: Write + Seek> File<W> {
     }
 }
 
-impl<W: Write + Seek> Sink for File<W> {
+impl<W: Write + Seek> MessageSink for McapFile<W> {
     type Channel = u16;
     type Error = WriteError;
 
@@ -100,7 +100,7 @@ impl<W: Write + Seek> Sink for File<W> {
         Ok(Some(channel))
     }
 
-    fn send(&mut self, channel: &u16, wall: u64, message: &Message) -> Result<(), WriteError> {
+    fn send(&mut self, channel: &u16, wall: u64, message: &CdrMessage) -> Result<(), WriteError> {
         let header = MessageHeader {
             channel_id: *channel,
             sequence: self.sequence,
@@ -114,7 +114,7 @@ impl<W: Write + Seek> Sink for File<W> {
 
 /// Writes what one robot sends into one file.
 pub struct Recorder<W: Write + Seek> {
-    messages: Messages<File<W>>,
+    messages: Messages<McapFile<W>>,
 }
 
 impl<W: Write + Seek> Recorder<W> {
@@ -124,7 +124,7 @@ impl<W: Write + Seek> Recorder<W> {
     /// # Errors
     /// The file cannot be written.
     pub fn new(output: W, about: &About, series: &[Series]) -> Result<Self, WriteError> {
-        let file = File::begin(output, about)?;
+        let file = McapFile::begin(output, about)?;
         let mut messages = Messages::new(file, &about.robot, about.offset);
         messages.know(series)?;
         messages.announce()?;
@@ -136,7 +136,7 @@ impl<W: Write + Seek> Recorder<W> {
     /// # Errors
     /// A file cannot be written.
     pub fn turn_to(&mut self, output: W, about: &About) -> Result<W, WriteError> {
-        let file = File::begin(output, about)?;
+        let file = McapFile::begin(output, about)?;
         let mut ended = self.messages.turn_to(file, about.offset)?;
         ended.mcap.finish()?;
         Ok(ended.mcap.into_inner())
@@ -153,7 +153,7 @@ impl<W: Write + Seek> Recorder<W> {
             false => (format!("/can/{bus}"), definitions::classic_frame),
         };
         self.messages.send(&topic, definition, frame.t, |wall| {
-            let mut message = Message::stamped(wall, bus);
+            let mut message = CdrMessage::stamped(wall, bus);
             message.u32(frame.id.raw());
             if !is_fd {
                 message.bool(frame.format == Format::Remote);
@@ -217,7 +217,7 @@ impl<W: Write + Seek> Recorder<W> {
 }
 
 impl<W: Write + Seek> Deref for Recorder<W> {
-    type Target = Messages<File<W>>;
+    type Target = Messages<McapFile<W>>;
 
     fn deref(&self) -> &Self::Target {
         &self.messages

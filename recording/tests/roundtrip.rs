@@ -6,7 +6,7 @@ use proprio_drivers::{Format, Frame, Id};
 use proprio_recording::{
     About, ReadError, Recorder, Ring, about, frames, is_mcap, to_estimates, to_table,
 };
-use proprio_topics::csv::{Columns, Series, Value, What, Writer};
+use proprio_topics::csv::{Columns, Series, TableWriter, Value, What};
 use proprio_topics::{
     ContactEstimate, ContactState, ContactWrench, Description, Entry, Header, JointTorque, Kind,
     MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Nanos, Publisher, Quality, Reading, Reason,
@@ -76,7 +76,7 @@ fn values(numbers: &[f64], count: usize) -> Vec<(Nanos, usize, Value)> {
 }
 
 fn table(values: &[(Nanos, usize, Value)]) -> Vec<u8> {
-    let mut writer = Writer::new(Vec::new(), &series(), Columns::All).unwrap();
+    let mut writer = TableWriter::new(Vec::new(), &series(), Columns::All).unwrap();
     for (t, series, value) in values {
         writer.push(Some(*t), *series, value).unwrap();
     }

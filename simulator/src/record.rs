@@ -6,7 +6,7 @@ use crate::settings::Settings;
 use crate::simulator::{BusCounts, Simulator, SimulatorError};
 use crate::truth::Simulation;
 use proprio_drivers::{Frame, State};
-use proprio_gateway::config::Source;
+use proprio_gateway::config::FrameSource;
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::link::adapter::Adapter;
 use proprio_gateway::log::candump::write_log_line;
@@ -185,8 +185,8 @@ impl Host<'_> {
 /// The interface name of `bus` in a log.
 fn interface(bus: &BusPlan) -> &str {
     match &bus.source {
-        Source::SocketCan(Adapter::Interface(name)) | Source::Virtual { name } => name,
-        Source::SocketCan(_) | Source::Replay { .. } => &bus.name,
+        FrameSource::SocketCan(Adapter::Interface(name)) | FrameSource::Virtual { name } => name,
+        FrameSource::SocketCan(_) | FrameSource::Replay { .. } => &bus.name,
     }
 }
 

@@ -37,7 +37,7 @@ pub enum RobotError {
     },
     /// gateway.toml is wrong.
     #[error(transparent)]
-    Gateway(#[from] proprio_gateway::plan::ConfigError),
+    Gateway(#[from] proprio_gateway::plan::PlanError),
     /// estimator.toml is wrong.
     #[error(transparent)]
     Estimator(#[from] proprio_estimator::config::ConfigError),

@@ -8,7 +8,7 @@ use crate::simulator::{BusCounts, BusSimulator, Simulator};
 use crate::truth::{PlannedPush, Simulation, Touch};
 use anyhow::Context as _;
 use proprio_gateway::clock::{Clock, Monotonic};
-use proprio_gateway::config::Source;
+use proprio_gateway::config::FrameSource;
 use proprio_gateway::daemon::open_link;
 use proprio_gateway::link::adapter::Adapter;
 use proprio_gateway::link::{Link, LinkCounters, Received, send_by};
@@ -41,7 +41,7 @@ const SEND_WITHIN: Nanos = Nanos::from_millis(20);
 pub struct Options {
     /// The buses, in the order of gateway.toml: `can0` or `virtual:NAME` ([`parse_bus`]). Empty:
     /// the sources that gateway.toml gives.
-    pub buses: Vec<Source>,
+    pub buses: Vec<FrameSource>,
     /// The domain of virtual buses: the gateway's.
     pub domain: String,
     /// Duration; `None`: until it is stopped.
@@ -89,13 +89,13 @@ pub enum OptionsError {
 ///
 /// # Errors
 /// [`OptionsError::Bus`].
-pub fn parse_bus(text: &str) -> Result<Source, OptionsError> {
+pub fn parse_bus(text: &str) -> Result<FrameSource, OptionsError> {
     match text.split_once(':') {
-        Some(("virtual", name)) if !name.is_empty() => Ok(Source::Virtual {
+        Some(("virtual", name)) if !name.is_empty() => Ok(FrameSource::Virtual {
             name: name.to_owned(),
         }),
         None if !text.is_empty() && text.len() <= 15 && text != "virtual" => {
-            Ok(Source::SocketCan(Adapter::Interface(text.to_owned())))
+            Ok(FrameSource::SocketCan(Adapter::Interface(text.to_owned())))
         }
         _ => Err(OptionsError::Bus(text.to_owned())),
     }
@@ -376,14 +376,14 @@ fn feel(
     }
 }
 
-fn sources(robot: &Robot, options: &Options) -> Result<Vec<Source>, OptionsError> {
+fn sources(robot: &Robot, options: &Options) -> Result<Vec<FrameSource>, OptionsError> {
     if let Some(seconds) = options.seconds
         && !(seconds > 0.0 && seconds.is_finite())
     {
         return Err(OptionsError::Seconds(seconds));
     }
     let plans = &robot.plan.buses;
-    let own: Vec<Source> = plans.iter().map(|b| b.source.clone()).collect();
+    let own: Vec<FrameSource> = plans.iter().map(|b| b.source.clone()).collect();
     let sources = if options.buses.is_empty() {
         own
     } else {
@@ -397,7 +397,7 @@ fn sources(robot: &Robot, options: &Options) -> Result<Vec<Source>, OptionsError
         });
     }
     for (number, (source, plan)) in sources.iter().zip(plans).enumerate() {
-        if matches!(source, Source::Replay { .. }) {
+        if matches!(source, FrameSource::Replay { .. }) {
             return Err(OptionsError::Replay(plan.name.clone()));
         }
         if sources.iter().take(number).any(|other| other == source) {
@@ -407,11 +407,11 @@ fn sources(robot: &Robot, options: &Options) -> Result<Vec<Source>, OptionsError
     Ok(sources)
 }
 
-fn source_text(source: &Source) -> String {
+fn source_text(source: &FrameSource) -> String {
     match source {
-        Source::SocketCan(adapter) => adapter.to_string(),
-        Source::Virtual { name } => format!("virtual:{name}"),
-        Source::Replay { log, .. } => log.display().to_string(),
+        FrameSource::SocketCan(adapter) => adapter.to_string(),
+        FrameSource::Virtual { name } => format!("virtual:{name}"),
+        FrameSource::Replay { log, .. } => log.display().to_string(),
     }
 }
 
@@ -425,7 +425,7 @@ mod tests {
     use super::*;
     use proprio_drivers::Frame;
     use proprio_gateway::decoder::Decoder;
-    use proprio_gateway::link::SendError;
+    use proprio_gateway::link::TransmitError;
     use proprio_gateway::status::BusStatus;
     use proprio_topics::{Counter, LinkState};
     use std::collections::VecDeque;
@@ -470,7 +470,7 @@ mod tests {
             }
         }
 
-        fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
+        fn send(&mut self, frame: &Frame) -> Result<(), TransmitError> {
             let now = Nanos(self.clock.0.fetch_add(10_000_000, Relaxed));
             self.gateway
                 .on_frame(&frame.at(now, proprio_topics::StampKind::Software), |_| {});

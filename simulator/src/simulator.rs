@@ -19,7 +19,7 @@ use crate::robot::{Robot, RobotError};
 use crate::settings::Settings;
 use crate::truth::Simulation;
 use proprio_drivers::{Board, Frame, Frames, Options, Spec};
-use proprio_gateway::joints::{Inverse, Layout};
+use proprio_gateway::joints::{Inverse, JointsPlan};
 use proprio_gateway::plan::DevicePlan;
 use proprio_topics::{
     Actuator, Imu, JointState, Kind, Nanos, Quality, Reading, Saturation, StampKind, Wrench,
@@ -427,7 +427,7 @@ impl Node {
     ) -> Result<Self, RobotError> {
         let mut random = Random::new(settings.seed, "board", stream);
         let mut node = Self {
-            kinds: device.routes.iter().map(|route| route.kind).collect(),
+            kinds: device.outputs.iter().map(|output| output.kind).collect(),
             board: power_on(robot, device)?,
             options: device.options.clone(),
             spec: device.spec.clone(),
@@ -585,24 +585,24 @@ fn sources(
     robot: &Robot,
     simulation: &Simulation,
     device: &DevicePlan,
-    joints: &Layout,
+    joints: &JointsPlan,
 ) -> Result<Vec<(u8, Source)>, RobotError> {
     let mut outputs = Vec::new();
-    for route in &device.routes {
+    for output in &device.outputs {
         let name = |channel: u32| {
             let channel = robot.plan.channels.get(channel as usize);
             channel.map_or("", |channel| channel.name.as_str())
         };
-        let of_route = name(route.channel);
+        let sensor = name(output.channel);
         let missing = |name: &str, problem: &str| {
             robot.mismatch(format!("gateway.toml has {name:?}: {problem}"))
         };
-        let source = match route.kind {
+        let source = match output.kind {
             Kind::Joint => {
-                let inverse = route
-                    .feed
+                let inverse = output
+                    .input
                     .as_ref()
-                    .and_then(|f| joints.inverse(f, route.map));
+                    .and_then(|f| joints.inverse(f, output.map));
                 let Some(inverse) = inverse else { continue };
                 let number = |channel: &u32| {
                     let no_joint = "the URDF has no moving joint of that name";
@@ -615,33 +615,33 @@ fn sources(
                 Source::Shaft(inverse, joints)
             }
             Kind::Wrench => {
-                let number = simulation.wrench(of_route);
+                let number = simulation.wrench(sensor);
                 let number = number.ok_or_else(|| {
                     missing(
-                        of_route,
+                        sensor,
                         "estimator.toml has no [[force_torque]] with that sensor",
                     )
                 })?;
                 let ft = robot.config.force_torque.get(number);
-                let ft = ft.ok_or_else(|| missing(of_route, "it is not configured"))?;
+                let ft = ft.ok_or_else(|| missing(sensor, "it is not configured"))?;
                 Source::Wrench(number, ft.noise_n, ft.noise_nm)
             }
-            Kind::Imu => Source::Imu(simulation.imu(of_route).ok_or_else(|| {
+            Kind::Imu => Source::Imu(simulation.imu(sensor).ok_or_else(|| {
                 missing(
-                    of_route,
+                    sensor,
                     "its place is not known: it is not the [base] of estimator.toml, and no link \
                      of the URDF has its name",
                 )
             })?),
             // A skin that estimator.toml does not place feels nothing.
-            Kind::Skin => match simulation.skin(of_route) {
+            Kind::Skin => match simulation.skin(sensor) {
                 Some(skin) => Source::Skin(skin),
                 None => continue,
             },
             // What is not simulated is silent.
             Kind::Gauges | Kind::Temperature | Kind::Actuator => continue,
         };
-        outputs.push((route.output, source));
+        outputs.push((output.number, source));
     }
     Ok(outputs)
 }

@@ -1,7 +1,7 @@
 //! Whole sessions: recorded offline and decoded by the gateway, and live on a virtual bus.
 
 use proprio_gateway::clock::{Clock, Monotonic};
-use proprio_gateway::config::Source;
+use proprio_gateway::config::FrameSource;
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::link::adapter::Adapter;
 use proprio_gateway::link::virtual_bus::VirtualBus;
@@ -13,7 +13,7 @@ use proprio_simulator::{
     Options, OptionsError, Robot, Settings, Simulation, is_configuration, parse_bus, run,
     run_with_skin,
 };
-use proprio_topics::csv::{Columns, Reader, Row, Value};
+use proprio_topics::csv::{Columns, Row, TableReader, Value};
 use proprio_topics::{Counter, Nanos, Reading};
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -109,7 +109,7 @@ fn the_truth_is_a_sample_log() {
     )
     .unwrap();
     assert_eq!(rows, 251);
-    let mut reader = Reader::new(&table[..]).unwrap();
+    let mut reader = TableReader::new(&table[..]).unwrap();
     let series = reader.series().to_vec();
     let (mut row, mut read) = (Row::default(), 0);
     while reader.next_row(&mut row).unwrap() {
@@ -332,7 +332,7 @@ fn the_skin_tells_of_each_touch_ahead_of_it() {
 #[test]
 fn options_that_can_not_be_followed_are_told() {
     let run = |options: Options| run(&robot(), &options, &AtomicBool::new(true)).unwrap_err();
-    let virtual_bus = |name: &str| Source::Virtual { name: name.into() };
+    let virtual_bus = |name: &str| FrameSource::Virtual { name: name.into() };
     for (options, expected) in [
         (
             Options {
@@ -386,7 +386,7 @@ fn options_that_can_not_be_followed_are_told() {
     assert_eq!(parse_bus("virtual:left_arm"), Ok(virtual_bus("left_arm")));
     assert_eq!(
         parse_bus("vcan0"),
-        Ok(Source::SocketCan(Adapter::Interface("vcan0".into())))
+        Ok(FrameSource::SocketCan(Adapter::Interface("vcan0".into())))
     );
     for wrong in ["", "virtual", "virtual:", "udp:x", "an_interface_too_long"] {
         assert_eq!(parse_bus(wrong), Err(OptionsError::Bus(wrong.into())));

@@ -29,7 +29,7 @@ use proprio_gateway::bus::Bus;
 use proprio_gateway::clock::Clock;
 use proprio_gateway::decoder::{Decoder, build};
 use proprio_gateway::plan::{ChannelPlan, DevicePlan, Plan};
-use proprio_gateway::publish::Shared;
+use proprio_gateway::publish::SharedMemory;
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::fault::{Fault as BoardFault, Window};
 use proprio_simulator::{Settings, Simulation};
@@ -192,7 +192,7 @@ fn at(t: f64) -> Nanos {
 
 /// The gateway's side of one bus.
 struct Running {
-    bus: Bus<Shared>,
+    bus: Bus<SharedMemory>,
     status: Arc<BusStatus>,
     clock: SimulatedClock,
     /// What the wire had delivered when it was started.
@@ -359,7 +359,7 @@ impl Chain {
             let status = Arc::new(BusStatus::new(number, plan));
             let decoder = Decoder::new(number, plan, None, Arc::clone(&status)).expect("devices");
             let writer = Writer::create(&self.domain, &self.plan.robot, epoch).expect("a port");
-            let sink = Shared::new(writer, &self.plan.robot, Arc::new(Renewal::default()));
+            let sink = SharedMemory::new(writer, &self.plan.robot, Arc::new(Renewal::default()));
             let end = self.wires[number as usize].clone();
             self.buses.push(Running {
                 before: end.with(|wire| wire.passed.delivered),
@@ -609,7 +609,7 @@ impl Chain {
 
     fn finish(mut self) -> Shown {
         let is_silent = |(health, plan): &(DeviceHealth, &DevicePlan)| {
-            !plan.routes.is_empty() && health.state.get() != Some(DeviceState::Streaming)
+            !plan.outputs.is_empty() && health.state.get() != Some(DeviceState::Streaming)
         };
         let mut silent = Vec::new();
         for (running, plan) in self.buses.iter().zip(&self.plan.buses) {

@@ -154,7 +154,7 @@ fn arm(change: impl FnOnce(&mut Config)) -> Setup {
 
 /// Records are at most as many as bytes: it ends.
 fn read_log(bytes: &[u8]) -> bool {
-    let mut reader = log::Reader::new(bytes);
+    let mut reader = log::LogReader::new(bytes);
     let mut records = 0;
     while let Ok(Some(_)) = reader.next_record() {
         records += 1;
@@ -165,7 +165,7 @@ fn read_log(bytes: &[u8]) -> bool {
 }
 
 fn read_table(bytes: &[u8]) -> bool {
-    let Ok(mut reader) = csv::Reader::new(bytes) else {
+    let Ok(mut reader) = csv::TableReader::new(bytes) else {
         return false;
     };
     let mut rows = 0;

@@ -226,7 +226,7 @@ impl Recorder {
             .collect();
         let out = File::create(file).expect("a file in a temporary folder");
         let mut writer =
-            csv::Writer::new(out, &series, Columns::Main).expect("a table can be written");
+            csv::TableWriter::new(out, &series, Columns::Main).expect("a table can be written");
         let mut samples: Vec<&Sample> = self
             .taken
             .iter()
@@ -291,8 +291,8 @@ fn exact(reading: &Reading, quality: proprio_topics::Quality) -> String {
 /// If it is not a table of samples.
 #[must_use]
 pub fn table_by_channel(file: &Path) -> BTreeMap<String, Vec<String>> {
-    let mut reader =
-        csv::Reader::new(BufReader::new(File::open(file).expect("the table"))).expect("a table");
+    let mut reader = csv::TableReader::new(BufReader::new(File::open(file).expect("the table")))
+        .expect("a table");
     let names: Vec<String> = reader.series().iter().map(|s| s.name.clone()).collect();
     let mut channels: BTreeMap<String, Vec<String>> = BTreeMap::new();
     let mut row = csv::Row::default();
@@ -323,8 +323,9 @@ impl Truth {
     /// If it is not such a table.
     #[must_use]
     pub fn read(file: &Path, joints: &[&str]) -> Self {
-        let mut reader = csv::Reader::new(BufReader::new(File::open(file).expect("the truth")))
-            .expect("a table");
+        let mut reader =
+            csv::TableReader::new(BufReader::new(File::open(file).expect("the truth")))
+                .expect("a table");
         let series: Vec<usize> = joints
             .iter()
             .map(|j| {

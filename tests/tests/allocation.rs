@@ -28,7 +28,7 @@ use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, Received, send_by};
 use proprio_gateway::log;
 use proprio_gateway::plan::Plan;
-use proprio_gateway::publish::{Memory, Shared, Sink};
+use proprio_gateway::publish::{Memory, SharedMemory, Sink};
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::record::record;
 use proprio_simulator::{Robot, Settings, Simulator};
@@ -219,7 +219,7 @@ fn run_bus<S: Sink>(
             let replacement = Replacement {
                 device: Some(build(device, None).expect("a device")),
                 max_silence: device.spec.max_silence,
-                routes: device.routes.clone(),
+                outputs: device.outputs.clone(),
             };
             (number, Request::Replace(replacement))
         })
@@ -360,7 +360,7 @@ fn a_bus_that_publishes_allocates_the_transports_loan_alone() {
             let writer =
                 Writer::<Sample>::create(&domain, &format!("bus{number}"), domain.epoch()).unwrap();
             reader = Some(Reader::<Sample>::open(&domain, &format!("bus{number}")).unwrap());
-            Shared::new(writer, "robot", Arc::default())
+            SharedMemory::new(writer, "robot", Arc::default())
         });
         let sends = usize::try_from(published).unwrap();
         assert_eq!(
@@ -390,7 +390,7 @@ fn session(robot: &Robot, seconds: f64) -> Vec<(usize, Frame)> {
         &mut log,
     )
     .unwrap();
-    let mut reader = log::Reader::new(&log[..]);
+    let mut reader = log::LogReader::new(&log[..]);
     let mut frames = Vec::new();
     while let Some(record) = reader.next_record().unwrap() {
         let takes = |bus: &usize| {

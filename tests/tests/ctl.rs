@@ -362,7 +362,8 @@ fn a_calibration_is_read_and_what_is_wrong_is_told() {
     some(&mut recorder, sensor, began);
     assert_continuous(&recorder, &[], began);
 
-    let proprio_gateway::config::Source::Virtual { name } = &running.arm.robot.plan.buses[0].source
+    let proprio_gateway::config::FrameSource::Virtual { name } =
+        &running.arm.robot.plan.buses[0].source
     else {
         panic!("a virtual bus")
     };

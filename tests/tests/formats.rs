@@ -3,7 +3,7 @@
 #![allow(missing_docs)]
 
 use proprio_drivers::{Format, Frame, Id};
-use proprio_gateway::log::Reader;
+use proprio_gateway::log::LogReader;
 use proprio_simulator::record::record;
 use proprio_simulator::{Robot, Settings};
 use proprio_tests::watch::Recorder;
@@ -22,7 +22,7 @@ const BUSES: [&str; 2] = ["can0", "can1"];
 fn session(robot: &Robot, seconds: f64) -> (Vec<(Nanos, usize, Frame)>, Vec<u8>) {
     let mut log = Vec::new();
     record(robot, &Settings::default(), seconds, T0, &mut log).expect("memory can be written");
-    let mut reader = Reader::new(&log[..]);
+    let mut reader = LogReader::new(&log[..]);
     let mut frames = Vec::new();
     while let Some(record) = reader.next_record().expect("memory can be read") {
         let channel = BUSES.iter().position(|bus| *bus == record.interface);

@@ -21,7 +21,7 @@ use proprio_estimator::setup::Setup;
 use proprio_estimator::{files, reading};
 use proprio_identification::online::{Change, Counts, Paused};
 use proprio_identification::{FindingCode, Options, Outcome, Role, Severity, Verdict, identify};
-use proprio_topics::csv::{Item, Reader, Row, Value, What};
+use proprio_topics::csv::{Row, SeriesValue, TableReader, Value, What};
 use proprio_topics::{InertiaEstimate, Nanos, Quality, Reading};
 use serde_json::Value as Json;
 use std::collections::{BTreeMap, BTreeSet};
@@ -873,7 +873,7 @@ fn told_by(setup: Setup, log: &str, delay: usize, end: &mut Option<Pipeline>) ->
 fn told_from(log: &str, delay: usize, end: &mut Option<Pipeline>) -> Told {
     let mut pipeline = end.take().expect("a pipeline");
     assert!(pipeline.identification_refused().is_none());
-    let mut reader = Reader::new(log.as_bytes()).unwrap();
+    let mut reader = TableReader::new(log.as_bytes()).unwrap();
     let series: Vec<_> = reader
         .series()
         .iter()
@@ -884,7 +884,7 @@ fn told_from(log: &str, delay: usize, end: &mut Option<Pipeline>) -> Told {
     loop {
         let more = reader.next_row(&mut row).unwrap();
         if more {
-            for Item {
+            for SeriesValue {
                 series: number,
                 value,
             } in &row.items
@@ -1204,7 +1204,7 @@ fn inertias_by(
     end: &mut Option<Pipeline>,
 ) -> (Vec<(Nanos, InertiaEstimate)>, Counts) {
     let mut pipeline = Pipeline::new(setup);
-    let mut reader = Reader::new(log.as_bytes()).unwrap();
+    let mut reader = TableReader::new(log.as_bytes()).unwrap();
     let series: Vec<_> = reader
         .series()
         .iter()
@@ -1212,7 +1212,7 @@ fn inertias_by(
         .collect();
     let (mut row, mut told) = (Row::default(), vec![]);
     while reader.next_row(&mut row).unwrap() {
-        for Item {
+        for SeriesValue {
             series: number,
             value,
         } in &row.items

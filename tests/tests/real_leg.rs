@@ -143,7 +143,7 @@ type Values = HashMap<(Kind, String), Vec<(Nanos, Vec<f64>)>>;
 
 /// All values of a table by kind, channel and instant.
 fn values(table: &str) -> Values {
-    let mut reader = csv::Reader::new(table.as_bytes()).expect("a table");
+    let mut reader = csv::TableReader::new(table.as_bytes()).expect("a table");
     let series = reader.series().to_vec();
     let (mut row, mut values) = (Row::default(), HashMap::<_, Vec<_>>::new());
     while reader.next_row(&mut row).expect("a row") {
@@ -267,7 +267,7 @@ fn played_onto_virtual_buses_the_live_estimates_are_those_of_the_samples_receive
                 .each_ref()
                 .map(|name| VirtualBus::open(&domain, name, &[]).expect("a virtual bus"));
             let file = std::fs::File::open(log).expect("the log");
-            let mut reader = log::Reader::new(std::io::BufReader::new(file));
+            let mut reader = log::LogReader::new(std::io::BufReader::new(file));
             let begin = now();
             let mut first = None;
             while let Some(record) = reader.next_record().expect("the log") {
@@ -660,7 +660,7 @@ fn real_sensors_are_said_to_be_frozen_only_where_they_are() {
         let (mut log, mut decoded) = (Vec::new(), Vec::new());
         encode(&plan, table.as_bytes(), &mut log).expect("frames");
         decode(&plan, &log[..], &mut decoded, Columns::Main).expect("samples");
-        let mut reader = csv::Reader::new(&decoded[..]).expect("a table");
+        let mut reader = csv::TableReader::new(&decoded[..]).expect("a table");
         let series = reader.series().to_vec();
         // Per sensor: the last reading, how often it was repeated, and its first stamp.
         let mut past: HashMap<usize, (Reading, u32, Nanos)> = HashMap::new();

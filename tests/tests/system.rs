@@ -6,7 +6,7 @@ use nix::sys::stat::Mode;
 use nix::unistd::{Pid, mkfifo};
 use proprio_tests::watch::{Newest, open, valid_since};
 use proprio_tests::{Arm, PATIENCE, Rig, now, until};
-use proprio_topics::csv::{Reader, Row, Value, What};
+use proprio_topics::csv::{Row, TableReader, Value, What};
 use proprio_topics::{GatewayHealth, Kind, Nanos, TorqueEstimate};
 use serde_json::Value as Json;
 use std::fs::{self, File};
@@ -178,7 +178,7 @@ fn a_running_system_says_what_it_does() {
         log.contains("the gateway was restarted: a gap of "),
         "{log}"
     );
-    let mut reader = Reader::new(File::open(&table).expect("a table")).expect("a table");
+    let mut reader = TableReader::new(File::open(&table).expect("a table")).expect("a table");
     let series = reader.series().to_vec();
     assert!(
         series

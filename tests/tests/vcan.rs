@@ -1022,7 +1022,7 @@ fn play(frames: &[(Nanos, usize, Frame)], mut meanwhile: impl FnMut()) {
 
 /// The frames of a log in order, with those of the second interface delayed by `skew`.
 fn skewed(log: &Path, interfaces: [&str; 2], skew: Nanos) -> Vec<(Nanos, usize, Frame)> {
-    let mut reader = log::Reader::new(BufReader::new(File::open(log).expect("the log")));
+    let mut reader = log::LogReader::new(BufReader::new(File::open(log).expect("the log")));
     let mut frames = Vec::new();
     while let Some(record) = reader.next_record().expect("a log") {
         let interface = interfaces

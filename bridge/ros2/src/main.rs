@@ -13,7 +13,7 @@ mod node;
 
 use anyhow::Context;
 use clap::Parser;
-use node::{Node, NodeError, Options};
+use node::{NodeError, NodeOptions, RosNode};
 use proprio_bridge::{ListenError, Listener, Messages};
 use proprio_gateway::clock::{realtime_offset, sleep_until};
 use proprio_topics::Nanos;
@@ -36,7 +36,7 @@ const WAIT: Nanos = Nanos::from_millis(100);
 /// Exit codes: 0 success, 2 wrong command line or variable, 1 any other failure.
 #[derive(Parser)]
 #[command(name = "proprio-ros2", version, about)]
-struct Args {
+struct Ros2Args {
     /// The robot; default: the only one
     #[arg(long, value_name = "NAME")]
     robot: Option<String>,
@@ -82,7 +82,7 @@ fn identifier(distro: Option<&str>) -> usize {
 }
 
 fn main() -> ExitCode {
-    let args = Args::parse();
+    let args = Ros2Args::parse();
     let variable = |name: &str| std::env::var(name).ok();
     let addresses = match network::addresses(&args.interface, variable) {
         Ok(addresses) => addresses,
@@ -94,7 +94,7 @@ fn main() -> ExitCode {
     if variable("ROS_STATIC_PEERS").is_some_and(|peers| !peers.is_empty()) {
         eprintln!("ROS_STATIC_PEERS is not supported: nodes are found by multicast");
     }
-    let options = Options {
+    let options = NodeOptions {
         namespace: args.namespace.clone(),
         domain: args.domain_id,
         addresses,
@@ -123,7 +123,7 @@ enum Failure {
 }
 
 /// Follows the robot until a signal comes.
-fn run(args: &Args, options: Options) -> anyhow::Result<()> {
+fn run(args: &Ros2Args, options: NodeOptions) -> anyhow::Result<()> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [
         signal_hook::consts::SIGINT,
@@ -136,7 +136,7 @@ fn run(args: &Args, options: Options) -> anyhow::Result<()> {
     if let Some(name) = &args.domain {
         config.name.clone_from(name);
     }
-    let node = Node::new(options)?;
+    let node = RosNode::new(options)?;
     let say = |why: &str| eprintln!("waiting: {why}");
     let opened = Listener::wait_open(&config, args.robot.as_deref(), &stop, say)?;
     let Some(mut listener) = opened else {
@@ -187,7 +187,7 @@ mod tests {
 
     #[test]
     fn the_command_line_is_consistent() {
-        Args::command().debug_assert();
+        Ros2Args::command().debug_assert();
     }
 
     #[test]

@@ -20,13 +20,13 @@ fn legal(text: &str) -> String {
 
 /// The names of all topics in a namespace.
 #[derive(Debug)]
-pub(crate) struct Topics {
+pub(crate) struct TopicNames {
     namespace: String,
     /// Of each name that is taken: whose it is.
     taken: BTreeMap<String, String>,
 }
 
-impl Topics {
+impl TopicNames {
     /// `namespace` as [`namespace`] gives it.
     pub(crate) fn new(namespace: &str) -> Self {
         Self {
@@ -100,7 +100,7 @@ mod tests {
 
     #[test]
     fn names_become_legal() {
-        let mut topics = Topics::new("");
+        let mut topics = TopicNames::new("");
         for (topic, name) in [
             ("/joint_states", "/joint_states"),
             ("/imu/chest_imu", "/imu/chest_imu"),
@@ -117,7 +117,7 @@ mod tests {
 
     #[test]
     fn two_topics_have_two_names() {
-        let mut topics = Topics::new("/left");
+        let mut topics = TopicNames::new("/left");
         assert_eq!(topics.of("/ft/a-b"), "/left/ft/a_b");
         assert_eq!(topics.of("/ft/a.b"), "/left/ft/a_b_2");
         assert_eq!(topics.of("/ft/a b"), "/left/ft/a_b_3");

@@ -1,9 +1,9 @@
 //! A node of ROS 2: a participant of DDS that publishes messages and says which of its writers
 //! belong to the node, so that `ros2 node` and `ros2 topic` show them.
 
-use crate::names::{Topics, dds_topic, dds_type};
-use proprio_bridge::Sink;
-use proprio_bridge::cdr::Message;
+use crate::names::{TopicNames, dds_topic, dds_type};
+use proprio_bridge::MessageSink;
+use proprio_bridge::cdr::CdrMessage;
 use proprio_bridge::definitions::Definition;
 use proprio_topics::Nanos;
 use rustdds::bytes::Bytes;
@@ -59,7 +59,7 @@ pub(crate) enum NodeError {
 
 /// What a node is.
 #[derive(Debug, Clone)]
-pub(crate) struct Options {
+pub(crate) struct NodeOptions {
     /// Of all topics and the node, as [`crate::names::namespace`] gives it.
     pub(crate) namespace: String,
     /// The domain of DDS.
@@ -74,11 +74,11 @@ pub(crate) struct Options {
     pub(crate) identifier: usize,
 }
 
-/// Messages come encoded: [`Message`] without the four bytes that [`Encoded::output_encoding`]
-/// stands for.
-struct Encoded;
+/// Messages come encoded: [`CdrMessage`] without the four bytes that
+/// [`CdrAdapter::output_encoding`] stands for.
+struct CdrAdapter;
 
-impl SerializerAdapter<Bytes> for Encoded {
+impl SerializerAdapter<Bytes> for CdrAdapter {
     type Error = Infallible;
 
     fn output_encoding() -> RepresentationIdentifier {
@@ -90,7 +90,7 @@ impl SerializerAdapter<Bytes> for Encoded {
     }
 }
 
-fn body(message: &Message) -> Bytes {
+fn body(message: &CdrMessage) -> Bytes {
     Bytes::copy_from_slice(message.bytes().get(4..).unwrap_or_default())
 }
 
@@ -102,14 +102,14 @@ fn timestamp(wall: u64) -> Timestamp {
 
 /// Lets messages of a topic pass at most at a rate, evenly.
 #[derive(Debug, Clone, Copy)]
-struct Pace {
+struct RateLimit {
     /// Between two messages \[ns\].
     period: u64,
     /// The next one is due \[ns since 1970, UTC\].
     due: u64,
 }
 
-impl Pace {
+impl RateLimit {
     fn new(rate: f64) -> Self {
         Self {
             period: (1e9 / rate) as u64,
@@ -133,11 +133,11 @@ impl Pace {
     }
 }
 
-struct Topic {
+struct NodeTopic {
     name: String,
     kind: String,
-    writer: DataWriter<Bytes, Encoded>,
-    pace: Option<Pace>,
+    writer: DataWriter<Bytes, CdrAdapter>,
+    pace: Option<RateLimit>,
     /// What could not be written yet, with its stamp.
     waiting: VecDeque<(Bytes, Timestamp)>,
     /// Since when (CLOCK_MONOTONIC).
@@ -146,7 +146,7 @@ struct Topic {
     is_told: bool,
 }
 
-impl Topic {
+impl NodeTopic {
     /// Writes what waits, as far as readers acknowledge.
     fn write(&mut self) -> Result<(), NodeError> {
         while let Some((message, stamp)) = self.waiting.front() {
@@ -166,24 +166,24 @@ impl Topic {
 }
 
 /// The node.
-pub(crate) struct Node {
-    options: Options,
+pub(crate) struct RosNode {
+    options: NodeOptions,
     participant: DomainParticipant,
     publisher: Publisher,
-    names: Topics,
-    topics: Vec<Topic>,
+    names: TopicNames,
+    topics: Vec<NodeTopic>,
     /// The time (CLOCK_MONOTONIC).
     now: Nanos,
     /// Says which nodes are in this participant.
-    graph: DataWriter<Bytes, Encoded>,
+    graph: DataWriter<Bytes, CdrAdapter>,
 }
 
-impl Node {
+impl RosNode {
     /// Joins the network.
     ///
     /// # Errors
     /// DDS cannot be used here.
-    pub(crate) fn new(options: Options) -> Result<Self, NodeError> {
+    pub(crate) fn new(options: NodeOptions) -> Result<Self, NodeError> {
         let failed = |what: &str| {
             let (what, domain) = (what.to_owned(), options.domain);
             move |error: CreateError| NodeError::Create {
@@ -214,7 +214,7 @@ impl Node {
         );
         let node = Self {
             graph: graph.map_err(failed("ros_discovery_info"))?,
-            names: Topics::new(&options.namespace),
+            names: TopicNames::new(&options.namespace),
             topics: Vec::new(),
             now: Nanos::ZERO,
             participant,
@@ -278,7 +278,7 @@ impl Node {
     }
 
     /// A writer of the topic `name` of messages of `kind`.
-    fn writer(&self, name: &str, kind: &str) -> Result<DataWriter<Bytes, Encoded>, NodeError> {
+    fn writer(&self, name: &str, kind: &str) -> Result<DataWriter<Bytes, CdrAdapter>, NodeError> {
         let (topic, kind) = (dds_topic(name), dds_type(kind));
         let made = writer(
             &self.participant,
@@ -296,11 +296,11 @@ impl Node {
 
     /// Publishes `rmw_dds_common/ParticipantEntitiesInfo` with this node.
     fn say_who_it_is(&self) -> Result<(), NodeError> {
-        let identifier = |message: &mut Message, guid: GUID| {
+        let identifier = |message: &mut CdrMessage, guid: GUID| {
             let bytes = guid.to_bytes().into_iter().chain(std::iter::repeat(0));
             (bytes.take(self.options.identifier)).for_each(|byte| message.u8(byte));
         };
-        let mut message = Message::new();
+        let mut message = CdrMessage::new();
         identifier(&mut message, self.participant.guid());
         message.count(1);
         message.text(match self.options.namespace.as_str() {
@@ -327,13 +327,13 @@ fn writer(
     topic: &str,
     kind: &str,
     qos: &QosPolicies,
-) -> Result<DataWriter<Bytes, Encoded>, CreateError> {
+) -> Result<DataWriter<Bytes, CdrAdapter>, CreateError> {
     let kind = kind.to_owned();
     let topic = participant.create_topic(topic.to_owned(), kind, qos, TopicKind::NoKey)?;
     publisher.create_datawriter_no_key(&topic, None)
 }
 
-impl Sink for Node {
+impl MessageSink for RosNode {
     type Channel = usize;
     type Error = NodeError;
 
@@ -349,11 +349,11 @@ impl Sink for Node {
         }
         let name = self.names.of(topic);
         let writer = self.writer(&name, kind)?;
-        self.topics.push(Topic {
+        self.topics.push(NodeTopic {
             name,
             kind: kind.to_owned(),
             writer,
-            pace: self.options.rate.map(Pace::new),
+            pace: self.options.rate.map(RateLimit::new),
             waiting: VecDeque::new(),
             since: Nanos::ZERO,
             is_told: false,
@@ -362,7 +362,7 @@ impl Sink for Node {
         Ok(Some(self.topics.len() - 1))
     }
 
-    fn send(&mut self, channel: &usize, wall: u64, message: &Message) -> Result<(), NodeError> {
+    fn send(&mut self, channel: &usize, wall: u64, message: &CdrMessage) -> Result<(), NodeError> {
         let Some(topic) = self.topics.get_mut(*channel) else {
             return Ok(());
         };
@@ -390,7 +390,7 @@ mod tests {
 
     /// How many of the messages of `seconds` pass, which come every `period` ns.
     fn passed(rate: f64, period: u64, seconds: u64) -> u64 {
-        let mut pace = Pace::new(rate);
+        let mut pace = RateLimit::new(rate);
         let instants = (0..seconds * 1_000_000_000 / period).map(|i| 1 << 60 | (i * period));
         instants.filter(|wall| pace.passes(*wall)).count() as u64
     }
@@ -407,7 +407,7 @@ mod tests {
 
     #[test]
     fn a_clock_that_is_set_back_stops_nothing() {
-        let mut pace = Pace::new(10.0);
+        let mut pace = RateLimit::new(10.0);
         let hour = 3_600_000_000_000;
         assert!(pace.passes(5 * hour));
         assert!(pace.passes(4 * hour));

@@ -16,13 +16,13 @@ mod server;
 use anyhow::Context;
 use clap::Parser;
 use foxglove::messages::Timestamp;
-use model::Model;
+use model::ShownModel;
 use proprio_bridge::{Event, Heard, ListenError, Listener, Messages, definitions};
 use proprio_estimator::config::Config;
 use proprio_topics::csv::Value;
 use proprio_topics::ipc::{DomainConfig, monotonic};
 use proprio_topics::{Nanos, Reading};
-use server::Topics;
+use server::ServedTopics;
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::net::IpAddr;
@@ -54,7 +54,7 @@ const AGAIN: Duration = Duration::from_millis(500);
 /// Exit codes: 0 success, 2 wrong configuration or command line, 1 any other failure.
 #[derive(Parser)]
 #[command(name = "proprio-view", version)]
-struct Args {
+struct ViewArgs {
     /// The robot; default: that of --config, or the only one
     #[arg(long, value_name = "NAME")]
     robot: Option<String>,
@@ -84,7 +84,7 @@ struct Args {
 }
 
 fn main() -> ExitCode {
-    let args = Args::parse();
+    let args = ViewArgs::parse();
     let (code, error) = match describe(&args) {
         Err(error) => (2, error),
         Ok((robot, model)) => match run(&args, robot, model) {
@@ -97,7 +97,7 @@ fn main() -> ExitCode {
 }
 
 /// The robot's name and model, as far as they were given.
-fn describe(args: &Args) -> anyhow::Result<(Option<String>, Option<Model>)> {
+fn describe(args: &ViewArgs) -> anyhow::Result<(Option<String>, Option<ShownModel>)> {
     let config = args.config.as_deref().map(Config::load).transpose()?;
     let (name, file, locked) = match config {
         Some(config) => (Some(config.robot), Some(config.model), config.locked),
@@ -105,7 +105,7 @@ fn describe(args: &Args) -> anyhow::Result<(Option<String>, Option<Model>)> {
     };
     let model = match args.urdf.clone().or(file) {
         Some(file) => {
-            let model = Model::read(&file, locked);
+            let model = ShownModel::read(&file, locked);
             Some(model.with_context(|| file.display().to_string())?)
         }
         None => None,
@@ -113,7 +113,7 @@ fn describe(args: &Args) -> anyhow::Result<(Option<String>, Option<Model>)> {
     Ok((args.robot.clone().or(name), model))
 }
 
-fn run(args: &Args, robot: Option<String>, model: Option<Model>) -> anyhow::Result<()> {
+fn run(args: &ViewArgs, robot: Option<String>, model: Option<ShownModel>) -> anyhow::Result<()> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot catch signals")?;
@@ -123,8 +123,8 @@ fn run(args: &Args, robot: Option<String>, model: Option<Model>) -> anyhow::Resu
         domain.name.clone_from(name);
     }
     let period = Nanos(SECOND.0 / i64::from(args.rate));
-    let mut topics = Topics::new(period);
-    let urdf = model.as_ref().map(Model::urdf);
+    let mut topics = ServedTopics::new(period);
+    let urdf = model.as_ref().map(ShownModel::urdf);
     let server = topics
         .serve(args.address, args.port, urdf, args.meshes.clone())
         .with_context(|| {
@@ -135,7 +135,7 @@ fn run(args: &Args, robot: Option<String>, model: Option<Model>) -> anyhow::Resu
         "ws://{}",
         std::net::SocketAddr::new(args.address, server.port())
     );
-    let mut view = View::new(topics, robot.as_deref().unwrap_or("robot"), model, period);
+    let mut view = RobotView::new(topics, robot.as_deref().unwrap_or("robot"), model, period);
     let mut said = String::new();
     while !stop.load(Relaxed) {
         let opened = Listener::open(&domain, robot.as_deref());
@@ -143,7 +143,7 @@ fn run(args: &Args, robot: Option<String>, model: Option<Model>) -> anyhow::Resu
             Ok(mut listener) => {
                 said.clear();
                 say!("showing {}", listener.robot());
-                view = View::new(
+                view = RobotView::new(
                     view.messages.into_sink(),
                     listener.robot(),
                     view.model,
@@ -168,9 +168,9 @@ fn run(args: &Args, robot: Option<String>, model: Option<Model>) -> anyhow::Resu
 }
 
 /// One robot, as it is shown.
-struct View {
-    messages: Messages<Topics>,
-    model: Option<Model>,
+struct RobotView {
+    messages: Messages<ServedTopics>,
+    model: Option<ShownModel>,
     period: Nanos,
     /// The newest instant of a joint's position.
     moved: Option<Nanos>,
@@ -180,8 +180,8 @@ struct View {
     second: Nanos,
 }
 
-impl View {
-    fn new(topics: Topics, robot: &str, model: Option<Model>, period: Nanos) -> Self {
+impl RobotView {
+    fn new(topics: ServedTopics, robot: &str, model: Option<ShownModel>, period: Nanos) -> Self {
         let mut messages = Messages::new(topics, robot, realtime_offset());
         let Ok(()) = messages.announce();
         Self {

@@ -1,13 +1,13 @@
 //! The robot's model: its URDF, and the transforms of its links at the joints' positions.
 
-use proprio_bridge::cdr::Message;
+use proprio_bridge::cdr::CdrMessage;
 use proprio_dynamics::model::{Model as Dynamics, ModelError};
 use proprio_dynamics::spatial::Pose;
 use std::collections::BTreeMap;
 use std::path::Path;
 
 /// A robot's model.
-pub(crate) struct Model {
+pub(crate) struct ShownModel {
     urdf: String,
     dynamics: Dynamics,
     /// Joints that nobody measures, and where they are held \[rad or m\].
@@ -21,7 +21,7 @@ pub(crate) struct Transform<'m> {
     pose: Pose,
 }
 
-impl Model {
+impl ShownModel {
     /// Reads a URDF. `locked` are joints that nobody measures, and their positions \[rad or m\].
     ///
     /// # Errors
@@ -84,8 +84,8 @@ impl Model {
 }
 
 /// The `TFMessage`; `wall` is in \[ns since 1970, UTC\].
-pub(crate) fn message(wall: u64, transforms: &[Transform<'_>]) -> Message {
-    let mut message = Message::new();
+pub(crate) fn message(wall: u64, transforms: &[Transform<'_>]) -> CdrMessage {
+    let mut message = CdrMessage::new();
     message.count(transforms.len());
     for transform in transforms {
         message.time(wall);
@@ -156,7 +156,7 @@ mod tests {
         let files = robots.map(|robot| config.join(robot).join("model.urdf"));
         for file in files.into_iter().chain([odd]) {
             let locked = BTreeMap::from([("held".to_owned(), 0.7)]);
-            let model = Model::read(&file, locked).expect("a model");
+            let model = ShownModel::read(&file, locked).expect("a model");
             let dynamics = &model.dynamics;
             let dofs = dynamics.dof_count();
             let q: Vec<f64> = (0..dofs)
@@ -196,7 +196,7 @@ mod tests {
     fn what_is_not_measured_is_left_out() {
         let file = Path::new(env!("CARGO_MANIFEST_DIR"));
         let file = file.join("../../config/icub_left_arm/model.urdf");
-        let model = Model::read(&file, BTreeMap::new()).expect("a model");
+        let model = ShownModel::read(&file, BTreeMap::new()).expect("a model");
         let of = |unknown: &str| {
             let transforms = model.transforms(|name| match name {
                 name if name == unknown => f64::NAN,

@@ -9,8 +9,8 @@ use foxglove::{
     ChannelBuilder, Context, Encode, FoxgloveError, PartialMetadata, RawChannel, Schema,
     WebSocketServer, WebSocketServerHandle,
 };
-use proprio_bridge::Sink;
-use proprio_bridge::cdr::Message;
+use proprio_bridge::MessageSink;
+use proprio_bridge::cdr::CdrMessage;
 use proprio_bridge::definitions::{Definition, MESSAGE, SCHEMA, string};
 use proprio_topics::Nanos;
 use std::convert::Infallible;
@@ -19,7 +19,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 /// A topic, and its newest message while that may not be sent yet.
-struct Topic {
+struct ServedTopic {
     channel: Arc<RawChannel>,
     /// When the next message may be sent (CLOCK_MONOTONIC).
     due: Nanos,
@@ -29,13 +29,13 @@ struct Topic {
 }
 
 /// The topics of the server.
-pub(crate) struct Topics {
+pub(crate) struct ServedTopics {
     context: Arc<Context>,
     period: Nanos,
-    topics: Vec<Topic>,
+    topics: Vec<ServedTopic>,
 }
 
-impl Topics {
+impl ServedTopics {
     /// None yet; each sends at most once per `period`.
     pub(crate) fn new(period: Nanos) -> Self {
         Self {
@@ -66,7 +66,7 @@ impl Topics {
             .name("proprio-view")
             .bind(host, port);
         if let Some(urdf) = urdf {
-            let mut message = Message::new();
+            let mut message = CdrMessage::new();
             message.text(urdf);
             let number = self.topic("/robot_description", MESSAGE, schema(&string()));
             if let Some(topic) = number.and_then(|number| self.topics.get(number)) {
@@ -95,7 +95,7 @@ impl Topics {
         }
         let builder = ChannelBuilder::new(topic).context(&self.context);
         let channel = builder.message_encoding(encoding).schema(schema);
-        let new = Topic {
+        let new = ServedTopic {
             channel: channel.build_raw().ok()?,
             due: Nanos::MIN,
             waiting: None,
@@ -137,7 +137,7 @@ impl Topics {
     }
 }
 
-impl Topic {
+impl ServedTopic {
     /// Replaces the message that waits, if anybody listens.
     fn put(&mut self, wall: u64, write: impl FnOnce(&mut Vec<u8>)) {
         self.waiting = self.channel.has_sinks().then_some(wall);
@@ -153,7 +153,7 @@ fn schema(definition: &Definition) -> Schema {
     Schema::new(&definition.name, SCHEMA, text)
 }
 
-impl Sink for Topics {
+impl MessageSink for ServedTopics {
     type Channel = usize;
     type Error = Infallible;
 
@@ -166,7 +166,7 @@ impl Sink for Topics {
         Ok(self.topic(topic, MESSAGE, schema(definition)))
     }
 
-    fn send(&mut self, channel: &usize, wall: u64, message: &Message) -> Result<(), Infallible> {
+    fn send(&mut self, channel: &usize, wall: u64, message: &CdrMessage) -> Result<(), Infallible> {
         if let Some(topic) = self.topics.get_mut(*channel) {
             topic.put(wall, |bytes| bytes.extend(message.bytes()));
         }
@@ -177,7 +177,7 @@ impl Sink for Topics {
 /// A message that each subscriber is sent once.
 struct Latched {
     channel: Arc<RawChannel>,
-    message: Message,
+    message: CdrMessage,
 }
 
 impl ServerListener for Latched {

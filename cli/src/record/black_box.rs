@@ -11,7 +11,7 @@ use proprio_drivers::Frame;
 use proprio_estimator::files;
 use proprio_gateway::clock::realtime_offset;
 use proprio_gateway::control;
-use proprio_recording::{About, Ring, Snapshot, WriteError};
+use proprio_recording::{About, Ring, RingSnapshot, WriteError};
 use proprio_topics::csv::{Series, Value};
 use proprio_topics::ipc::DomainConfig;
 use proprio_topics::{DeviceState, LinkState, Nanos, Quality};
@@ -48,7 +48,7 @@ pub(super) struct BlackBox {
     folder: PathBuf,
     robot: String,
     duration: Nanos,
-    control: control::Recorder,
+    control: control::RecorderSocket,
     asking: Option<control::Asking>,
     faults: Faults,
     /// When a file is due, and why.
@@ -79,7 +79,7 @@ impl BlackBox {
         Ok(Self {
             ring: Ring::new(about, series, duration)?,
             folder: folder.to_owned(),
-            control: control::Recorder::open(domain, &robot)
+            control: control::RecorderSocket::open(domain, &robot)
                 .context("the socket for `proprio ctl snapshot` cannot be made")?,
             asking: None,
             robot,
@@ -208,7 +208,7 @@ impl BlackBox {
 }
 
 /// Writes a file: it has its name when it is complete, and outlives a loss of power then.
-fn write(snapshot: &Snapshot, place: &Path) -> io::Result<()> {
+fn write(snapshot: &RingSnapshot, place: &Path) -> io::Result<()> {
     let file = BufWriter::new(files::begin(place)?);
     let file = snapshot.write(file).map_err(io::Error::other)?;
     files::end(file.into_inner()?, place, 0o644)

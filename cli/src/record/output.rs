@@ -7,7 +7,7 @@ use proprio_drivers::Frame;
 use proprio_gateway::clock::realtime_offset;
 use proprio_recording::{About, Recorder};
 use proprio_topics::Nanos;
-use proprio_topics::csv::{Columns, Series, Writer};
+use proprio_topics::csv::{Columns, Series, TableWriter};
 use std::fs::File;
 use std::io::{self, BufWriter, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
@@ -38,7 +38,7 @@ pub(super) enum Output {
 
 /// A table of so many series.
 pub(super) struct Table {
-    writer: Writer<BufWriter<File>>,
+    writer: TableWriter<BufWriter<File>>,
     series: usize,
     /// Values of other series, which are not in it.
     others: u64,
@@ -89,7 +89,7 @@ impl Split {
 impl Output {
     pub(super) fn table(file: File, series: &[Series], columns: Columns) -> io::Result<Self> {
         Ok(Self::Table(Table {
-            writer: Writer::new(BufWriter::new(file), series, columns)?,
+            writer: TableWriter::new(BufWriter::new(file), series, columns)?,
             series: series.len(),
             others: 0,
         }))

@@ -3,7 +3,7 @@
 use super::story::{Channel, Known, Part, System, opinion};
 use crate::status::newest;
 use anyhow::{anyhow, bail};
-use proprio_bridge::{Described, Level, bus_state, device_state, next, one_robot, open};
+use proprio_bridge::{DescriptionReader, Level, bus_state, device_state, next, one_robot, open};
 use proprio_estimator::setup::nearest;
 use proprio_topics::ipc::{Domain, DomainConfig, PortError, Presence, Reader, monotonic};
 use proprio_topics::{
@@ -36,7 +36,7 @@ pub(super) fn know(
     let mut drives = Reader::<DriveEstimate>::open(&domain, &robot).ok();
     let presence = domain.robots().into_iter().find(|own| own.name == robot);
     let presence = presence.ok_or_else(|| anyhow!("robot {robot} has ended meanwhile"))?;
-    let names = Described::by(&domain, &robot, Publisher::Estimator)?;
+    let names = DescriptionReader::by(&domain, &robot, Publisher::Estimator)?;
     let names = names.map(|described| *described.newest());
     let number = match &names {
         Some(names) => Some(number(names, joint)?),
@@ -155,7 +155,7 @@ fn torque(domain: &Domain, robot: &str, joint: u32) -> Option<TorqueBudget> {
 /// The state of channels, boards and buses; those first that the estimator reads.
 fn system(domain: &Domain, robot: &str, read: Option<&Description>) -> anyhow::Result<System> {
     let health = newest::<GatewayHealth>(domain, robot)?;
-    let names = Described::by(domain, robot, Publisher::Gateway)?;
+    let names = DescriptionReader::by(domain, robot, Publisher::Gateway)?;
     let (Some(health), Some(names)) = (health, names) else {
         return Ok(System::default());
     };

@@ -7,47 +7,47 @@
 //! channels become stale.
 
 use super::matrix::Matrix;
-use super::track::{Measured, Track};
+use super::track::{ShaftState, Track};
 use proprio_topics::{Nanos, Quality, StampKind};
 
 /// Flags of what happened since the reading before; the others tell of one reading alone.
 const EVENTS: Quality = Quality(Quality::GAP_BEFORE.0 | Quality::ZERO_CHANGED.0);
 
 #[derive(Debug, Clone, Copy, Default)]
-struct Motor {
+struct MotorTrack {
     track: Track,
     is_new: bool,
     /// Events since the last state.
     events: Quality,
     /// Its part of the present state.
-    now: Option<Measured>,
+    now: Option<ShaftState>,
 }
 
 /// A coupling while it runs.
 #[derive(Debug)]
-pub(crate) struct Coupling {
+pub(crate) struct CoupledMotors {
     matrix: Matrix,
-    motors: Vec<Motor>,
+    motors: Vec<MotorTrack>,
 }
 
-impl Coupling {
+impl CoupledMotors {
     /// A coupling without readings.
     pub(crate) fn new(matrix: Matrix, motors: usize) -> Self {
         Self {
             matrix,
-            motors: vec![Motor::default(); motors],
+            motors: vec![MotorTrack::default(); motors],
         }
     }
 
     /// Takes a state of motor number `place`. Whether the joints have a new state with it, which
-    /// [`Coupling::joint`] gives.
-    pub(crate) fn give(&mut self, place: usize, measured: Measured) -> bool {
+    /// [`CoupledMotors::joint`] gives.
+    pub(crate) fn push(&mut self, place: usize, measured: ShaftState) -> bool {
         if let Some(motor) = self.motors.get_mut(place) {
             motor.events |= Quality(measured.quality.0 & EVENTS.0);
             motor.track.push(measured);
             motor.is_new = true;
         }
-        let newest = |motor: &Motor| motor.track.newest().filter(|_| motor.is_new).copied();
+        let newest = |motor: &MotorTrack| motor.track.newest().filter(|_| motor.is_new).copied();
         if self.motors.iter().any(|motor| newest(motor).is_none()) {
             return false;
         }
@@ -67,7 +67,7 @@ impl Coupling {
         for motor in &mut self.motors {
             motor.is_new = false;
             let events = std::mem::take(&mut motor.events);
-            motor.now = motor.track.at(t).map(|now| Measured {
+            motor.now = motor.track.at(t).map(|now| ShaftState {
                 acquired: t,
                 stamp,
                 quality: Quality(now.quality.0 & !EVENTS.0) | events,
@@ -79,7 +79,7 @@ impl Coupling {
 
     /// The present state of joint number `joint`; its flags are those of the motors that move it. A
     /// drive's fault counts too if its torque is in that of the joint.
-    pub(crate) fn joint(&self, joint: usize) -> Option<Measured> {
+    pub(crate) fn joint(&self, joint: usize) -> Option<ShaftState> {
         let motors = self.motors.iter().filter_map(|motor| motor.now.as_ref());
         let first = motors.clone().next()?;
         let mut quality = Quality::GOOD;
@@ -92,7 +92,7 @@ impl Coupling {
             }
         }
         let max_silence = motors.clone().map(|motor| motor.max_silence).max();
-        Some(Measured {
+        Some(ShaftState {
             device_time: Nanos::MIN,
             device_counter: 0,
             quality: Quality(quality.0 & !Quality::DEVICE_COUNTER.0),
@@ -113,8 +113,8 @@ mod tests {
     #[test]
     fn a_coupled_state_is_no_single_devices() {
         let matrix = Matrix::new(&[vec![1.0, 1.0], vec![1.0, -1.0]], 2).unwrap();
-        let mut coupling = Coupling::new(matrix, 2);
-        let measured = |ms, stamp| Measured {
+        let mut coupling = CoupledMotors::new(matrix, 2);
+        let measured = |ms, stamp| ShaftState {
             acquired: Nanos::from_millis(ms),
             stamp,
             device_time: Nanos(7),
@@ -123,8 +123,8 @@ mod tests {
             state: JointState::ABSENT,
             max_silence: Nanos::from_millis(ms),
         };
-        assert!(!coupling.give(0, measured(50, StampKind::Hardware)));
-        assert!(coupling.give(1, measured(60, StampKind::Software)));
+        assert!(!coupling.push(0, measured(50, StampKind::Hardware)));
+        assert!(coupling.push(1, measured(60, StampKind::Software)));
         let joint = coupling.joint(1).unwrap();
         assert_eq!((joint.device_time, joint.device_counter), (Nanos::MIN, 0));
         assert_eq!(
@@ -148,13 +148,13 @@ mod tests {
         ) {
             let unit = |k: usize| (0..3).map(|j| f64::from(u8::from(j == k))).collect();
             let matrix = Matrix::new(&[unit(0), unit(1), unit(2)], 3).unwrap();
-            let mut coupling = Coupling::new(matrix, 3);
+            let mut coupling = CoupledMotors::new(matrix, 3);
             let (mut now, mut last, mut given) = ([0; 3], Nanos::MIN, [0; 3]);
             for (motor, step) in steps {
                 // Each motor has stamps of its own, which may be behind the others'.
                 now[motor] += step;
                 given[motor] += 1;
-                let is_new = coupling.give(motor, Measured {
+                let is_new = coupling.push(motor, ShaftState {
                     acquired: Nanos(now[motor]),
                     stamp: StampKind::Software,
                     device_time: Nanos::MIN,

@@ -1,18 +1,18 @@
-//! A shaft (a joint, or a motor of a coupling) and its sources: one state out of what each gives.
+//! A shaft (a joint, or a motor of a coupling) and its inputs: one state out of what each gives.
 //!
-//! The source of the position makes the samples: its stamp, flags and sequence number are the
+//! The input of the position makes the samples: its stamp, flags and sequence number are the
 //! shaft's. The others' newest values are carried along ([`super::track`]) while they are fresh,
-//! else they are absent. A fault belongs to what it spoils: an encoder's fault in another source
-//! takes that source's velocity and acceleration away, and leaves the position as it is. A fault of
+//! else they are absent. A fault belongs to what it spoils: an encoder's fault in another input
+//! takes that input's velocity and acceleration away, and leaves the position as it is. A fault of
 //! a device without a position, such as a torque sensor's, takes all that it gives away. A drive's
 //! fault is passed on, as it condemns nothing.
 
-use super::track::{Measured, Track};
+use super::track::{ShaftState, Track};
 use super::wrap::Turns;
-use crate::config::Quantity;
+use crate::config::JointQuantity;
 use proprio_topics::{JointState, Nanos, Quality};
 
-/// What is taken of a source: a set of quantities.
+/// What is taken of an input: a set of quantities.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Takes(u8);
 
@@ -22,24 +22,24 @@ impl Takes {
 
     /// The quantities of a list.
     #[must_use]
-    pub fn of(list: &[Quantity]) -> Self {
+    pub fn of(list: &[JointQuantity]) -> Self {
         Self(list.iter().fold(0, |set, q| set | 1 << *q as u8))
     }
 
     /// Whether `quantity` is in it.
     #[must_use]
-    pub const fn has(self, quantity: Quantity) -> bool {
+    pub const fn has(self, quantity: JointQuantity) -> bool {
         self.0 >> quantity as u8 & 1 == 1
     }
 
     /// Its quantities.
-    pub fn quantities(self) -> impl Iterator<Item = Quantity> {
+    pub fn quantities(self) -> impl Iterator<Item = JointQuantity> {
         let all = [
-            Quantity::Position,
-            Quantity::Velocity,
-            Quantity::Acceleration,
-            Quantity::Torque,
-            Quantity::Current,
+            JointQuantity::Position,
+            JointQuantity::Velocity,
+            JointQuantity::Acceleration,
+            JointQuantity::Torque,
+            JointQuantity::Current,
         ];
         all.into_iter().filter(move |q| self.has(*q))
     }
@@ -48,19 +48,19 @@ impl Takes {
     fn copy(self, from: &JointState, into: &mut JointState) {
         for quantity in self.quantities() {
             match quantity {
-                Quantity::Position => into.position = from.position,
-                Quantity::Velocity => into.velocity = from.velocity,
-                Quantity::Acceleration => into.acceleration = from.acceleration,
-                Quantity::Torque => into.torque = from.torque,
-                Quantity::Current => into.current = from.current,
+                JointQuantity::Position => into.position = from.position,
+                JointQuantity::Velocity => into.velocity = from.velocity,
+                JointQuantity::Acceleration => into.acceleration = from.acceleration,
+                JointQuantity::Torque => into.torque = from.torque,
+                JointQuantity::Current => into.current = from.current,
             }
         }
     }
 }
 
-/// A source of a shaft while it runs.
+/// A input of a shaft while it runs.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Source {
+pub(crate) struct RunningInput {
     takes: Takes,
     track: Track,
     /// The turns of a device that wraps.
@@ -76,13 +76,13 @@ pub(crate) struct Source {
 /// A shaft.
 #[derive(Debug)]
 pub(crate) struct Shaft {
-    pub(crate) sources: Vec<Source>,
+    pub(crate) inputs: Vec<RunningInput>,
 }
 
 impl Shaft {
-    /// A shaft whose sources give this, and may be silent for so long \[ns\].
-    pub(crate) fn new(sources: impl Iterator<Item = (Takes, Nanos)>) -> Self {
-        let source = |(takes, max_silence)| Source {
+    /// A shaft whose inputs give this, and may be silent for so long \[ns\].
+    pub(crate) fn new(inputs: impl Iterator<Item = (Takes, Nanos)>) -> Self {
+        let input = |(takes, max_silence)| RunningInput {
             takes,
             track: Track::default(),
             turns: Turns::default(),
@@ -91,26 +91,24 @@ impl Shaft {
             max_silence,
         };
         Self {
-            sources: sources.map(source).collect(),
+            inputs: inputs.map(input).collect(),
         }
     }
 
-    /// Takes a reading of source number `place`. The shaft's state, if that source gives its
+    /// Takes a reading of input number `place`. The shaft's state, if that input gives its
     /// position.
-    pub(crate) fn give(&mut self, place: usize, measured: Measured) -> Option<Measured> {
-        let source = self.sources.get_mut(place)?;
-        if !source.takes.has(Quantity::Position) {
-            source.track.push(measured);
+    pub(crate) fn push(&mut self, place: usize, measured: ShaftState) -> Option<ShaftState> {
+        let input = self.inputs.get_mut(place)?;
+        if !input.takes.has(JointQuantity::Position) {
+            input.track.push(measured);
             return None;
         }
-        let mut whole = Measured {
+        let mut whole = ShaftState {
             state: JointState::ABSENT,
             ..measured
         };
-        source.takes.copy(&measured.state, &mut whole.state);
-        let others = (0..)
-            .zip(&self.sources)
-            .filter(|(other, _)| *other != place);
+        input.takes.copy(&measured.state, &mut whole.state);
+        let others = (0..).zip(&self.inputs).filter(|(other, _)| *other != place);
         for (_, other) in others {
             let Some(mut held) = other.track.at(measured.acquired) else {
                 continue;
@@ -136,7 +134,7 @@ mod tests {
     use super::*;
     use proprio_topics::StampKind;
 
-    /// What a fault of the second source takes away depends on whether it has a position.
+    /// What a fault of the second input takes away depends on whether it has a position.
     #[test]
     fn a_torque_sensors_fault_takes_its_torque() {
         let (good, fault) = (Quality::GOOD, Quality::DEVICE_FAULT);
@@ -146,9 +144,10 @@ mod tests {
             (7.0, good, false),
             (7.0, fault, false),
         ] {
-            let takes = [[Quantity::Position], [Quantity::Torque]].map(|list| Takes::of(&list));
+            let takes =
+                [[JointQuantity::Position], [JointQuantity::Torque]].map(|list| Takes::of(&list));
             let mut shaft = Shaft::new(takes.into_iter().map(|takes| (takes, Nanos(100))));
-            let measured = |position, torque, quality| Measured {
+            let measured = |position, torque, quality| ShaftState {
                 acquired: Nanos(0),
                 stamp: StampKind::Software,
                 device_time: Nanos::MIN,
@@ -161,8 +160,8 @@ mod tests {
                 },
                 max_silence: Nanos(100),
             };
-            assert!(shaft.give(1, measured(position, 2.0, quality)).is_none());
-            let whole = shaft.give(0, measured(1.0, f64::NAN, good)).unwrap();
+            assert!(shaft.push(1, measured(position, 2.0, quality)).is_none());
+            let whole = shaft.push(0, measured(1.0, f64::NAN, good)).unwrap();
             assert_eq!((whole.quality, whole.state.position), (good, 1.0));
             assert_eq!(whole.state.torque.is_nan(), torque_is_lost);
         }

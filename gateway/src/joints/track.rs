@@ -1,4 +1,4 @@
-//! A source's newest state, and how it is carried to another instant.
+//! An input's newest state, and how it is carried to another instant.
 //!
 //! Devices measure at different instants, and a sample has one stamp. So a position is carried to
 //! it by the velocity, and a velocity by the acceleration: as reported, or else the difference of
@@ -13,7 +13,7 @@ use proprio_topics::{JointState, Nanos, Quality, StampKind};
 
 /// The state of a shaft at an instant.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Measured {
+pub(crate) struct ShaftState {
     /// When it was measured \[ns\].
     pub(crate) acquired: Nanos,
     /// The source of that stamp.
@@ -30,13 +30,13 @@ pub(crate) struct Measured {
     pub(crate) max_silence: Nanos,
 }
 
-/// The readings of one source.
+/// The readings of one input.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Track {
-    newest: Option<Measured>,
+    newest: Option<ShaftState>,
     /// The reading that differences are taken from, and how long it was after the one before it
     /// \[ns\].
-    base: Option<(Measured, Nanos)>,
+    base: Option<(ShaftState, Nanos)>,
     /// Rates of the newest reading: of position \[rad/s\] and of velocity \[rad/s^2\]; 0 if
     /// unknown.
     rates: (f64, f64),
@@ -44,7 +44,7 @@ pub(crate) struct Track {
 
 impl Track {
     /// Takes the next reading.
-    pub(crate) fn push(&mut self, now: Measured) {
+    pub(crate) fn push(&mut self, now: ShaftState) {
         let state = now.state;
         let (mut rates, mut differences) = ((0.0, 0.0), (f64::NAN, f64::NAN));
         let mut base = (now, Nanos::ZERO);
@@ -82,14 +82,14 @@ impl Track {
     }
 
     /// The newest reading.
-    pub(crate) const fn newest(&self) -> Option<&Measured> {
+    pub(crate) const fn newest(&self) -> Option<&ShaftState> {
         self.newest.as_ref()
     }
 
     /// The newest reading carried to `t`, forward or backward; `None` if there is none that is
     /// fresh at `t`.
-    pub(crate) fn at(&self, t: Nanos) -> Option<Measured> {
-        let is_near = |m: &Measured| (t - m.acquired).0.abs() <= m.max_silence.0;
+    pub(crate) fn at(&self, t: Nanos) -> Option<ShaftState> {
+        let is_near = |m: &ShaftState| (t - m.acquired).0.abs() <= m.max_silence.0;
         let newest = self.newest.filter(is_near)?;
         let age = (t - newest.acquired).seconds();
         let state = JointState {
@@ -97,7 +97,7 @@ impl Track {
             velocity: newest.state.velocity + self.rates.1 * age,
             ..newest.state
         };
-        Some(Measured { state, ..newest })
+        Some(ShaftState { state, ..newest })
     }
 }
 
@@ -107,8 +107,8 @@ mod tests {
 
     const ABSENT: JointState = JointState::ABSENT;
 
-    fn measured(ms: i64, state: JointState) -> Measured {
-        Measured {
+    fn measured(ms: i64, state: JointState) -> ShaftState {
+        ShaftState {
             acquired: Nanos::from_millis(ms),
             stamp: StampKind::Software,
             device_time: Nanos::MIN,

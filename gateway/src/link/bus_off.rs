@@ -21,7 +21,7 @@ const LINK_WATCH: Nanos = Nanos::from_millis(1500);
 
 /// What is known of the controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum State {
+enum ControllerState {
     OnTheBus,
     /// Bus-off was reported at this time.
     Suspected(Nanos),
@@ -32,14 +32,14 @@ enum State {
 /// Follows the reports of one interface.
 #[derive(Debug)]
 pub(super) struct BusOff {
-    state: State,
+    state: ControllerState,
     patience: Nanos,
 }
 
 impl Default for BusOff {
     fn default() -> Self {
         Self {
-            state: State::OnTheBus,
+            state: ControllerState::OnTheBus,
             patience: PATIENCE,
         }
     }
@@ -55,18 +55,18 @@ impl BusOff {
         let counts = error.classes & libc::CAN_ERR_CRTL != 0;
         let is_on = reports(BusError::Restarted) || reports(BusError::Active) || counts && !is_off;
         self.state = match self.state {
-            _ if is_on => State::OnTheBus,
-            State::OnTheBus if is_off => State::Suspected(now),
+            _ if is_on => ControllerState::OnTheBus,
+            ControllerState::OnTheBus if is_off => ControllerState::Suspected(now),
             unchanged => unchanged,
         };
     }
 
     /// A frame has arrived.
     pub(super) fn receive(&mut self) {
-        if let State::Off(_) = self.state {
+        if let ControllerState::Off(_) = self.state {
             self.be_patient();
         }
-        self.state = State::OnTheBus;
+        self.state = ControllerState::OnTheBus;
     }
 
     /// A belief was wrong.
@@ -76,17 +76,17 @@ impl BusOff {
 
     /// The interface has a carrier, or has none, at `now`.
     pub(super) fn look(&mut self, has_carrier: bool, now: Nanos) {
-        if !has_carrier && self.state != State::OnTheBus {
+        if !has_carrier && self.state != ControllerState::OnTheBus {
             self.patience = PATIENCE;
         }
         self.state = match self.state {
-            State::Suspected(since) if !has_carrier || now - since >= self.patience => {
-                State::Off(since)
+            ControllerState::Suspected(since) if !has_carrier || now - since >= self.patience => {
+                ControllerState::Off(since)
             }
             // No frame has refuted it: boards that only answer were not asked meanwhile.
-            State::Off(since) if has_carrier && now - since >= LINK_WATCH => {
+            ControllerState::Off(since) if has_carrier && now - since >= LINK_WATCH => {
                 self.be_patient();
-                State::OnTheBus
+                ControllerState::OnTheBus
             }
             unchanged => unchanged,
         };
@@ -94,12 +94,12 @@ impl BusOff {
 
     /// Whether it was reported, and is not believed yet: nothing should be sent.
     pub(super) fn is_suspected(&self) -> bool {
-        matches!(self.state, State::Suspected(_))
+        matches!(self.state, ControllerState::Suspected(_))
     }
 
     /// Whether the controller is bus-off.
     pub(super) fn is_off(&self) -> bool {
-        matches!(self.state, State::Off(_))
+        matches!(self.state, ControllerState::Off(_))
     }
 }
 

@@ -58,7 +58,7 @@ pub struct LinkCounters {
 /// Why a frame was not sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
-pub enum SendError {
+pub enum TransmitError {
     /// The system's queue is full; a later attempt may succeed.
     #[error("the queue is full")]
     Full,
@@ -89,8 +89,8 @@ pub trait Link: Send {
     /// Hands a frame to the system to be sent: one attempt, which never waits.
     ///
     /// # Errors
-    /// [`SendError`]; the frame was not sent and will not be.
-    fn send(&mut self, frame: &Frame) -> Result<(), SendError>;
+    /// [`TransmitError`]; the frame was not sent and will not be.
+    fn send(&mut self, frame: &Frame) -> Result<(), TransmitError>;
 
     /// The link's state.
     fn state(&self) -> LinkState;
@@ -113,8 +113,8 @@ impl Link for ListenOnly {
     }
 
     /// Refuses every frame.
-    fn send(&mut self, _frame: &Frame) -> Result<(), SendError> {
-        Err(SendError::ListenOnly)
+    fn send(&mut self, _frame: &Frame) -> Result<(), TransmitError> {
+        Err(TransmitError::ListenOnly)
     }
 
     fn state(&self) -> LinkState {
@@ -134,12 +134,12 @@ impl Link for ListenOnly {
 /// For programs that may wait, such as a simulated board; the gateway's data plane may not.
 ///
 /// # Errors
-/// [`SendError`]; [`SendError::Full`] if the queue was full until the deadline.
-pub fn send_by(link: &mut dyn Link, frame: &Frame, deadline: Nanos) -> Result<(), SendError> {
+/// [`TransmitError`]; [`TransmitError::Full`] if the queue was full until the deadline.
+pub fn send_by(link: &mut dyn Link, frame: &Frame, deadline: Nanos) -> Result<(), TransmitError> {
     loop {
         let sent = link.send(frame);
         let next = Monotonic.now() + Nanos::from_micros(200);
-        if sent != Err(SendError::Full) || next > deadline {
+        if sent != Err(TransmitError::Full) || next > deadline {
             return sent;
         }
         sleep_until(next);

@@ -8,13 +8,13 @@
 //!
 //! At the recorded pace the first stamp is the time of the first call of [`Link::recv`].
 //!
-//! A log does not answer, so [`Link::send`] fails with [`SendError::Unsupported`]. Devices that
+//! A log does not answer, so [`Link::send`] fails with [`TransmitError::Unsupported`]. Devices that
 //! only listen never send.
 
-use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
+use super::{Link, LinkCounters, OpenError, Received, TransmitError, passes};
 use crate::clock::{Clock, Monotonic, sleep_until};
 pub use crate::config::Pace;
-use crate::log::{self, Bytes, LogFormat, Reader, Report, Stamps};
+use crate::log::{self, Bytes, LogFormat, LogReader, LogReport, Stamps};
 use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos, StampKind};
 use std::io::{self, BufRead, BufReader};
@@ -55,7 +55,7 @@ impl Matching {
     ///
     /// # Errors
     /// The log cannot be read.
-    pub fn in_log(self, log: &mut Reader<impl BufRead>) -> io::Result<Option<Self>> {
+    pub fn in_log(self, log: &mut LogReader<impl BufRead>) -> io::Result<Option<Self>> {
         let takes_all = self.is_alone && !log.has_interface(|name| self.takes(name))?;
         Ok((!takes_all).then_some(self))
     }
@@ -82,7 +82,7 @@ pub(crate) fn several(interfaces: &[String]) -> Option<String> {
 /// A log that is being replayed.
 #[derive(Debug)]
 pub struct Replay<R = BufReader<Bytes>> {
-    log: Reader<R>,
+    log: LogReader<R>,
     pace: Pace,
     matching: Option<Matching>,
     claims: Vec<Claim>,
@@ -133,7 +133,7 @@ impl Replay {
             cause,
         };
         let file = log::open(path).map_err(fail)?;
-        let log = Reader::with_stamps(BufReader::with_capacity(BUFFER, file), stamps);
+        let log = LogReader::with_stamps(BufReader::with_capacity(BUFFER, file), stamps);
         Self::of(log, pace, interface, claims).map_err(fail)
     }
 }
@@ -141,7 +141,7 @@ impl Replay {
 impl<R: BufRead> Replay<R> {
     /// A log of which nothing is read yet.
     fn of(
-        mut log: Reader<R>,
+        mut log: LogReader<R>,
         pace: Pace,
         interface: Option<Matching>,
         claims: &[Claim],
@@ -194,7 +194,7 @@ impl<R: BufRead> Replay<R> {
 
     /// The report of the log's reader so far: bad lines, frames without stamps.
     #[must_use]
-    pub const fn report(&self) -> &Report {
+    pub const fn report(&self) -> &LogReport {
         self.log.report()
     }
 
@@ -324,8 +324,8 @@ impl<R: BufRead + Send> Link for Replay<R> {
     }
 
     /// Never sends: a log does not answer.
-    fn send(&mut self, _frame: &Frame) -> Result<(), SendError> {
-        Err(SendError::Unsupported)
+    fn send(&mut self, _frame: &Frame) -> Result<(), TransmitError> {
+        Err(TransmitError::Unsupported)
     }
 
     fn state(&self) -> LinkState {
@@ -358,7 +358,7 @@ mod tests {
     #[test]
     fn a_log_that_can_not_be_read_to_its_end_is_not_complete() {
         let text = b"(1.0) can0 123#11\n(1.1) can0 123#22\n".as_slice();
-        let log = Reader::with_stamps(
+        let log = LogReader::with_stamps(
             BufReader::new(io::Read::chain(text, Failing)),
             Stamps::Detect,
         );

@@ -27,7 +27,7 @@ pub(super) const RECEIVE_BUFFER: usize = 4 << 20;
 const CONTROL: usize = 128;
 
 #[repr(align(8))]
-struct Slot<const SIZE: usize> {
+struct DatagramBuffer<const SIZE: usize> {
     data: [u8; SIZE],
     control: [u8; CONTROL],
 }
@@ -41,7 +41,7 @@ struct Filled {
 
 /// Datagrams of at most `SIZE` bytes that arrived together.
 pub(super) struct Batch<const SIZE: usize> {
-    slots: Box<[Slot<SIZE>]>,
+    slots: Box<[DatagramBuffer<SIZE>]>,
     filled: [Filled; BATCH],
     count: usize,
     next: usize,
@@ -49,7 +49,7 @@ pub(super) struct Batch<const SIZE: usize> {
 
 /// One datagram.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Message<'a> {
+pub(super) struct Datagram<'a> {
     /// Its bytes, truncated to the batch's size.
     pub(super) bytes: &'a [u8],
     /// Whether the datagram or its control data were truncated.
@@ -94,7 +94,7 @@ impl<const SIZE: usize> Batch<SIZE> {
     /// An empty batch.
     pub(super) fn new() -> Self {
         let slots = (0..BATCH)
-            .map(|_| Slot {
+            .map(|_| DatagramBuffer {
                 data: [0; SIZE],
                 control: [0; CONTROL],
             })
@@ -156,13 +156,13 @@ impl<const SIZE: usize> Batch<SIZE> {
 
     /// The next datagram of the batch.
     #[inline]
-    pub(super) fn next(&mut self) -> Option<Message<'_>> {
+    pub(super) fn next(&mut self) -> Option<Datagram<'_>> {
         if self.next >= self.count {
             return None;
         }
         let (slot, filled) = (self.slots.get(self.next)?, self.filled.get(self.next)?);
         self.next += 1;
-        Some(Message {
+        Some(Datagram {
             bytes: slot.data.get(..filled.len)?,
             truncated: filled.flags & (libc::MSG_TRUNC | libc::MSG_CTRUNC) != 0,
             control: Control::parse(slot.control.get(..filled.control)?),

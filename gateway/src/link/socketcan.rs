@@ -33,7 +33,7 @@ use super::error_frame::ErrorFrame;
 use super::socket::{
     RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, interface_flags, newly_dropped,
 };
-use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
+use super::{Link, LinkCounters, OpenError, Received, TransmitError, passes};
 use crate::clock::{Clock, HardwareToMonotonic, Monotonic, sleep_until};
 use nix::errno::Errno;
 use nix::sys::socket::{MsgFlags, send, setsockopt, sockopt};
@@ -438,16 +438,16 @@ impl Link for SocketCan {
         }
     }
 
-    fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
+    fn send(&mut self, frame: &Frame) -> Result<(), TransmitError> {
         let mut bytes = [0; FD];
         let bytes = encode(frame, &mut bytes)
             .and_then(|size| bytes.get(..size))
-            .ok_or(SendError::Unsupported)?;
+            .ok_or(TransmitError::Unsupported)?;
         if self.state != LinkState::Up {
-            return Err(SendError::NotUp);
+            return Err(TransmitError::NotUp);
         }
         if self.bus_off.is_suspected() {
-            return Err(SendError::Full);
+            return Err(TransmitError::Full);
         }
         match send(self.socket.as_raw_fd(), bytes, MsgFlags::MSG_DONTWAIT) {
             Ok(_) => {
@@ -455,13 +455,13 @@ impl Link for SocketCan {
                 Ok(())
             }
             // The socket's own queue, the interface's queue, a signal.
-            Err(Errno::EAGAIN | Errno::ENOBUFS | Errno::EINTR) => Err(SendError::Full),
+            Err(Errno::EAGAIN | Errno::ENOBUFS | Errno::EINTR) => Err(TransmitError::Full),
             Err(error @ (Errno::ENETDOWN | Errno::ENODEV | Errno::ENXIO)) => {
                 self.changed |= self.lose(error);
-                Err(SendError::NotUp)
+                Err(TransmitError::NotUp)
             }
-            Err(Errno::EINVAL | Errno::EMSGSIZE) => Err(SendError::Unsupported),
-            Err(error) => Err(SendError::System(error as i32)),
+            Err(Errno::EINVAL | Errno::EMSGSIZE) => Err(TransmitError::Unsupported),
+            Err(error) => Err(TransmitError::System(error as i32)),
         }
     }
 

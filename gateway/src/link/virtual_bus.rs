@@ -31,7 +31,7 @@
 //! frames arrive in the order in which the kernel received them, as fast as they are sent.
 
 use super::socket::{RECEIVE_BUFFER, Receiver, enlarge_receive_buffer, newly_dropped};
-use super::{Link, LinkCounters, OpenError, Received, SendError, passes};
+use super::{Link, LinkCounters, OpenError, Received, TransmitError, passes};
 use crate::clock::{Clock, HardwareToMonotonic, Monotonic, sleep_until};
 use nix::sys::socket::{setsockopt, sockopt};
 use proprio_drivers::{Claim, Format, Frame, Id};
@@ -319,17 +319,17 @@ impl Link for VirtualBus {
         }
     }
 
-    fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
+    fn send(&mut self, frame: &Frame) -> Result<(), TransmitError> {
         let mut datagram = self.template;
         let datagram = encode(frame, &mut datagram, self.key_len)
             .and_then(|len| datagram.get(..len))
-            .ok_or(SendError::Unsupported)?;
+            .ok_or(TransmitError::Unsupported)?;
         self.socket
             .send_to(datagram, self.group)
             .map_err(|error| match error.raw_os_error() {
-                Some(libc::EAGAIN | libc::ENOBUFS | libc::EINTR) => SendError::Full,
-                Some(libc::ENETDOWN | libc::ENETUNREACH) => SendError::NotUp,
-                number => SendError::System(number.unwrap_or_default()),
+                Some(libc::EAGAIN | libc::ENOBUFS | libc::EINTR) => TransmitError::Full,
+                Some(libc::ENETDOWN | libc::ENETUNREACH) => TransmitError::NotUp,
+                number => TransmitError::System(number.unwrap_or_default()),
             })?;
         self.counters.sent += 1;
         Ok(())

@@ -35,7 +35,7 @@
 //! Sources: can-utils `asc2log.c`, `log2asc.c`; python-can `io/asc.py` and the files of its tests.
 
 use super::record::{
-    Direction, Interface, LineError, LogFormat, Parsed, ParsedLine, StampForm, bus_error,
+    FrameDirection, Interface, LineError, LogFormat, OwnedRecord, ParsedLine, StampForm, bus_error,
     identifier,
 };
 use super::text::{civil, decimal, number, words};
@@ -163,7 +163,7 @@ impl Asc {
             Some(start) => (start.saturating_add(self.last), StampForm::Absolute),
             None => (self.last, StampForm::Origin),
         };
-        Ok(ParsedLine::Record(Parsed {
+        Ok(ParsedLine::Record(OwnedRecord {
             stamp: Some(stamp),
             interface: Interface::channel(channel),
             direction,
@@ -174,7 +174,7 @@ impl Asc {
 }
 
 /// A frame, its direction, and whether no continuation of the line could make it another one.
-type Found = (Frame, Option<Direction>, bool);
+type Found = (Frame, Option<FrameDirection>, bool);
 
 fn is(word: &[u8], text: &str) -> bool {
     word.eq_ignore_ascii_case(text.as_bytes())
@@ -185,10 +185,10 @@ fn channel(word: &[u8]) -> Option<u16> {
 }
 
 /// What `Rx`, `Tx` or `TxRq` says: the direction, unless the frame is only asked for.
-fn way(word: &[u8]) -> Option<Option<Direction>> {
+fn way(word: &[u8]) -> Option<Option<FrameDirection>> {
     match word {
-        b"Rx" | b"rx" | b"RX" => Some(Some(Direction::Received)),
-        b"Tx" | b"tx" | b"TX" => Some(Some(Direction::Sent)),
+        b"Rx" | b"rx" | b"RX" => Some(Some(FrameDirection::Received)),
+        b"Tx" | b"tx" | b"TX" => Some(Some(FrameDirection::Sent)),
         b"TxRq" => Some(None),
         _ => None,
     }

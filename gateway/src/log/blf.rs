@@ -27,7 +27,7 @@
 //! Sources: python-can `io/blf.py`; Technica Engineering `vector_blf`; Wireshark `blf.h`.
 
 use super::record::{
-    Direction, Interface, LineError, Parsed, ParsedLine, StampForm, bus_error, identifier,
+    FrameDirection, Interface, LineError, OwnedRecord, ParsedLine, StampForm, bus_error, identifier,
 };
 use super::text::civil;
 use flate2::{Decompress, FlushDecompress, Status};
@@ -65,7 +65,7 @@ const BUFFER: usize = 1 << 16;
 
 /// The contents of all containers as one sequence of bytes.
 struct Contents {
-    part: Part,
+    part: BytePosition,
     inflate: Decompress,
     /// Bytes read of the file.
     read: u64,
@@ -83,7 +83,7 @@ struct Contents {
 
 /// Where in the file the next byte is.
 #[derive(Debug, Clone, Copy)]
-enum Part {
+enum BytePosition {
     /// Before an object.
     Between,
     /// In a container that is not packed, or in an object outside any.
@@ -151,18 +151,18 @@ impl Contents {
         }
         loop {
             match self.part {
-                Part::End => return Ok(0),
-                Part::Between => {
+                BytePosition::End => return Ok(0),
+                BytePosition::Between => {
                     self.next_part(inner)?;
                     if self.outside.is_some() {
                         return self.more(inner);
                     }
                 }
-                Part::Plain { left: 0 } => self.part = Part::Between,
-                Part::Plain { left } => {
+                BytePosition::Plain { left: 0 } => self.part = BytePosition::Between,
+                BytePosition::Plain { left } => {
                     let input = inner.fill_buf()?;
                     if input.is_empty() {
-                        (self.part, self.cut) = (Part::End, true);
+                        (self.part, self.cut) = (BytePosition::End, true);
                         continue;
                     }
                     let room = self.buffer.get_mut(self.end..).unwrap_or_default();
@@ -174,12 +174,12 @@ impl Contents {
                     inner.consume(count);
                     self.read += count as u64;
                     self.end += count;
-                    self.part = Part::Plain {
+                    self.part = BytePosition::Plain {
                         left: left - count as u64,
                     };
                     return Ok(count);
                 }
-                Part::Packed { left } => {
+                BytePosition::Packed { left } => {
                     let count = self.unpack(inner, left)?;
                     if count > 0 {
                         return Ok(count);
@@ -205,14 +205,14 @@ impl Contents {
         self.read += used;
         self.end += made;
         self.part = match status {
-            Ok(Status::StreamEnd) => Part::Between,
-            Ok(_) if used > 0 || made > 0 => Part::Packed { left: left - used },
+            Ok(Status::StreamEnd) => BytePosition::Between,
+            Ok(_) if used > 0 || made > 0 => BytePosition::Packed { left: left - used },
             Ok(_) if at_end => {
                 self.cut = true;
-                Part::End
+                BytePosition::End
             }
             _ => {
-                (self.part, self.lost) = (Part::Between, true);
+                (self.part, self.lost) = (BytePosition::Between, true);
                 return Err(Break::Damage(LineError::Container));
             }
         };
@@ -225,7 +225,7 @@ impl Contents {
         let mut before = 0_u64;
         while !header.starts_with(&OBJECT) {
             let Some(byte) = self.byte(inner)? else {
-                self.part = Part::End;
+                self.part = BytePosition::End;
                 // What is left is padding, or the beginning of an object.
                 self.cut |= header.contains(&OBJECT[0]);
                 return Ok(());
@@ -239,7 +239,7 @@ impl Contents {
         let is_container = |header: &[u8]| u32_at(header, 12) == Some(CONTAINER_TYPE);
         while have < BASE || have < CONTAINER && is_container(&header) {
             let Some(byte) = self.byte(inner)? else {
-                (self.part, self.cut) = (Part::End, true);
+                (self.part, self.cut) = (BytePosition::End, true);
                 return Ok(());
             };
             if let Some(place) = header.get_mut(have) {
@@ -254,12 +254,12 @@ impl Contents {
         self.part = match u16_at(&header, 16) {
             _ if have < CONTAINER => {
                 self.outside = header.get(..BASE).and_then(|header| header.try_into().ok());
-                Part::Plain { left }
+                BytePosition::Plain { left }
             }
-            Some(0) => Part::Plain { left },
+            Some(0) => BytePosition::Plain { left },
             Some(2) => {
                 self.inflate.reset(true);
-                Part::Packed { left }
+                BytePosition::Packed { left }
             }
             packing => {
                 self.lost = true;
@@ -312,7 +312,7 @@ impl Blf {
     pub(super) fn new() -> Self {
         Self {
             contents: Contents {
-                part: Part::Between,
+                part: BytePosition::Between,
                 inflate: Decompress::new(true),
                 read: 0,
                 cut: false,
@@ -407,7 +407,7 @@ impl Blf {
         let mut header = [0; FILE_HEADER];
         for place in &mut header {
             let Some(byte) = self.contents.byte(inner)? else {
-                (self.contents.part, self.contents.cut) = (Part::End, true);
+                (self.contents.part, self.contents.cut) = (BytePosition::End, true);
                 return Ok(());
             };
             *place = byte;
@@ -437,7 +437,7 @@ fn parse(
     header: usize,
     object: &[u8],
     start: Option<Nanos>,
-) -> Result<Parsed, LineError> {
+) -> Result<OwnedRecord, LineError> {
     let short = LineError::Object;
     let size = u32_at(object, 8).and_then(|size| usize::try_from(size).ok());
     let size = size.ok_or(short)?;
@@ -453,9 +453,9 @@ fn parse(
     };
     let way = |sent: bool| {
         Some(if sent {
-            Direction::Sent
+            FrameDirection::Sent
         } else {
-            Direction::Received
+            FrameDirection::Received
         })
     };
     let wide_channel = || u16_at(body, 0).ok_or(short);
@@ -513,7 +513,7 @@ fn parse(
         Some(start) => (start.saturating_add(t), StampForm::Absolute),
         None => (t, StampForm::Origin),
     };
-    Ok(Parsed {
+    Ok(OwnedRecord {
         stamp: Some(stamp),
         interface: Interface::channel(channel),
         direction,

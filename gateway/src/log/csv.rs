@@ -12,7 +12,9 @@
 //!
 //! Source: python-can `io/csv.py`.
 
-use super::record::{Interface, LineError, Parsed, ParsedLine, StampForm, bus_error, identifier};
+use super::record::{
+    Interface, LineError, OwnedRecord, ParsedLine, StampForm, bus_error, identifier,
+};
 use super::text::{decimal, number};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
@@ -86,7 +88,7 @@ pub(super) fn parse(line: &[u8]) -> Result<ParsedLine, LineError> {
         };
         Frame::with_format(id, format, data).ok_or(LineError::TooLong { most: 64 })?
     };
-    Ok(ParsedLine::Record(Parsed {
+    Ok(ParsedLine::Record(OwnedRecord {
         stamp: Some((t, StampForm::Origin)),
         interface: Interface::channel(1),
         direction: None,

@@ -46,8 +46,8 @@ mod stamps;
 mod text;
 mod trc;
 
-pub use reader::{REORDER, Reader, Report, StepBack};
-pub use record::{Direction, LineError, LogFormat, Record};
+pub use reader::{LogReader, LogReport, REORDER, StepBack};
+pub use record::{FrameDirection, LineError, LogFormat, Record};
 pub use stamps::{STAMPS_OPTION, Stamps};
 
 use std::fmt;

@@ -6,7 +6,7 @@ use super::blf::{self, Blf};
 use super::candump::parse_line;
 use super::csv;
 use super::record::{
-    Interface, LineError, LogFormat, MAX_LINE, Parsed, ParsedLine, Record, StampForm,
+    Interface, LineError, LogFormat, MAX_LINE, OwnedRecord, ParsedLine, Record, StampForm,
 };
 use super::stamps::{Stamps, judge};
 use super::text::without_escapes;
@@ -15,15 +15,15 @@ use arrayvec::ArrayVec;
 use proprio_topics::Nanos;
 use std::io::{self, BufRead, Read, Write};
 
-/// Maximum number of bad lines in a [`Report`].
+/// Maximum number of bad lines in a [`LogReport`].
 const NAMED: usize = 8;
 /// The order of the frames in a log is that of their stamps, except within this time \[ns\]: the
 /// recorder reads one interface after the other.
 pub const REORDER: Nanos = Nanos::from_millis(100);
 
-/// The counts of a [`Reader`] so far.
+/// The counts of a [`LogReader`] so far.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Report {
+pub struct LogReport {
     /// Lines (or objects of a BLF file), including bad ones.
     pub lines: u64,
     /// Frames.
@@ -157,7 +157,7 @@ impl<R: BufRead> BufRead for Ahead<R> {
 
 /// The source of lines or objects.
 #[derive(Debug)]
-enum Source {
+enum Syntax {
     /// Nothing is read yet.
     Unopened,
     /// Text, of which no line told the format yet.
@@ -171,7 +171,7 @@ enum Source {
     Ended,
 }
 
-impl Report {
+impl LogReport {
     fn reject(&mut self, line: u64, error: LineError) {
         self.bad += 1;
         // The ninth and later ones are only counted.
@@ -194,25 +194,25 @@ impl Report {
 ///
 /// Escape sequences of a terminal, such as the colours of `candump -c`, are ignored.
 #[derive(Debug)]
-pub struct Reader<R> {
+pub struct LogReader<R> {
     inner: Ahead<R>,
-    source: Source,
+    source: Syntax,
     format: Option<LogFormat>,
     line: Vec<u8>,
     /// The frame after the current one, if it has been read already: its text, the number of its
     /// line, and the frame.
     next_line: Vec<u8>,
-    next: Option<(u64, Parsed)>,
+    next: Option<(u64, OwnedRecord)>,
     stamps: Stamps,
     /// Whether the meaning of the stamps was guessed from too little.
     doubtful: bool,
     sum: Nanos,
     last: Option<Nanos>,
     interfaces: ArrayVec<String, NAMED>,
-    report: Report,
+    report: LogReport,
 }
 
-impl<R: BufRead> Reader<R> {
+impl<R: BufRead> LogReader<R> {
     /// Reads from `inner`. To detect the meaning of relative stamps it reads ahead: the whole log,
     /// or its first 64 MiB.
     pub fn new(inner: R) -> Self {
@@ -228,7 +228,7 @@ impl<R: BufRead> Reader<R> {
                 used: 0,
                 rest: inner,
             },
-            source: Source::Unopened,
+            source: Syntax::Unopened,
             format: None,
             next_line: line(),
             line: line(),
@@ -238,12 +238,12 @@ impl<R: BufRead> Reader<R> {
             sum: Nanos::ZERO,
             last: None,
             interfaces: ArrayVec::new(),
-            report: Report::default(),
+            report: LogReport::default(),
         }
     }
 
     /// The counts so far.
-    pub const fn report(&self) -> &Report {
+    pub const fn report(&self) -> &LogReport {
         &self.report
     }
 
@@ -330,7 +330,7 @@ impl<R: BufRead> Reader<R> {
         let (most, mut size) = LOOK_FOR_INTERFACE;
         loop {
             let held = self.inner.hold(size)?;
-            let mut ahead = Reader::with_stamps(held, Stamps::SinceStart);
+            let mut ahead = LogReader::with_stamps(held, Stamps::SinceStart);
             while let Some(record) = ahead.next_record()? {
                 if wanted(record.interface) {
                     return Ok(true);
@@ -346,7 +346,7 @@ impl<R: BufRead> Reader<R> {
     /// The next record; `None` at the end of the log.
     ///
     /// # Errors
-    /// A read error of `inner`. A bad line is not an error: see [`Reader::report`].
+    /// A read error of `inner`. A bad line is not an error: see [`LogReader::report`].
     pub fn next_record(&mut self) -> io::Result<Option<Record<'_>>> {
         let (parsed, stamp) = loop {
             let Some((number, parsed)) = self.next_frame()? else {
@@ -399,7 +399,7 @@ impl<R: BufRead> Reader<R> {
 
     /// The next frame and the number of its line; its text is in `line`. Lines without a frame are
     /// skipped.
-    fn next_frame(&mut self) -> io::Result<Option<(u64, Parsed)>> {
+    fn next_frame(&mut self) -> io::Result<Option<(u64, OwnedRecord)>> {
         if let Some(next) = self.next.take() {
             std::mem::swap(&mut self.line, &mut self.next_line);
             return Ok(Some(next));
@@ -449,15 +449,15 @@ impl<R: BufRead> Reader<R> {
 
     /// Reads and parses the next line or object; `None` at the end.
     fn next_parsed(&mut self) -> io::Result<Option<Result<ParsedLine, LineError>>> {
-        if matches!(self.source, Source::Unopened)
+        if matches!(self.source, Syntax::Unopened)
             && let Err(error) = self.open()?
         {
             self.report.lines = 1;
             return Ok(Some(Err(error)));
         }
         let next = match &mut self.source {
-            Source::Ended => return Ok(None),
-            Source::Blf(blf) => {
+            Syntax::Ended => return Ok(None),
+            Syntax::Blf(blf) => {
                 self.line.clear();
                 let next = blf.next(&mut self.inner)?;
                 self.report.lines += u64::from(next.is_some());
@@ -467,7 +467,7 @@ impl<R: BufRead> Reader<R> {
         };
         Ok(match next {
             Some(Err(error)) if error.is_final() => {
-                self.source = Source::Ended;
+                self.source = Syntax::Ended;
                 Some(Err(error))
             }
             Some(Ok(ParsedLine::Record(mut parsed))) => {
@@ -492,21 +492,21 @@ impl<R: BufRead> Reader<R> {
             .iter()
             .find(|(beginning, _)| head.starts_with(beginning));
         if let Some((_, what)) = what {
-            self.source = Source::Ended;
+            self.source = Syntax::Ended;
             return Ok(Err(LineError::NoLog(what)));
         }
         if is_utf_16 {
-            self.source = Source::Ended;
+            self.source = Syntax::Ended;
             return Ok(Err(LineError::NoLog(UTF_16)));
         }
         self.source = if head.starts_with(blf::SIGNATURE) {
             self.format = Some(LogFormat::Blf);
-            Source::Blf(Box::new(Blf::new()))
+            Syntax::Blf(Box::new(Blf::new()))
         } else {
             if head.starts_with(UTF_8_MARK) {
                 self.inner.consume(UTF_8_MARK.len());
             }
-            Source::Unknown
+            Syntax::Unknown
         };
         Ok(Ok(()))
     }
@@ -544,10 +544,10 @@ impl<R: BufRead> Reader<R> {
         }
         without_escapes(&mut self.line);
         let parsed = match &mut self.source {
-            Source::Candump => parse_line(&self.line),
-            Source::Asc(asc) => asc.parse(&self.line),
-            Source::Trc(trc) => trc.parse(&self.line),
-            Source::Csv => csv::parse(&self.line),
+            Syntax::Candump => parse_line(&self.line),
+            Syntax::Asc(asc) => asc.parse(&self.line),
+            Syntax::Trc(trc) => trc.parse(&self.line),
+            Syntax::Csv => csv::parse(&self.line),
             _ => self.first_line(),
         };
         Ok(Some(match parsed {
@@ -565,17 +565,17 @@ impl<R: BufRead> Reader<R> {
         let parsed = parse_line(line);
         let is_candump = matches!(parsed, Ok(ParsedLine::Record(_) | ParsedLine::Dropped(_)));
         let (format, source, parsed) = if is_candump {
-            (LogFormat::Candump, Source::Candump, parsed)
+            (LogFormat::Candump, Syntax::Candump, parsed)
         } else if Asc::has(line) {
             let mut asc = Asc::new();
             let parsed = asc.parse(line);
-            (LogFormat::Asc, Source::Asc(asc), parsed)
+            (LogFormat::Asc, Syntax::Asc(asc), parsed)
         } else if Trc::has(line) {
             let mut trc = Trc::new();
             let parsed = trc.parse(line);
-            (LogFormat::Trc, Source::Trc(trc), parsed)
+            (LogFormat::Trc, Syntax::Trc(trc), parsed)
         } else if csv::has(line) {
-            (LogFormat::Csv, Source::Csv, csv::parse(line))
+            (LogFormat::Csv, Syntax::Csv, csv::parse(line))
         } else if self.report.lines == 1 && parsed.is_err() && csv::is_other_table(line) {
             return Err(LineError::Table);
         } else {

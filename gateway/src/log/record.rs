@@ -57,7 +57,7 @@ impl fmt::Display for LogFormat {
 
 /// Whether a frame was received or sent by the host that recorded it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Direction {
+pub enum FrameDirection {
     /// `R`, `RX`: it came from the bus.
     Received,
     /// `T`, `TX`: that host sent it.
@@ -67,13 +67,13 @@ pub enum Direction {
 /// One frame of a log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Record<'a> {
-    /// The stamp in the line; `None` if there is none. From a [`Reader`](super::Reader): relative
-    /// to the log's origin, with stamps since the previous line added up.
+    /// The stamp in the line; `None` if there is none. From a [`LogReader`](super::LogReader):
+    /// relative to the log's origin, with stamps since the previous line added up.
     pub stamp: Option<Nanos>,
     /// The interface it was seen on.
     pub interface: &'a str,
     /// Whether it was received or sent, if the line states it.
-    pub direction: Option<Direction>,
+    pub direction: Option<FrameDirection>,
     /// The frame, with `t` the stamp and [`StampKind::Log`], or zero and [`StampKind::None`].
     pub frame: Frame,
 }
@@ -266,10 +266,10 @@ impl Interface {
 
 /// A record without its borrow of the line.
 #[derive(Debug)]
-pub(super) struct Parsed {
+pub(super) struct OwnedRecord {
     pub(super) stamp: Option<(Nanos, StampForm)>,
     pub(super) interface: Interface,
-    pub(super) direction: Option<Direction>,
+    pub(super) direction: Option<FrameDirection>,
     pub(super) frame: Frame,
     /// Whether no continuation of this line could make it another frame.
     pub(super) whole: bool,
@@ -278,12 +278,12 @@ pub(super) struct Parsed {
 /// What a line or an object holds.
 #[derive(Debug)]
 pub(super) enum ParsedLine {
-    Record(Parsed),
+    Record(OwnedRecord),
     Dropped(u64),
     Note,
 }
 
-impl Parsed {
+impl OwnedRecord {
     pub(super) fn record(self, line: &[u8], stamp: Option<Nanos>) -> Option<Record<'_>> {
         let Interface::Text(interface) = self.interface else {
             return None;

@@ -20,7 +20,7 @@
 //! read up to 20 frames late) at most 1 in 2000 was told wrong without doubt.
 
 use super::candump::parse_line;
-use super::record::{Parsed, ParsedLine, StampForm};
+use super::record::{OwnedRecord, ParsedLine, StampForm};
 use super::text::without_escapes;
 use proprio_topics::Nanos;
 use serde::Deserialize;
@@ -63,21 +63,21 @@ impl Stamps {
 
 /// What the stamps of a log mean.
 #[derive(Debug, PartialEq)]
-pub(super) struct Verdict {
+pub(super) struct StampMeaning {
     pub(super) stamps: Stamps,
     /// It may be otherwise, and that would make a difference.
     pub(super) doubtful: bool,
 }
 
 /// Tells the meaning of the stamp `first` and of those in the lines that follow.
-pub(super) fn judge(first: Nanos, lines: &[u8]) -> Verdict {
+pub(super) fn judge(first: Nanos, lines: &[u8]) -> StampMeaning {
     let mut stamps = vec![first];
     let mut plain = Vec::new();
     for line in lines.split(|c| *c == b'\n') {
         plain.clear();
         plain.extend_from_slice(line);
         without_escapes(&mut plain);
-        if let Ok(ParsedLine::Record(Parsed {
+        if let Ok(ParsedLine::Record(OwnedRecord {
             stamp: Some((t, StampForm::Relative)),
             ..
         })) = parse_line(&plain)
@@ -89,7 +89,7 @@ pub(super) fn judge(first: Nanos, lines: &[u8]) -> Verdict {
     verdict(&stamps)
 }
 
-fn verdict(stamps: &[Nanos]) -> Verdict {
+fn verdict(stamps: &[Nanos]) -> StampMeaning {
     let least = if stamps.len() < PAIRS { 1 } else { 2 };
     let size = stamps.len().div_ceil(BLOCKS).max(least);
     #[allow(clippy::cast_precision_loss)]
@@ -116,7 +116,7 @@ fn verdict(stamps: &[Nanos]) -> Verdict {
     };
     // Without any step, all frames would be of one instant.
     let climb: f64 = if way > 0.0 { net / way } else { 0.0 };
-    Verdict {
+    StampMeaning {
         stamps: match same || climb > 0.5 {
             true => Stamps::SinceStart,
             false => Stamps::SincePrevious,

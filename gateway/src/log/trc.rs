@@ -29,7 +29,7 @@
 //! its tests.
 
 use super::record::{
-    Direction, Interface, LineError, LogFormat, Parsed, ParsedLine, StampForm, bus_error,
+    FrameDirection, Interface, LineError, LogFormat, OwnedRecord, ParsedLine, StampForm, bus_error,
     fd_length, identifier,
 };
 use super::text::{civil, decimal, hex_byte, number, words};
@@ -171,8 +171,8 @@ impl Trc {
         }
         let direction = match direction {
             None => None,
-            Some(b"Rx") => Some(Direction::Received),
-            Some(b"Tx") => Some(Direction::Sent),
+            Some(b"Rx") => Some(FrameDirection::Received),
+            Some(b"Tx") => Some(FrameDirection::Sent),
             Some(_) => return Err(LineError::Direction),
         };
         let (frame, whole) = if matches!(kind, b"ER" | b"Error") {
@@ -187,7 +187,7 @@ impl Trc {
             Some(start) => (start.saturating_add(t), StampForm::Absolute),
             None => (t, StampForm::Origin),
         };
-        Ok(ParsedLine::Record(Parsed {
+        Ok(ParsedLine::Record(OwnedRecord {
             stamp: Some(stamp),
             interface: Interface::channel(bus),
             direction,

@@ -1,25 +1,49 @@
-//! From the tables of a bus's joints and couplings to their [`Layout`], checked.
+//! From the tables of a bus's joints and couplings to their [`JointsPlan`], checked.
 
+use super::ChannelPlan;
 use super::words::{did_you_mean, quoted};
-use crate::config::{Quantity, RawCoupling, RawJoint};
+use crate::config::{CouplingConfig, JointConfig, JointQuantity};
 use crate::joints::{
-    CouplingPlan, Feed, JointMap, Layout, MOST, Matrix, Origin, ShaftPlan, SourcePlan, Takes,
-    Target, Wrap,
+    CouplingPlan, InputPlan, JointMap, JointsPlan, MOST, Matrix, Origin, ShaftInput, ShaftPlan,
+    ShaftRole, Takes, Wrap,
 };
-use proprio_topics::Nanos;
+use proprio_topics::{Kind, Nanos};
 use std::f64::consts::TAU;
 
 /// How near a range may be to a whole number of turns without being one \[turns\]: nearer, it is a
 /// rounded number, whose error grows with each turn.
 const ROUNDED: f64 = 0.01;
 
-/// The layout of one bus while its devices are read.
+/// The plan of one bus's joints while its devices are read.
 #[derive(Debug)]
 pub(super) struct Wiring {
-    couplings: Vec<(RawCoupling, Matrix)>,
-    layout: Layout,
+    couplings: Vec<(CouplingConfig, Matrix)>,
+    plan: JointsPlan,
     /// Per coupling and joint, its channel, once its motor or a device at the joint is known.
     channels: Vec<Vec<Option<u32>>>,
+}
+
+/// The device whose table is read.
+pub(super) struct NewDevice<'a> {
+    pub(super) name: &'a str,
+    /// The number of its bus.
+    pub(super) bus: usize,
+    /// Its own on the bus.
+    pub(super) number: usize,
+    pub(super) max_silence: Nanos,
+}
+
+impl NewDevice<'_> {
+    /// A channel of it.
+    pub(super) fn channel(&self, name: String, kind: Kind) -> ChannelPlan {
+        ChannelPlan {
+            name,
+            kind,
+            bus: self.bus,
+            device: self.number,
+            max_silence: self.max_silence,
+        }
+    }
 }
 
 /// The device that a joint's channel is shown with: its number, and its maximum silence \[ns\].
@@ -34,8 +58,8 @@ impl Wiring {
     ///
     /// # Errors
     /// A message with the coupling, the error and the legal values.
-    pub(super) fn new(couplings: Vec<RawCoupling>) -> Result<Self, String> {
-        let mut checked: Vec<(RawCoupling, Matrix)> = Vec::new();
+    pub(super) fn new(couplings: Vec<CouplingConfig>) -> Result<Self, String> {
+        let mut checked: Vec<(CouplingConfig, Matrix)> = Vec::new();
         for raw in couplings {
             let at = format!("coupling of {}", quoted(&raw.joints));
             let n = raw.joints.len();
@@ -76,7 +100,7 @@ impl Wiring {
         Ok(Self {
             channels: channels.collect(),
             couplings: checked,
-            layout: Layout::default(),
+            plan: JointsPlan::default(),
         })
     }
 
@@ -101,10 +125,10 @@ impl Wiring {
 
     /// The number of the channel `name`, if it is a joint's.
     pub(super) fn channel(&self, name: &str) -> Option<u32> {
-        let shaft = self.layout.shafts.iter().find(|shaft| shaft.name == name);
-        let own = shaft.and_then(|shaft| match shaft.target {
-            Target::Channel(channel) => Some(channel),
-            Target::Motor(..) => None,
+        let shaft = self.plan.shafts.iter().find(|shaft| shaft.name == name);
+        let own = shaft.and_then(|shaft| match shaft.role {
+            ShaftRole::Joint(channel) => Some(channel),
+            ShaftRole::Motor(..) => None,
         });
         own.or_else(|| {
             let couplings = self.couplings.iter().zip(&self.channels);
@@ -113,7 +137,7 @@ impl Wiring {
         })
     }
 
-    /// Adds the joint `raw` of device number `device` with the gear `map`; `channel` is that of
+    /// Adds the joint `raw` of `device` with the gear `map`; `channel` is that of
     /// [`Wiring::channel_name`], `at` its place in the file.
     ///
     /// # Errors
@@ -121,25 +145,25 @@ impl Wiring {
     pub(super) fn add(
         &mut self,
         at: &str,
-        raw: &RawJoint,
-        (device, device_name, max_silence): (usize, &str, Nanos),
+        raw: &JointConfig,
+        device: &NewDevice<'_>,
         channel: u32,
         map: &JointMap,
-    ) -> Result<Feed, String> {
+    ) -> Result<ShaftInput, String> {
         let takes = takes(at, raw.takes.as_deref())?;
         let wrap = wrap(at, raw, map)?;
-        if wrap.is_some() && !takes.has(Quantity::Position) {
+        if wrap.is_some() && !takes.has(JointQuantity::Position) {
             return Err(format!(
                 "{at}: wraps_rad is given, but takes has no \"position\""
             ));
         }
-        let source = SourcePlan {
-            origin: Origin::Device(device, device_name.to_owned()),
+        let input = InputPlan {
+            origin: Origin::Device(device.number, device.name.to_owned()),
             takes,
-            max_silence,
+            max_silence: device.max_silence,
         };
-        let target = match self.motor(&raw.name) {
-            None => Target::Channel(channel),
+        let role = match self.motor(&raw.name) {
+            None => ShaftRole::Joint(channel),
             Some((coupling, place)) => {
                 let joint = self
                     .channels
@@ -148,43 +172,47 @@ impl Wiring {
                 if let Some(known) = joint {
                     *known = Some(channel);
                 }
-                Target::Motor(coupling, place)
+                ShaftRole::Motor(coupling, place)
             }
         };
-        let (shaft, place) = self.attach(&raw.name, target, source);
-        Ok(Feed { shaft, place, wrap })
+        let at = self.attach(&raw.name, role, input);
+        Ok(ShaftInput { wrap, ..at })
     }
 
-    /// Adds a source to shaft `name`: the shaft's number, and the source's place there.
-    fn attach(&mut self, name: &str, target: Target, source: SourcePlan) -> (usize, usize) {
-        let shafts = &mut self.layout.shafts;
+    /// Adds an input, of which no turns are counted, to shaft `name`.
+    fn attach(&mut self, name: &str, role: ShaftRole, input: InputPlan) -> ShaftInput {
+        let shafts = &mut self.plan.shafts;
         let number = shafts.iter().position(|shaft| shaft.name == name);
         let number = number.unwrap_or_else(|| {
             shafts.push(ShaftPlan {
                 name: name.to_owned(),
-                target,
-                sources: Vec::new(),
+                role,
+                inputs: Vec::new(),
             });
             shafts.len() - 1
         });
         let place = shafts.get_mut(number).map_or(0, |shaft| {
-            shaft.sources.push(source);
-            shaft.sources.len() - 1
+            shaft.inputs.push(input);
+            shaft.inputs.len() - 1
         });
-        (number, place)
+        ShaftInput {
+            shaft: number,
+            place,
+            wrap: None,
+        }
     }
 
-    /// The layout, once all devices of the bus are added, and the device that each joint's channel
+    /// The plan, once all devices of the bus are added, and the device that each joint's channel
     /// is shown with.
     ///
     /// # Errors
     /// A message with the joint or coupling, the error and the legal values.
-    pub(super) fn finish(mut self) -> Result<(Layout, Vec<Shown>), String> {
+    pub(super) fn finish(mut self) -> Result<(JointsPlan, Vec<Shown>), String> {
         let couplings = std::mem::take(&mut self.couplings);
         let channels = std::mem::take(&mut self.channels);
         for (number, ((raw, matrix), channels)) in couplings.into_iter().zip(channels).enumerate() {
             let at = format!("coupling of {}", quoted(&raw.joints));
-            let shafts = &self.layout.shafts;
+            let shafts = &self.plan.shafts;
             let mut motors = Vec::new();
             for name in &raw.motors {
                 let Some(motor) = shafts.iter().position(|shaft| shaft.name == *name) else {
@@ -199,49 +227,45 @@ impl Wiring {
                 motors.push(motor);
             }
             let takes = takes(&at, raw.takes.as_deref())?;
-            let silence = |motor: &usize| self.layout.shafts.get(*motor).and_then(silence_of);
-            let max_silence = motors
+            let positions = motors
                 .iter()
-                .filter_map(silence)
-                .max()
-                .unwrap_or(Nanos::MAX);
+                .filter_map(|motor| shafts.get(*motor)?.position());
+            let max_silence = positions.map(|input| input.max_silence).max();
+            let max_silence = max_silence.unwrap_or(Nanos::MAX);
             let mut joints = Vec::new();
             for (name, channel) in raw.joints.iter().zip(channels) {
-                let source = SourcePlan {
+                let input = InputPlan {
                     origin: Origin::Coupling(number),
                     takes,
                     max_silence,
                 };
-                let target = Target::Channel(channel.unwrap_or(u32::MAX));
-                joints.push(self.attach(name, target, source));
+                let role = ShaftRole::Joint(channel.unwrap_or(u32::MAX));
+                joints.push(self.attach(name, role, input));
             }
-            self.layout.couplings.push(CouplingPlan {
+            self.plan.couplings.push(CouplingPlan {
                 joints,
                 motors,
                 matrix,
             });
         }
-        for shaft in &self.layout.shafts {
+        for shaft in &self.plan.shafts {
             self.check(shaft)?;
         }
-        let shown = self
-            .layout
-            .shafts
-            .iter()
-            .filter_map(|shaft| self.shown(shaft));
-        Ok((shown.collect::<Vec<_>>(), self.layout)).map(|(shown, layout)| (layout, shown))
+        let shafts = self.plan.shafts.iter();
+        let shown = shafts.filter_map(|shaft| self.shown(shaft)).collect();
+        Ok((self.plan, shown))
     }
 
-    /// Checks that each quantity of a shaft has one source, and the position has one.
+    /// Checks that each quantity of a shaft has one input, and the position has one.
     fn check(&self, shaft: &ShaftPlan) -> Result<(), String> {
         let at = format!("joint {:?}", shaft.name);
-        let by = |source: &SourcePlan| match &source.origin {
+        let by = |input: &InputPlan| match &input.origin {
             Origin::Device(_, name) => format!("device {name:?}"),
             Origin::Coupling(_) => "its coupling".to_owned(),
         };
-        for (number, source) in shaft.sources.iter().enumerate() {
-            for other in shaft.sources.iter().take(number) {
-                let mut both = source.takes.quantities().filter(|q| other.takes.has(*q));
+        for (number, input) in shaft.inputs.iter().enumerate() {
+            for other in shaft.inputs.iter().take(number) {
+                let mut both = input.takes.quantities().filter(|q| other.takes.has(*q));
                 let Some(quantity) = both.next() else {
                     continue;
                 };
@@ -250,41 +274,39 @@ impl Wiring {
                     "{at}: its {word} comes from {} and from {}; give them different names or, if \
                      both measure this joint, say with takes = [...] what each of them gives: {}",
                     by(other),
-                    by(source),
+                    by(input),
                     quoted(Takes::ALL.quantities().map(self::word))
                 ));
             }
         }
-        let mut sources = shaft.sources.iter();
-        if sources.any(|source| source.takes.has(Quantity::Position)) {
+        if shaft.position().is_some() {
             return Ok(());
         }
         Err(format!(
             "{at}: no device gives its position (only {}); the position makes the samples",
-            shaft.sources.iter().map(by).collect::<Vec<_>>().join(", ")
+            shaft.inputs.iter().map(by).collect::<Vec<_>>().join(", ")
         ))
     }
 
     /// The device to show the channel of a joint with: the one that gives its position; for a
     /// coupling, the motor in the joint's place.
     fn shown(&self, shaft: &ShaftPlan) -> Option<Shown> {
-        let Target::Channel(channel) = shaft.target else {
+        let ShaftRole::Joint(channel) = shaft.role else {
             return None;
         };
-        let source = position_of(shaft)?;
-        let device = match source.origin {
+        let input = shaft.position()?;
+        let shafts = &self.plan.shafts;
+        let device = match input.origin {
             Origin::Device(device, _) => device,
             Origin::Coupling(number) => {
-                let coupling = self.layout.couplings.get(number)?;
-                let is_it = |&(joint, _): &(usize, usize)| {
-                    self.layout
-                        .shafts
-                        .get(joint)
-                        .is_some_and(|s| s.name == shaft.name)
+                let coupling = self.plan.couplings.get(number)?;
+                let is_it = |joint: &ShaftInput| {
+                    let joint = shafts.get(joint.shaft);
+                    joint.is_some_and(|joint| joint.name == shaft.name)
                 };
                 let place = coupling.joints.iter().position(is_it)?;
-                let motor = self.layout.shafts.get(*coupling.motors.get(place)?)?;
-                match position_of(motor)?.origin {
+                let motor = shafts.get(*coupling.motors.get(place)?)?;
+                match motor.position()?.origin {
                     Origin::Device(device, _) => device,
                     Origin::Coupling(_) => return None,
                 }
@@ -293,34 +315,23 @@ impl Wiring {
         Some(Shown {
             channel,
             device,
-            max_silence: source.max_silence,
+            max_silence: input.max_silence,
         })
     }
 }
 
-/// The source that gives a shaft's position.
-fn position_of(shaft: &ShaftPlan) -> Option<&SourcePlan> {
-    let mut sources = shaft.sources.iter();
-    sources.find(|source| source.takes.has(Quantity::Position))
-}
-
-/// The maximum silence of a shaft \[ns\].
-fn silence_of(shaft: &ShaftPlan) -> Option<Nanos> {
-    position_of(shaft).map(|source| source.max_silence)
-}
-
 /// The word of a quantity in `takes`.
-pub(super) const fn word(quantity: Quantity) -> &'static str {
+pub(super) const fn word(quantity: JointQuantity) -> &'static str {
     match quantity {
-        Quantity::Position => "position",
-        Quantity::Velocity => "velocity",
-        Quantity::Acceleration => "acceleration",
-        Quantity::Torque => "torque",
-        Quantity::Current => "current",
+        JointQuantity::Position => "position",
+        JointQuantity::Velocity => "velocity",
+        JointQuantity::Acceleration => "acceleration",
+        JointQuantity::Torque => "torque",
+        JointQuantity::Current => "current",
     }
 }
 
-fn takes(at: &str, list: Option<&[Quantity]>) -> Result<Takes, String> {
+fn takes(at: &str, list: Option<&[JointQuantity]>) -> Result<Takes, String> {
     match list {
         None => Ok(Takes::ALL),
         Some([]) => Err(format!(
@@ -332,7 +343,7 @@ fn takes(at: &str, list: Option<&[Quantity]>) -> Result<Takes, String> {
 }
 
 /// The range of a joint's table, checked; `at` is its place.
-fn wrap(at: &str, raw: &RawJoint, map: &JointMap) -> Result<Option<Wrap>, String> {
+fn wrap(at: &str, raw: &JointConfig, map: &JointMap) -> Result<Option<Wrap>, String> {
     let (range, centre, speed) = match (raw.wraps_rad, raw.centre_rad, raw.max_speed_radps) {
         (None, None, None) => return Ok(None),
         (Some(range), Some(centre), Some(speed)) => (range, centre, speed),

@@ -7,7 +7,7 @@ use proprio_topics::Nanos;
 
 /// A device on a bus.
 #[derive(Debug, Clone)]
-pub struct Device {
+pub struct FoundDevice {
     /// Its name in the configuration: driver and address, after a prefix.
     pub name: String,
     /// What speaks for it.
@@ -18,7 +18,7 @@ pub struct Device {
     pub(super) claims: Vec<Claim>,
 }
 
-impl Device {
+impl FoundDevice {
     /// Whether the frames of `id` are explained by it.
     #[must_use]
     pub fn explains(&self, id: Id) -> bool {
@@ -53,8 +53,8 @@ fn claims(finding: &Finding) -> Result<Vec<Claim>, String> {
 
 /// The devices on the bus of `heard`, the surest first. `prefix` begins their names.
 #[must_use]
-pub fn devices(heard: &Traffic, prefix: &str) -> Vec<Device> {
-    let mut devices: Vec<Device> = Vec::new();
+pub fn devices(heard: &Traffic, prefix: &str) -> Vec<FoundDevice> {
+    let mut devices: Vec<FoundDevice> = Vec::new();
     for finding in recognise(heard) {
         let claims = match (finding.unusable, claims(&finding)) {
             ("", Ok(claims)) => claims,
@@ -65,7 +65,7 @@ pub fn devices(heard: &Traffic, prefix: &str) -> Vec<Device> {
             _ => Vec::new(),
         };
         // As the plan refuses it: one identifier, two readers.
-        let rivals = |device: &Device| {
+        let rivals = |device: &FoundDevice| {
             let mut pairs = claims
                 .iter()
                 .flat_map(|a| device.claims.iter().map(move |b| (a, b)));
@@ -79,7 +79,7 @@ pub fn devices(heard: &Traffic, prefix: &str) -> Vec<Device> {
         let is_free = |name: &String| devices.iter().all(|device| device.name != *name);
         let more = (2..).map(|number| format!("{base}_{number}"));
         let name = std::iter::once(base.clone()).chain(more).find(is_free);
-        devices.push(Device {
+        devices.push(FoundDevice {
             name: name.unwrap_or(base),
             finding,
             rivals: Vec::new(),
@@ -88,7 +88,7 @@ pub fn devices(heard: &Traffic, prefix: &str) -> Vec<Device> {
     }
     // Of those that are equally sure, as a person counts them.
     devices.sort_by(|a, b| {
-        let order = |device: &Device| (device.finding.driver, device.finding.address);
+        let order = |device: &FoundDevice| (device.finding.driver, device.finding.address);
         let by_certainty = b.finding.certainty().cmp(&a.finding.certainty());
         by_certainty.then(order(a).cmp(&order(b)))
     });

@@ -1,26 +1,26 @@
 //! The tables of gateway.toml for the devices found, with comments about what a person has to fill
 //! in.
 
-use super::found::Device;
-use crate::config::Source;
+use super::found::FoundDevice;
+use crate::config::FrameSource;
 use crate::link::adapter::Adapter;
 use proprio_drivers::{Certainty, Finding};
 use std::fmt::Write as _;
 
 /// A bus that was scanned.
 #[derive(Debug, Clone)]
-pub struct Bus {
+pub struct ScannedBus {
     /// Its name in the configuration.
     pub name: String,
     /// The source of its frames.
-    pub source: Source,
+    pub source: FrameSource,
     /// The name of its interface when it was scanned, if the source does not say it; empty if it
     /// has none.
     pub interface: String,
     /// Its bit rate, and that of the data phase of CAN FD \[bit/s\]; 0 if not known.
     pub bit_rates: (u32, u32),
     /// Its devices.
-    pub devices: Vec<Device>,
+    pub devices: Vec<FoundDevice>,
 }
 
 /// A device that sends more seldom than this \[ms\] needs a longer maximum silence than the usual
@@ -52,7 +52,7 @@ fn quoted(text: &str) -> String {
 
 /// `[[bus.device]]` for each device; `joints` counts their joints. Possible ones are comments.
 #[must_use]
-pub fn tables(devices: &[Device], joints: &mut usize) -> String {
+pub fn tables(devices: &[FoundDevice], joints: &mut usize) -> String {
     let mut text = String::new();
     for device in devices {
         let finding = &device.finding;
@@ -105,7 +105,7 @@ fn line(text: &str) -> String {
         .collect()
 }
 
-fn keys_of(device: &Device, joints: &mut usize, text: &mut String) {
+fn keys_of(device: &FoundDevice, joints: &mut usize, text: &mut String) {
     let finding = &device.finding;
     let _ = writeln!(text, "[[bus.device]]");
     let _ = writeln!(text, "driver = {}", quoted(finding.driver));
@@ -142,8 +142,8 @@ fn keys_of(device: &Device, joints: &mut usize, text: &mut String) {
 }
 
 /// The sender of the SYNC, if a device waits for one.
-fn sync(devices: &[Device]) -> String {
-    let waits = |device: &&Device| {
+fn sync(devices: &[FoundDevice]) -> String {
+    let waits = |device: &&FoundDevice| {
         let finding = &device.finding;
         finding.needs_sync && finding.certainty() > Some(Certainty::Possible)
     };
@@ -162,7 +162,7 @@ fn sync(devices: &[Device]) -> String {
 
 /// A whole gateway.toml for robot `robot`.
 #[must_use]
-pub fn file(robot: &str, buses: &[Bus]) -> String {
+pub fn file(robot: &str, buses: &[ScannedBus]) -> String {
     let mut text = format!(
         "# Written by `proprio setup`. `fill in` marks what nobody but a person knows; devices in\n\
          # comments are possible, and not sure enough to be used. To check it (which refuses what\n\
@@ -178,12 +178,12 @@ pub fn file(robot: &str, buses: &[Bus]) -> String {
     let mut joints = 0;
     for bus in buses {
         let source = match &bus.source {
-            Source::SocketCan(Adapter::Interface(name)) => {
+            FrameSource::SocketCan(Adapter::Interface(name)) => {
                 format!("kind = \"socketcan\", interface = {}", quoted(name))
             }
-            Source::SocketCan(adapter) => format!("kind = \"socketcan\", {adapter}"),
-            Source::Virtual { name } => format!("kind = \"virtual\", name = {}", quoted(name)),
-            Source::Replay { log, .. } => {
+            FrameSource::SocketCan(adapter) => format!("kind = \"socketcan\", {adapter}"),
+            FrameSource::Virtual { name } => format!("kind = \"virtual\", name = {}", quoted(name)),
+            FrameSource::Replay { log, .. } => {
                 let log = log.display().to_string();
                 format!("kind = \"replay\", log = {}", quoted(&log))
             }
@@ -219,10 +219,10 @@ mod tests {
     use proprio_topics::Kind;
     use std::path::Path;
 
-    fn bus(name: &str, devices: Vec<Device>) -> Bus {
-        Bus {
+    fn bus(name: &str, devices: Vec<FoundDevice>) -> ScannedBus {
+        ScannedBus {
             name: name.to_owned(),
-            source: Source::SocketCan(Adapter::Serial {
+            source: FrameSource::SocketCan(Adapter::Serial {
                 serial: "00\"42".into(),
                 channel: Some(1),
             }),
@@ -232,8 +232,8 @@ mod tests {
         }
     }
 
-    fn device(driver: &'static str, address: u32, bits: f64) -> Device {
-        Device {
+    fn device(driver: &'static str, address: u32, bits: f64) -> FoundDevice {
+        FoundDevice {
             name: format!("{driver}_{address}"),
             finding: Finding {
                 driver,
@@ -267,8 +267,8 @@ mod tests {
             "new-robot",
             &[
                 bus("arm", vec![strain, hand, motor, drive, possible, foreign]),
-                Bus {
-                    source: Source::Virtual { name: "v".into() },
+                ScannedBus {
+                    source: FrameSource::Virtual { name: "v".into() },
                     interface: String::new(),
                     bit_rates: (0, 0),
                     ..bus("empty", vec![])

@@ -22,12 +22,12 @@
 //!
 //! The components of one vector (`fx` to `tz`; `ax` to `az`; ...) are all present or all empty. A
 //! row that breaks this rule or holds a cell that is not a finite number is skipped, counted and
-//! reported by [`Reader::report`].
+//! reported by [`TableReader::report`].
 
 mod columns;
 mod reader;
 mod writer;
 
 pub use columns::{Series, Value, What};
-pub use reader::{BadRow, Error, Item, Reader, Report, Row};
-pub use writer::{Columns, Writer};
+pub use reader::{BadRow, Row, SeriesValue, TableError, TableReader, TableReport};
+pub use writer::{Columns, TableWriter};

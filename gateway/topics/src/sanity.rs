@@ -54,7 +54,7 @@ const OUTLIER: f64 = 4.0;
 
 /// The past of one axis. NaN: not known.
 #[derive(Debug, Clone, Copy)]
-struct Axis {
+struct AxisHistory {
     last: f64,
     /// The last change.
     change: f64,
@@ -68,7 +68,7 @@ struct Axis {
     frozen: bool,
 }
 
-impl Axis {
+impl AxisHistory {
     const NEW: Self = Self {
         last: f64::NAN,
         change: f64::NAN,
@@ -131,7 +131,7 @@ impl Axis {
 /// The repeats of a channel of `N` axes.
 #[derive(Debug, Clone, Copy)]
 pub struct Repeats<const N: usize> {
-    axes: [Axis; N],
+    axes: [AxisHistory; N],
     /// All axes together are frozen.
     all: bool,
 }
@@ -139,7 +139,7 @@ pub struct Repeats<const N: usize> {
 impl<const N: usize> Default for Repeats<N> {
     fn default() -> Self {
         Self {
-            axes: [Axis::NEW; N],
+            axes: [AxisHistory::NEW; N],
             all: false,
         }
     }
@@ -154,7 +154,7 @@ impl<const N: usize> Repeats<N> {
     pub fn look(&mut self, values: &[f64; N], quality: Quality, least: u32) -> u16 {
         let axes = &mut self.axes;
         if quality.intersects(Quality::FROZEN | Quality::SATURATED) {
-            axes.iter_mut().for_each(Axis::interrupt);
+            axes.iter_mut().for_each(AxisHistory::interrupt);
             self.all = false;
             return 0;
         }
@@ -171,7 +171,7 @@ impl<const N: usize> Repeats<N> {
         if self.all && together == 0 {
             self.all = false;
             let same = axes.iter_mut().filter(|axis| axis.run > 0);
-            same.for_each(Axis::release);
+            same.for_each(AxisHistory::release);
             return 0;
         }
         if longest < least {
@@ -179,7 +179,7 @@ impl<const N: usize> Repeats<N> {
         }
         let certain =
             |run: u32, surprise: f64| run >= least && f64::from(run) * surprise >= CERTAINTY;
-        self.all |= certain(together, measured().map(Axis::surprise).sum());
+        self.all |= certain(together, measured().map(AxisHistory::surprise).sum());
         let mut mask = 0;
         let numbered = (0..).zip(axes.iter_mut());
         for (number, axis) in numbered.filter(|(_, axis)| !axis.last.is_nan()) {
@@ -214,7 +214,7 @@ const GROWTH: f64 = 2.0;
 
 /// The path of one axis.
 #[derive(Debug, Clone, Copy)]
-struct Path {
+struct AxisPath {
     /// The last reading that is not doubtful.
     t: Nanos,
     value: f64,
@@ -248,7 +248,7 @@ struct Path {
     is_off: bool,
 }
 
-impl Path {
+impl AxisPath {
     const NEW: Self = Self {
         t: Nanos::ZERO,
         value: f64::NAN,
@@ -393,11 +393,11 @@ impl Path {
 /// changed; if it is where those before lead, one reading was wrong. A load or motion that sets in
 /// at once costs a reading, or a few while it grows.
 #[derive(Debug, Clone, Copy)]
-pub struct Jumps<const N: usize>([Path; N]);
+pub struct Jumps<const N: usize>([AxisPath; N]);
 
 impl<const N: usize> Default for Jumps<N> {
     fn default() -> Self {
-        Self([Path::NEW; N])
+        Self([AxisPath::NEW; N])
     }
 }
 
@@ -406,9 +406,9 @@ impl<const N: usize> Jumps<N> {
     #[must_use]
     pub fn new(peaks: [f64; N]) -> Self {
         // The line through two readings is off by three errors, and the reading by one.
-        Self(peaks.map(|peak| Path {
+        Self(peaks.map(|peak| AxisPath {
             least: 4.0 * peak,
-            ..Path::NEW
+            ..AxisPath::NEW
         }))
     }
 
@@ -419,7 +419,7 @@ impl<const N: usize> Jumps<N> {
     #[must_use]
     pub fn of_encoders(peaks: [f64; N]) -> Self {
         let paths = Self::new(peaks).0;
-        Self(paths.map(|path| Path {
+        Self(paths.map(|path| AxisPath {
             fastest: FASTEST,
             ..path
         }))
@@ -450,7 +450,7 @@ impl<const N: usize> Jumps<N> {
     pub fn look(&mut self, t: Nanos, values: &[f64; N], quality: Quality) -> bool {
         // An encoder that does not know its zero yet will jump.
         let has_no_zero =
-            |path: &Path| quality.contains(Quality::NOT_CALIBRATED) && path.fastest.is_finite();
+            |path: &AxisPath| quality.contains(Quality::NOT_CALIBRATED) && path.fastest.is_finite();
         for path in &mut self.0 {
             if quality.contains(Quality::ZERO_CHANGED) || has_no_zero(path) {
                 path.count = 0;

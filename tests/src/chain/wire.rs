@@ -4,7 +4,7 @@
 use crate::truth::random::Random;
 use proprio_drivers::{Claim, Format, Frame, Id};
 use proprio_gateway::clock::Clock;
-use proprio_gateway::link::{Link, LinkCounters, Received, SendError};
+use proprio_gateway::link::{Link, LinkCounters, Received, TransmitError};
 use proprio_simulator::simulator::BusSimulator;
 use proprio_topics::{LinkState, Nanos, StampKind};
 use std::collections::VecDeque;
@@ -368,13 +368,13 @@ impl Wire {
         }
     }
 
-    fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
+    fn send(&mut self, frame: &Frame) -> Result<(), TransmitError> {
         let now = self.clock.now();
         if self.state_at(now) != LinkState::Up {
-            return Err(SendError::NotUp);
+            return Err(TransmitError::NotUp);
         }
         match self.fault(now, None) {
-            Fault::Full => return Err(SendError::Full),
+            Fault::Full => return Err(TransmitError::Full),
             Fault::Deaf if self.random.happens(0.2) => return Ok(()),
             _ => {}
         }
@@ -406,7 +406,7 @@ impl Link for End {
         self.with(|wire| wire.recv(deadline))
     }
 
-    fn send(&mut self, frame: &Frame) -> Result<(), SendError> {
+    fn send(&mut self, frame: &Frame) -> Result<(), TransmitError> {
         self.with(|wire| wire.send(frame))
     }
 

@@ -23,7 +23,7 @@ pub(super) struct Truth {
 
 impl Truth {
     pub(super) fn read(file: &Path, joints: &[String]) -> anyhow::Result<Self> {
-        let mut reader = csv::Reader::new(BufReader::new(File::open(file)?))?;
+        let mut reader = csv::TableReader::new(BufReader::new(File::open(file)?))?;
         let series: Vec<Option<usize>> = joints
             .iter()
             .map(|j| {

@@ -3,7 +3,7 @@
 
 use super::stamp::parse_stamp;
 use crate::log::record::{
-    Direction, ERROR_FLAG, Interface, LineError, Parsed, ParsedLine, Record, StampForm,
+    ERROR_FLAG, FrameDirection, Interface, LineError, OwnedRecord, ParsedLine, Record, StampForm,
 };
 use crate::log::text::{hex, hex_byte};
 use proprio_drivers::{Format, Frame, Id};
@@ -21,7 +21,7 @@ pub enum Line<'a> {
 
 impl<'a> Line<'a> {
     /// Parses one line, with or without its line end. A relative stamp is returned as written; see
-    /// [`Reader`](crate::log::Reader).
+    /// [`LogReader`](crate::log::LogReader).
     ///
     /// # Errors
     /// [`LineError`] names the part that cannot be read.
@@ -94,8 +94,8 @@ pub(in crate::log) fn parse_line(line: &[u8]) -> Result<ParsedLine, LineError> {
             let (mut frame, used) = parse_log_frame(identifier()?, data)?;
             let direction = match data.get(used..).unwrap_or(&[]).trim_ascii_start() {
                 [] => None,
-                b"R" => Some(Direction::Received),
-                b"T" => Some(Direction::Sent),
+                b"R" => Some(FrameDirection::Received),
+                b"T" => Some(FrameDirection::Sent),
                 _ => return Err(LineError::Trailing),
             };
             frame.whole |= direction.is_some();
@@ -117,7 +117,7 @@ pub(in crate::log) fn parse_line(line: &[u8]) -> Result<ParsedLine, LineError> {
             relative
         }
     };
-    Ok(ParsedLine::Record(Parsed {
+    Ok(ParsedLine::Record(OwnedRecord {
         stamp: stamp.map(|s| (s.t, form(s.absolute))),
         interface: Interface::Text(interface),
         direction,
@@ -127,7 +127,7 @@ pub(in crate::log) fn parse_line(line: &[u8]) -> Result<ParsedLine, LineError> {
 }
 
 /// The columns of `candump -x`: the direction, and whether bit rate switch and error state are set.
-type Columns = (Direction, (bool, bool));
+type Columns = (FrameDirection, (bool, bool));
 
 /// Parses the columns of `candump -x`, such as `TX B E  `.
 fn parse_columns(rest: &[u8]) -> (Option<Columns>, &[u8]) {
@@ -143,9 +143,9 @@ fn parse_columns(rest: &[u8]) -> (Option<Columns>, &[u8]) {
             after @ ..,
         ] => {
             let direction = if *d == b'T' {
-                Direction::Sent
+                FrameDirection::Sent
             } else {
-                Direction::Received
+                FrameDirection::Received
             };
             (
                 Some((direction, (*brs == b'B', *esi == b'E'))),

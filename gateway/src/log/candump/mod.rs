@@ -34,11 +34,11 @@
 //! An absolute stamp has ten digits of seconds or a date. A shorter stamp is relative. In the log
 //! format it counts from the origin of the log (other programs write such stamps). In the screen
 //! format it is `-t z` or `-t d`, which one line cannot distinguish: the whole log tells
-//! (`log/stamps.rs`), or [`Reader::with_stamps`] states it. Stamps since the previous line are
+//! (`log/stamps.rs`), or [`LogReader::with_stamps`] states it. Stamps since the previous line are
 //! added up.
 //!
-//! [`Reader`]: super::Reader
-//! [`Reader::with_stamps`]: super::Reader::with_stamps
+//! [`LogReader`]: super::LogReader
+//! [`LogReader::with_stamps`]: super::LogReader::with_stamps
 //!
 //! Sources: can-utils `candump.c`, `lib.c` (`parse_canframe`, `sprint_canframe`,
 //! `sprint_long_canframe`) and `lib.h`; the golden lines of tests/candump.rs were printed by

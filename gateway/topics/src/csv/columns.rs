@@ -7,7 +7,7 @@ use std::string::String;
 
 /// The quantity in one column of a channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) enum Field {
+pub(super) enum ColumnQuantity {
     /// A value of a reading of this kind: its place in [`Kind::fields`].
     Value(Kind, u8),
     Quality,
@@ -19,8 +19,8 @@ pub(super) enum Field {
 const CONTACT: [&str; 8] = ["active", "px", "py", "pz", "p_std", "dx", "dy", "dz"];
 
 /// All columns of a contact.
-pub(super) fn contact_fields() -> impl Iterator<Item = Field> {
-    (0_u8..).take(CONTACT.len()).map(Field::Contact)
+pub(super) fn contact_fields() -> impl Iterator<Item = ColumnQuantity> {
+    (0_u8..).take(CONTACT.len()).map(ColumnQuantity::Contact)
 }
 
 /// The readings that a channel of kind `kind` can have, its main one first.
@@ -108,11 +108,13 @@ impl Cells {
         contact: [f64::NAN; CONTACT.len()],
     };
 
-    pub(super) fn slot(&mut self, field: Field) -> Option<&mut f64> {
+    pub(super) fn slot(&mut self, field: ColumnQuantity) -> Option<&mut f64> {
         match field {
-            Field::Value(kind, i) => self.values.get_mut(kind as usize)?.get_mut(usize::from(i)),
-            Field::Quality => Some(&mut self.quality),
-            Field::Contact(i) => self.contact.get_mut(usize::from(i)),
+            ColumnQuantity::Value(kind, i) => {
+                self.values.get_mut(kind as usize)?.get_mut(usize::from(i))
+            }
+            ColumnQuantity::Quality => Some(&mut self.quality),
+            ColumnQuantity::Contact(i) => self.contact.get_mut(usize::from(i)),
         }
     }
 }
@@ -125,7 +127,7 @@ pub(super) const fn word(what: What) -> &'static str {
 }
 
 /// Parses a column's name into kind (`None`: a channel's quality), name and field.
-pub(super) fn parse_column(column: &str) -> Option<(Option<What>, &str, Field)> {
+pub(super) fn parse_column(column: &str) -> Option<(Option<What>, &str, ColumnQuantity)> {
     let (front, field) = column.rsplit_once('/')?;
     if let Some((head, name)) = front.split_once('/') {
         let what = match head {
@@ -140,20 +142,20 @@ pub(super) fn parse_column(column: &str) -> Option<(Option<What>, &str, Field)> 
             return parse_field(what, field).map(|f| (Some(what), name, f));
         }
     }
-    (field == "quality" && !front.is_empty()).then_some((None, front, Field::Quality))
+    (field == "quality" && !front.is_empty()).then_some((None, front, ColumnQuantity::Quality))
 }
 
-pub(super) fn parse_field(what: What, field: &str) -> Option<Field> {
+pub(super) fn parse_field(what: What, field: &str) -> Option<ColumnQuantity> {
     if field == "quality" && what != What::Contact {
-        return Some(Field::Quality);
+        return Some(ColumnQuantity::Quality);
     }
     let What::Channel(kind) = what else {
         let at = CONTACT.iter().position(|name| *name == field)?;
-        return Some(Field::Contact(u8::try_from(at).ok()?));
+        return Some(ColumnQuantity::Contact(u8::try_from(at).ok()?));
     };
     readings(kind).iter().find_map(|&kind| {
         let at = kind.fields().iter().position(|name| *name == field)?;
-        Some(Field::Value(kind, u8::try_from(at).ok()?))
+        Some(ColumnQuantity::Value(kind, u8::try_from(at).ok()?))
     })
 }
 
@@ -222,11 +224,13 @@ fn contact_of(cells: &[f64; CONTACT.len()]) -> Result<Option<ContactState>, Stri
     }))
 }
 
-pub(super) fn field_word(field: Field) -> &'static str {
+pub(super) fn field_word(field: ColumnQuantity) -> &'static str {
     match field {
-        Field::Value(kind, i) => (kind.fields().get(usize::from(i)).copied()).unwrap_or_default(),
-        Field::Quality => "quality",
-        Field::Contact(i) => CONTACT.get(usize::from(i)).copied().unwrap_or_default(),
+        ColumnQuantity::Value(kind, i) => {
+            (kind.fields().get(usize::from(i)).copied()).unwrap_or_default()
+        }
+        ColumnQuantity::Quality => "quality",
+        ColumnQuantity::Contact(i) => CONTACT.get(usize::from(i)).copied().unwrap_or_default(),
     }
 }
 
@@ -250,7 +254,7 @@ pub(super) fn spread(value: &Value, cells: &mut Cells) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::csv::{Columns, Reader, Row, Writer};
+    use crate::csv::{Columns, Row, TableReader, TableWriter};
     use crate::{Actuator, Imu, JointState, Nanos, Temperature, Wrench};
     use std::vec;
     use std::vec::Vec;
@@ -347,7 +351,7 @@ mod tests {
             (3, Value::Contact(touch)),
         ];
         assert_ne!(touch, ContactState::configured(true));
-        let mut writer = Writer::new(Vec::new(), &series, Columns::All).unwrap();
+        let mut writer = TableWriter::new(Vec::new(), &series, Columns::All).unwrap();
         for (number, value) in &values {
             writer
                 .push(Some(Nanos(123_456_789)), *number, value)
@@ -358,7 +362,7 @@ mod tests {
             .push(Some(Nanos(123_456_789)), values[0].0, &values[0].1)
             .unwrap();
         let text = String::from_utf8(writer.finish().unwrap()).unwrap();
-        let mut reader = Reader::new(text.as_bytes()).unwrap();
+        let mut reader = TableReader::new(text.as_bytes()).unwrap();
         let (mut rows, mut row) = (Vec::new(), Row::default());
         while reader.next_row(&mut row).unwrap() {
             rows.push(row.clone());
@@ -451,14 +455,14 @@ mod tests {
                 what: What::Channel(kind),
                 name: "one".into(),
             }];
-            let mut writer = Writer::new(Vec::new(), &series, Columns::All).unwrap();
+            let mut writer = TableWriter::new(Vec::new(), &series, Columns::All).unwrap();
             let flags: Vec<Quality> = (0..32).map(|bit| Quality(1 << bit)).collect();
             for (t, flag) in (0..).zip(&flags) {
                 let value = Value::Reading(reading, *flag);
                 writer.push(Some(Nanos(t)), 0, &value).unwrap();
             }
             let text = writer.finish().unwrap();
-            let mut reader = Reader::new(text.as_slice()).unwrap();
+            let mut reader = TableReader::new(text.as_slice()).unwrap();
             let (mut got, mut row) = (Vec::new(), Row::default());
             while reader.next_row(&mut row).unwrap() {
                 let Value::Reading(_, quality) = row.items[0].value else {

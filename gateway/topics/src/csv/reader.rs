@@ -1,7 +1,7 @@
 //! Reads a table row by row. Unusable rows are skipped, counted and reported with the reason.
 
 use super::columns::{
-    Cells, Field, Series, Value, What, items_of, parse_column, parse_field, word,
+    Cells, ColumnQuantity, Series, Value, What, items_of, parse_column, parse_field, word,
 };
 use crate::Nanos;
 use std::borrow::ToOwned;
@@ -13,8 +13,8 @@ use std::vec::Vec;
 
 /// One entry of a row: the value of one series at that instant.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Item {
-    /// The number of its [`Series`] in [`Reader::series`].
+pub struct SeriesValue {
+    /// The number of its [`Series`] in [`TableReader::series`].
     pub series: usize,
     /// Its value.
     pub value: Value,
@@ -23,7 +23,7 @@ pub struct Item {
 /// Why a log cannot be read at all.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum Error {
+pub enum TableError {
     /// The file could not be read.
     #[error(transparent)]
     Io(#[from] io::Error),
@@ -68,19 +68,19 @@ pub struct BadRow {
 
 /// Counts of the rows used and skipped, with reasons.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Report {
+pub struct TableReport {
     /// Rows used.
     pub rows: u64,
     /// Rows skipped.
     pub bad_rows: u64,
-    /// The first skipped rows (at most [`Report::NAMED`]).
+    /// The first skipped rows (at most [`TableReport::NAMED`]).
     pub bad: Vec<BadRow>,
     /// Columns with unknown names.
     pub unknown_columns: Vec<String>,
 }
 
-impl Report {
-    /// Maximum number of entries in [`Report::bad`].
+impl TableReport {
+    /// Maximum number of entries in [`TableReport::bad`].
     pub const NAMED: usize = 10;
 
     /// Adds the report of the rows that follow after `lines` lines.
@@ -98,15 +98,15 @@ impl Report {
     /// Tests whether a table with this complete report is usable.
     ///
     /// # Errors
-    /// [`Error::NoRow`], [`Error::Empty`].
-    pub fn usable(&self) -> Result<(), Error> {
+    /// [`TableError::NoRow`], [`TableError::Empty`].
+    pub fn usable(&self) -> Result<(), TableError> {
         match (self.rows, self.bad.first()) {
-            (0, Some(first)) => Err(Error::NoRow {
+            (0, Some(first)) => Err(TableError::NoRow {
                 rows: self.bad_rows,
                 line: first.line,
                 reason: first.reason.clone(),
             }),
-            (0, None) => Err(Error::Empty),
+            (0, None) => Err(TableError::Empty),
             _ => Ok(()),
         }
     }
@@ -120,17 +120,17 @@ pub struct Row {
     /// Its line in the file.
     pub line: u64,
     /// The values, each channel's main reading first.
-    pub items: Vec<Item>,
+    pub items: Vec<SeriesValue>,
 }
 
 #[derive(Clone)]
-struct Column {
+struct TableColumn {
     series: usize,
-    field: Field,
+    field: ColumnQuantity,
 }
 
 /// Reads a log row by row.
-pub struct Reader<R> {
+pub struct TableReader<R> {
     csv: ::csv::Reader<R>,
     record: ::csv::ByteRecord,
     /// Whether it reads a whole table, including the header.
@@ -138,19 +138,19 @@ pub struct Reader<R> {
     series: Vec<Series>,
     names: ::csv::StringRecord,
     /// Per column: series and field; `None` if unknown. The stamp is in column `t_column`.
-    columns: Vec<Option<Column>>,
+    columns: Vec<Option<TableColumn>>,
     t_column: usize,
     cells: Vec<Cells>,
-    report: Report,
+    report: TableReport,
 }
 
-impl<R: io::Read> Reader<R> {
+impl<R: io::Read> TableReader<R> {
     /// Reads the header.
     ///
     /// # Errors
-    /// [`Error`]: not a table, no column `t`, two columns of one name, or no column with a known
-    /// name.
-    pub fn new(input: R) -> Result<Self, Error> {
+    /// [`TableError`]: not a table, no column `t`, two columns of one name, or no column with a
+    /// known name.
+    pub fn new(input: R) -> Result<Self, TableError> {
         let mut csv = ::csv::ReaderBuilder::new()
             .flexible(true)
             .trim(::csv::Trim::Headers)
@@ -164,17 +164,17 @@ impl<R: io::Read> Reader<R> {
                 .chars()
                 .take(60)
                 .collect();
-            return Err(Error::NoHeader(begin));
+            return Err(TableError::NoHeader(begin));
         };
         let mut seen = HashMap::new();
         let (mut series, mut numbers) = (Vec::new(), HashMap::new());
         let mut columns = Vec::new();
-        let mut report = Report::default();
+        let mut report = TableReport::default();
         // `<channel>/quality` names no kind: it belongs to the first channel of that name.
         let mut qualities = Vec::new();
         for (at, name) in header.iter().enumerate() {
             if seen.insert(name.to_owned(), at).is_some() {
-                return Err(Error::TwoColumns(name.to_owned()));
+                return Err(TableError::TwoColumns(name.to_owned()));
             }
             let column = parse_column(name).and_then(|(what, channel, field)| {
                 let Some(what) = what else {
@@ -189,7 +189,7 @@ impl<R: io::Read> Reader<R> {
                     series.push(key);
                     series.len() - 1
                 });
-                Some(Column {
+                Some(TableColumn {
                     series: number,
                     field,
                 })
@@ -206,9 +206,9 @@ impl<R: io::Read> Reader<R> {
                 .position(|s: &Series| s.name == channel && s.what != What::Contact);
             match (found, columns.get_mut(at)) {
                 (Some(number), Some(column)) => {
-                    *column = Some(Column {
+                    *column = Some(TableColumn {
                         series: number,
-                        field: Field::Quality,
+                        field: ColumnQuantity::Quality,
                     });
                 }
                 _ => report.unknown_columns.push(format!("{channel}/quality")),
@@ -216,7 +216,7 @@ impl<R: io::Read> Reader<R> {
         }
         if series.is_empty() {
             let names: Vec<_> = header.iter().take(8).collect();
-            return Err(Error::NothingKnown(names.join(", ")));
+            return Err(TableError::NothingKnown(names.join(", ")));
         }
         let cells = std::vec![Cells::EMPTY; series.len()];
         Ok(Self {
@@ -233,11 +233,11 @@ impl<R: io::Read> Reader<R> {
     }
 
     /// A reader of further rows of this table, with lines counted from the first of them. For
-    /// reading a table in parts: combine the parts' reports with [`Report::add`] and
-    /// [`Report::usable`].
+    /// reading a table in parts: combine the parts' reports with [`TableReport::add`] and
+    /// [`TableReport::usable`].
     #[must_use]
-    pub fn further<S: io::Read>(&self, rows: S) -> Reader<S> {
-        Reader {
+    pub fn further<S: io::Read>(&self, rows: S) -> TableReader<S> {
+        TableReader {
             csv: ::csv::ReaderBuilder::new()
                 .flexible(true)
                 .has_headers(false)
@@ -249,11 +249,11 @@ impl<R: io::Read> Reader<R> {
             columns: self.columns.clone(),
             t_column: self.t_column,
             cells: self.cells.clone(),
-            report: Report::default(),
+            report: TableReport::default(),
         }
     }
 
-    /// The channels and contacts of this log; [`Item::series`] is an index of it.
+    /// The channels and contacts of this log; [`SeriesValue::series`] is an index of it.
     #[must_use]
     pub fn series(&self) -> &[Series] {
         &self.series
@@ -277,16 +277,16 @@ impl<R: io::Read> Reader<R> {
 
     /// Counts of rows read and skipped so far.
     #[must_use]
-    pub fn report(&self) -> &Report {
+    pub fn report(&self) -> &TableReport {
         &self.report
     }
 
     /// Reads the next usable row into `row`; returns `false` at the end.
     ///
     /// # Errors
-    /// [`Error`]: the file cannot be read further; or a whole table is at its end and no row was
-    /// usable.
-    pub fn next_row(&mut self, row: &mut Row) -> Result<bool, Error> {
+    /// [`TableError`]: the file cannot be read further; or a whole table is at its end and no row
+    /// was usable.
+    pub fn next_row(&mut self, row: &mut Row) -> Result<bool, TableError> {
         loop {
             match self.csv.read_byte_record(&mut self.record) {
                 Ok(true) => {}
@@ -315,7 +315,7 @@ impl<R: io::Read> Reader<R> {
 
     fn skip(&mut self, line: u64, reason: String) {
         self.report.bad_rows += 1;
-        if self.report.bad.len() < Report::NAMED {
+        if self.report.bad.len() < TableReport::NAMED {
             self.report.bad.push(BadRow { line, reason });
         }
     }
@@ -364,7 +364,7 @@ impl<R: io::Read> Reader<R> {
         }
         for (number, (series, cells)) in self.series.iter().zip(&self.cells).enumerate() {
             items_of(series, cells, |value| {
-                row.items.push(Item {
+                row.items.push(SeriesValue {
                     series: number,
                     value,
                 });
@@ -379,8 +379,8 @@ impl<R: io::Read> Reader<R> {
 mod tests {
     use super::*;
 
-    fn read(text: &str) -> Result<(Vec<Row>, Report, Vec<Series>), Error> {
-        let mut reader = Reader::new(text.as_bytes())?;
+    fn read(text: &str) -> Result<(Vec<Row>, TableReport, Vec<Series>), TableError> {
+        let mut reader = TableReader::new(text.as_bytes())?;
         let (mut rows, mut row) = (Vec::new(), Row::default());
         while reader.next_row(&mut row)? {
             rows.push(row.clone());
@@ -426,14 +426,17 @@ mod tests {
     fn a_log_without_a_usable_row_is_an_error() {
         assert!(matches!(
             read("t,joint/a/position\n1,x\n"),
-            Err(Error::NoRow { line: 2, .. })
+            Err(TableError::NoRow { line: 2, .. })
         ));
-        assert!(matches!(read("t,joint/a/position\n"), Err(Error::Empty)));
+        assert!(matches!(
+            read("t,joint/a/position\n"),
+            Err(TableError::Empty)
+        ));
         assert!(matches!(
             read("time,joint/a/position\n"),
-            Err(Error::NoHeader(_))
+            Err(TableError::NoHeader(_))
         ));
-        assert!(matches!(read("t,t\n"), Err(Error::TwoColumns(_))));
-        assert!(matches!(read("t,x\n"), Err(Error::NothingKnown(_))));
+        assert!(matches!(read("t,t\n"), Err(TableError::TwoColumns(_))));
+        assert!(matches!(read("t,x\n"), Err(TableError::NothingKnown(_))));
     }
 }

@@ -1,7 +1,8 @@
 //! Writes a table row by row. Values of one instant share a row.
 
 use super::columns::{
-    Cells, Field, Series, Value, What, contact_fields, field_word, readings, spread, usual, word,
+    Cells, ColumnQuantity, Series, Value, What, contact_fields, field_word, readings, spread,
+    usual, word,
 };
 use crate::{Kind, Nanos};
 use std::format;
@@ -9,7 +10,7 @@ use std::io;
 use std::string::String;
 use std::vec::Vec;
 
-/// Which columns a [`Writer`] writes per channel, besides its quality.
+/// Which columns a [`TableWriter`] writes per channel, besides its quality.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Columns {
     /// The columns that the estimator reads: position and velocity; the wrench; accelerations and
@@ -20,10 +21,10 @@ pub enum Columns {
 }
 
 /// Writes a log row by row.
-pub struct Writer<W> {
+pub struct TableWriter<W> {
     output: W,
     /// Per series: its first column and its fields.
-    series: Vec<(What, usize, Vec<Field>)>,
+    series: Vec<(What, usize, Vec<ColumnQuantity>)>,
     /// The current row, one cell per column after `t`; NaN is empty.
     cells: Vec<f64>,
     /// The text of the current row.
@@ -31,7 +32,7 @@ pub struct Writer<W> {
     pending: Option<Option<Nanos>>,
 }
 
-impl<W: io::Write> Writer<W> {
+impl<W: io::Write> TableWriter<W> {
     /// Writes the header for `series`, each with `columns`.
     ///
     /// # Errors
@@ -44,7 +45,7 @@ impl<W: io::Write> Writer<W> {
             for field in &fields {
                 header.push(',');
                 match field {
-                    Field::Quality => header.push_str(&one.name),
+                    ColumnQuantity::Quality => header.push_str(&one.name),
                     _ => header.push_str(&format!("{}/{}", word(one.what), one.name)),
                 }
                 header.push('/');
@@ -94,7 +95,7 @@ impl<W: io::Write> Writer<W> {
             .zip(fields);
         let clash = taken
             .into_iter()
-            .any(|((old, new), f)| *f != Field::Quality && !old.is_nan() && !new.is_nan());
+            .any(|((old, new), f)| *f != ColumnQuantity::Quality && !old.is_nan() && !new.is_nan());
         if self.pending.is_some_and(|p| p != t || t.is_none()) || clash {
             self.flush_row()?;
         }
@@ -108,7 +109,7 @@ impl<W: io::Write> Writer<W> {
             .zip(incoming)
             .zip(fields)
         {
-            if *field == Field::Quality && !cell.is_nan() && !new.is_nan() {
+            if *field == ColumnQuantity::Quality && !cell.is_nan() && !new.is_nan() {
                 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
                 let both = *cell as u32 | new as u32;
                 *cell = f64::from(both);
@@ -184,17 +185,21 @@ fn write_integer(text: &mut Vec<u8>, value: i32) {
     text.extend_from_slice(digits.get(at..).unwrap_or_default());
 }
 
-fn fields_of(what: What, columns: Columns) -> Vec<Field> {
+fn fields_of(what: What, columns: Columns) -> Vec<ColumnQuantity> {
     let What::Channel(kind) = what else {
         return contact_fields().collect();
     };
-    let values = |kind: Kind, count| (0_u8..).take(count).map(move |i| Field::Value(kind, i));
-    let mut fields: Vec<Field> = match columns {
+    let values = |kind: Kind, count| {
+        (0_u8..)
+            .take(count)
+            .map(move |i| ColumnQuantity::Value(kind, i))
+    };
+    let mut fields: Vec<ColumnQuantity> = match columns {
         Columns::Main => values(kind, usual(kind)).collect(),
         Columns::All => (readings(kind).iter())
             .flat_map(|&kind| values(kind, kind.fields().len()))
             .collect(),
     };
-    fields.push(Field::Quality);
+    fields.push(ColumnQuantity::Quality);
     fields
 }

@@ -4,8 +4,8 @@ use super::bell::Bell;
 use super::error::{SHM, transport};
 use super::guard::Guard;
 use super::lock::{FEW_STEPS, Lock, STEPS};
-use super::memory::{self, Held, Made};
-use super::sweep::{self, Place, SweepCounts};
+use super::memory::{self, MadeFile, OpenMappings};
+use super::sweep::{self, DomainPaths, SweepCounts};
 use super::{DomainError, PortError};
 use iceoryx2::prelude::{
     Config, FileName, LogLevel, Node, NodeBuilder, Path as IoxPath, SemanticString, ServiceName,
@@ -76,7 +76,7 @@ impl DomainConfig {
         Self { base, name }
     }
 
-    fn place(&self) -> Result<Place, DomainError> {
+    fn place(&self) -> Result<DomainPaths, DomainError> {
         let legal = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
         if self.name.is_empty() || self.name.len() > 32 || !self.name.chars().all(legal) {
             return Err(DomainError::Name {
@@ -126,7 +126,7 @@ impl DomainConfig {
             &base.dev().to_le_bytes(),
             &base.ino().to_le_bytes(),
         ]);
-        Ok(Place {
+        Ok(DomainPaths {
             root,
             lock,
             prefix: format!("proprio_{hash:016x}_"),
@@ -165,7 +165,7 @@ impl<S: Service> Clone for Domain<S> {
 #[derive(Debug)]
 struct Inner<S: Service> {
     config: DomainConfig,
-    place: Place,
+    place: DomainPaths,
     iceoryx: Config,
     epoch: u64,
     id: u128,
@@ -177,9 +177,9 @@ struct Inner<S: Service> {
     /// For how long it waits for the lock.
     steps: u32,
     /// The files that this process has made.
-    made: Mutex<Vec<Made>>,
+    made: Mutex<Vec<MadeFile>>,
     /// What it holds of a domain that was given up.
-    held: Mutex<Held>,
+    held: Mutex<OpenMappings>,
 }
 
 impl Domain {
@@ -365,7 +365,7 @@ impl<S: Service> Domain<S> {
         // If a stopped process holds the lock, drop without it: a program must be able to end.
         let _lock = Lock::take(&self.inner.place.lock);
         self.inner.drop_unless_replaced(port);
-        self.inner.made().retain(Made::exists);
+        self.inner.made().retain(MadeFile::exists);
     }
 
     /// Whether everything that this process has made in the domain is as it was: nobody has
@@ -373,7 +373,7 @@ impl<S: Service> Domain<S> {
     #[must_use]
     pub fn is_intact(&self) -> bool {
         self.is_usable()
-            && self.inner.made().iter().all(Made::is_intact)
+            && self.inner.made().iter().all(MadeFile::is_intact)
             && self.inner.emptied().next().is_none()
     }
 
@@ -460,14 +460,14 @@ impl<S: Service> Domain<S> {
 }
 
 /// The segment that counts a domain's nodes. iceoryx2 makes it writable for everybody.
-fn counters(place: &Place) -> impl Iterator<Item = PathBuf> {
+fn counters(place: &DomainPaths) -> impl Iterator<Item = PathBuf> {
     let segments = place.segments().into_iter().flatten();
     let is_counter = |path: &PathBuf| path.extension().is_some_and(|end| end == "global_mgmt");
     segments.map(|(path, _)| path).filter(is_counter)
 }
 
 /// Removes the counter; returns whether there was one.
-fn remove_counter(place: &Place) -> bool {
+fn remove_counter(place: &DomainPaths) -> bool {
     counters(place)
         .filter(|path| fs::remove_file(path).is_ok())
         .count()
@@ -475,18 +475,18 @@ fn remove_counter(place: &Place) -> bool {
 }
 
 /// Leaves the counter to its owner.
-fn protect_counter(place: &Place) {
+fn protect_counter(place: &DomainPaths) {
     for path in counters(place) {
         let _ = fs::set_permissions(path, Permissions::from_mode(0o600));
     }
 }
 
 impl<S: Service> Inner<S> {
-    fn made(&self) -> MutexGuard<'_, Vec<Made>> {
+    fn made(&self) -> MutexGuard<'_, Vec<MadeFile>> {
         self.made.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn keep(&self, made: Vec<Made>) {
+    fn keep(&self, made: Vec<MadeFile>) {
         self.made().extend(made);
     }
 
@@ -501,7 +501,7 @@ impl<S: Service> Inner<S> {
     /// twice, nobody knows what is whose: then that stays until the process ends.
     fn hold(&self) {
         if sweep::is_only(&self.place, self.id) {
-            let held = Held::of(&self.place.prefix);
+            let held = OpenMappings::of(&self.place.prefix);
             *self.held.lock().unwrap_or_else(PoisonError::into_inner) = held;
         }
     }
@@ -568,7 +568,7 @@ pub(super) fn service_name(robot: &str, suffix: &str) -> Result<ServiceName, Por
 
 /// All settings are explicit, because iceoryx2's default reads `config/iceoryx2.toml` of the
 /// consumer's working directory.
-fn iceoryx(place: &Place) -> Result<Config, DomainError> {
+fn iceoryx(place: &DomainPaths) -> Result<Config, DomainError> {
     let failed = |problem: String| DomainError::Transport {
         root: place.root.clone(),
         doing: "cannot name the domain's files",

@@ -6,7 +6,7 @@
 //! Before iceoryx2 makes a file, which touches its first pages, there must be room for all of it.
 
 use super::error::SHM;
-use super::sweep::Place;
+use super::sweep::DomainPaths;
 use super::{DomainError, Topic};
 use crate::maps::{self, Mapping};
 use crate::{
@@ -81,13 +81,13 @@ pub(super) fn is_emptied(meta: &Metadata) -> bool {
 
 /// A file of the domain as it was when this process made it.
 #[derive(Debug)]
-pub(super) struct Made {
+pub(super) struct MadeFile {
     path: PathBuf,
     inode: u64,
     length: u64,
 }
 
-impl Made {
+impl MadeFile {
     fn of(path: PathBuf) -> Option<Self> {
         let meta = fs::metadata(&path).ok()?;
         Some(Self {
@@ -110,7 +110,7 @@ impl Made {
 
 /// The files of the domain at this moment. A connection's file is left out: the reader at its other
 /// end may remove it.
-pub(super) fn files(place: &Place) -> Result<BTreeSet<PathBuf>, DomainError> {
+pub(super) fn files(place: &DomainPaths) -> Result<BTreeSet<PathBuf>, DomainError> {
     let mut files: BTreeSet<PathBuf> = place
         .segments()?
         .into_iter()
@@ -129,7 +129,10 @@ fn entries(folder: &Path) -> impl Iterator<Item = PathBuf> {
 }
 
 /// Allocates all segments of the domain, and returns the files that are not among those `before`.
-pub(super) fn commit(place: &Place, before: &BTreeSet<PathBuf>) -> Result<Vec<Made>, DomainError> {
+pub(super) fn commit(
+    place: &DomainPaths,
+    before: &BTreeSet<PathBuf>,
+) -> Result<Vec<MadeFile>, DomainError> {
     for (path, meta) in place.segments()? {
         // 512 is the unit of st_blocks on every file system (stat(2)).
         if meta.blocks() * 512 < meta.len() {
@@ -139,21 +142,21 @@ pub(super) fn commit(place: &Place, before: &BTreeSet<PathBuf>) -> Result<Vec<Ma
     let made = files(place)?.into_iter();
     Ok(made
         .filter(|path| !before.contains(path))
-        .filter_map(Made::of)
+        .filter_map(MadeFile::of)
         .collect())
 }
 
 /// What this process has mapped and opened of a domain that it gives up. iceoryx2's objects that
 /// hold it are never dropped: they would remove files of the domain that replaces it.
 #[derive(Debug, Default)]
-pub(super) struct Held {
+pub(super) struct OpenMappings {
     /// Lines of the kernel's list.
     mappings: Vec<String>,
     /// Numbers, and the kernel's names of the files.
     descriptors: Vec<(i32, String)>,
 }
 
-impl Held {
+impl OpenMappings {
     /// Everything in files whose names have this prefix.
     pub(super) fn of(prefix: &str) -> Self {
         let lines = maps::own().unwrap_or_default();

@@ -68,7 +68,7 @@ pub struct Reader<T: Topic, S: Service = ipc::Service> {
     heard: Rings,
     /// The changes of the writers before it was opened.
     changes: u32,
-    tally: Tally,
+    tally: SequenceTally,
     invalid: u64,
     last: Option<Header>,
 }
@@ -145,7 +145,7 @@ impl<T: Topic, S: Service> Reader<T, S> {
             failures,
             heard: Rings::default(),
             changes,
-            tally: Tally::new(predecessors),
+            tally: SequenceTally::new(predecessors),
             invalid: 0,
             last: None,
         })
@@ -366,11 +366,11 @@ fn subscribe<T: Topic, S: Service>(
 /// The last writers seen with their next sequence numbers. Their number is fixed, so that counting
 /// never allocates.
 #[derive(Debug)]
-struct Tally {
+struct SequenceTally {
     /// Writers older than the reader: the first payload seen may have any sequence number. All
     /// others begin at 0.
     predecessors: Vec<u128>,
-    writers: [Option<Seen>; Self::WRITERS],
+    writers: [Option<SeenWriter>; Self::WRITERS],
     known_epochs: [u64; Self::WRITERS],
     taken: u64,
     lost: u64,
@@ -378,13 +378,13 @@ struct Tally {
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Seen {
+struct SeenWriter {
     writer: u128,
     next: u64,
     last_taken: u64,
 }
 
-impl Tally {
+impl SequenceTally {
     /// Twice the largest number of writers of any topic.
     const WRITERS: usize = 2 * crate::MAX_BUSES;
 
@@ -432,7 +432,7 @@ impl Tally {
             .iter_mut()
             .min_by_key(|s| s.map_or(0, |s| s.last_taken));
         if let Some(place) = place {
-            *place = Some(Seen {
+            *place = Some(SeenWriter {
                 writer,
                 next,
                 last_taken: self.taken,
@@ -456,7 +456,7 @@ mod tests {
 
     #[test]
     fn gaps_are_counted_per_writer() {
-        let mut tally = Tally::new(vec![1]);
+        let mut tally = SequenceTally::new(vec![1]);
         for (writer, epoch, sequence, lost) in [
             (1, 7, 100, 0), // older than the reader: no loss
             (1, 7, 101, 0),
@@ -474,7 +474,7 @@ mod tests {
 
     #[test]
     fn any_number_of_restarts_is_counted() {
-        let mut tally = Tally::new(vec![]);
+        let mut tally = SequenceTally::new(vec![]);
         for restart in 0..100 {
             tally.count(u128::from(restart), &header(1000 + restart, 0));
             tally.count(u128::from(restart), &header(1000 + restart, 1));
@@ -485,7 +485,7 @@ mod tests {
     /// A bus that goes on is not forgotten for those that come and go.
     #[test]
     fn restarts_of_others_are_no_loss_of_one_that_goes_on() {
-        let mut tally = Tally::new(vec![]);
+        let mut tally = SequenceTally::new(vec![]);
         for restart in 0..100 {
             tally.count(u128::from(1000 + restart), &header(1000 + restart, 0));
             tally.count(1, &header(1, restart));

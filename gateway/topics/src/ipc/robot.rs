@@ -157,7 +157,7 @@ pub struct RobotReader {
     attaching: Attaching,
     max_age: Nanos,
     now: Nanos,
-    ports: Ports,
+    ports: OpenPorts,
     wanted: Vec<Wanted>,
     torques: Box<Option<TorqueEstimate>>,
     contacts: Box<Option<ContactEstimate>>,
@@ -169,7 +169,7 @@ pub struct RobotReader {
 
 /// The open ports.
 #[derive(Debug, Default)]
-struct Ports {
+struct OpenPorts {
     torques: Option<Port<TorqueEstimate>>,
     contacts: Option<Port<ContactEstimate>>,
     descriptions: Option<Port<Description>>,
@@ -197,7 +197,7 @@ impl RobotReader {
             attaching: Attaching::start(domain.clone(), robot.to_owned())?,
             max_age,
             now: Nanos::MIN,
-            ports: Ports::default(),
+            ports: OpenPorts::default(),
             wanted: Vec::new(),
             torques: Box::new(None),
             contacts: Box::new(None),
@@ -586,14 +586,14 @@ const PORTS: usize = 4;
 /// The thread that opens ports, as the cycle sees it.
 #[derive(Debug)]
 struct Attaching {
-    shared: Arc<Shared>,
+    shared: Arc<AttachState>,
     arrivals: Receiver<Passed>,
     back: SyncSender<Passed>,
     thread: Option<JoinHandle<()>>,
 }
 
 #[derive(Debug, Default)]
-struct Shared {
+struct AttachState {
     stop: AtomicBool,
     /// Ports have been opened and wait for the cycle.
     has_arrivals: AtomicBool,
@@ -604,7 +604,7 @@ struct Shared {
 
 impl Attaching {
     fn start(domain: DomainConfig, robot: String) -> io::Result<Self> {
-        let shared = Arc::new(Shared::default());
+        let shared = Arc::new(AttachState::default());
         // Room for every port twice: a channel allocates when it is made, and never again.
         let (send, arrivals) = sync_channel(2 * PORTS);
         let (back, returned) = sync_channel(2 * PORTS);
@@ -639,7 +639,7 @@ impl Attaching {
     }
 
     /// Takes the ports that have been opened, and gives all back if they are recalled.
-    fn exchange(&self, ports: &mut Ports) {
+    fn exchange(&self, ports: &mut OpenPorts) {
         if self.shared.has_arrivals.load(Relaxed) && self.shared.has_arrivals.swap(false, AcqRel) {
             while let Ok(port) = self.arrivals.try_recv() {
                 match port {
@@ -714,7 +714,7 @@ fn leave_signals_to_others() {
 struct Attacher {
     config: DomainConfig,
     robot: String,
-    shared: Arc<Shared>,
+    shared: Arc<AttachState>,
     send: SyncSender<Passed>,
     returned: Receiver<Passed>,
     domain: Option<Domain<ipc_threadsafe::Service>>,

@@ -46,7 +46,7 @@ pub struct SweepCounts {
 
 /// The paths of a domain's files.
 #[derive(Debug, Clone)]
-pub(super) struct Place {
+pub(super) struct DomainPaths {
     /// `<base>/<name>`.
     pub(super) root: PathBuf,
     /// `<base>/<name>.lock`.
@@ -60,27 +60,27 @@ pub(super) struct Place {
 /// processes see that this one is alive.
 static OWN: Mutex<Vec<(String, u128)>> = Mutex::new(Vec::new());
 
-pub(super) fn register(place: &Place, node: u128) {
+pub(super) fn register(place: &DomainPaths, node: u128) {
     OWN.lock()
         .unwrap_or_else(PoisonError::into_inner)
         .push((place.prefix.clone(), node));
 }
 
-pub(super) fn deregister(place: &Place, node: u128) {
+pub(super) fn deregister(place: &DomainPaths, node: u128) {
     OWN.lock()
         .unwrap_or_else(PoisonError::into_inner)
         .retain(|(p, n)| (p, *n) != (&place.prefix, node));
 }
 
 /// Whether `node` is the only one of this process in the domain.
-pub(super) fn is_only(place: &Place, node: u128) -> bool {
+pub(super) fn is_only(place: &DomainPaths, node: u128) -> bool {
     OWN.lock()
         .unwrap_or_else(PoisonError::into_inner)
         .iter()
         .all(|(p, n)| *p != place.prefix || *n == node)
 }
 
-fn is_own(place: &Place, node: u128) -> bool {
+fn is_own(place: &DomainPaths, node: u128) -> bool {
     OWN.lock()
         .unwrap_or_else(PoisonError::into_inner)
         .iter()
@@ -88,7 +88,7 @@ fn is_own(place: &Place, node: u128) -> bool {
 }
 
 /// Removes the files of dead processes; if no node is alive, all files and the directory itself.
-pub(super) fn sweep(place: &Place, config: &Config) -> Result<SweepCounts, DomainError> {
+pub(super) fn sweep(place: &DomainPaths, config: &Config) -> Result<SweepCounts, DomainError> {
     let mut swept = SweepCounts::default();
     let nodes = place.nodes()?;
     let (alive, dead): (Vec<u128>, Vec<u128>) = nodes
@@ -132,7 +132,7 @@ pub(super) fn sweep(place: &Place, config: &Config) -> Result<SweepCounts, Domai
     Ok(swept)
 }
 
-fn clean_dead(place: &Place, config: &Config, dead: &[u128], swept: &mut SweepCounts) {
+fn clean_dead(place: &DomainPaths, config: &Config, dead: &[u128], swept: &mut SweepCounts) {
     for &node in dead {
         keep_tags(place, node);
     }
@@ -175,7 +175,7 @@ fn clean_dead(place: &Place, config: &Config, dead: &[u128], swept: &mut SweepCo
 /// iceoryx2 frees a port's place in its service only if it finds the port's tag, but removes the
 /// tag first. If the process dies between the two, the place stays taken for ever, and a topic of
 /// one writer can have no writer again.
-fn keep_tags(place: &Place, node: u128) {
+fn keep_tags(place: &DomainPaths, node: u128) {
     let (home, kept) = (place.node(node), place.kept(node));
     // Errors are ignored: the node is cleaned in any case.
     let _ = fs::create_dir_all(&kept);
@@ -190,7 +190,7 @@ fn keep_tags(place: &Place, node: u128) {
 }
 
 fn remove_ownerless(
-    place: &Place,
+    place: &DomainPaths,
     config: &Config,
     swept: &mut SweepCounts,
 ) -> Result<(), DomainError> {
@@ -295,7 +295,7 @@ fn monitor_holder(path: &Path) -> Option<i32> {
 }
 
 /// The process id of a node, 0 if it is not known; `None` if the node is dead.
-pub(super) fn holder_of(place: &Place, node: u128) -> Option<i32> {
+pub(super) fn holder_of(place: &DomainPaths, node: u128) -> Option<i32> {
     if is_own(place, node) {
         return Some(i32::try_from(std::process::id()).unwrap_or(0));
     }
@@ -330,7 +330,7 @@ fn list(path: &Path) -> Result<Vec<(PathBuf, Metadata)>, DomainError> {
     Ok(files)
 }
 
-impl Place {
+impl DomainPaths {
     fn node(&self, node: u128) -> PathBuf {
         self.root.join("nodes").join(node.to_string())
     }
