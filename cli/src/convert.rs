@@ -1,7 +1,6 @@
 //! The subcommands that convert files: decode, encode, estimate.
 
 use crate::identify::advice::sentence;
-use crate::identify::summary;
 use crate::samples;
 use anyhow::{Context, bail};
 use clap::error::ErrorKind;
@@ -22,7 +21,7 @@ use std::path::{Path, PathBuf};
 
 /// `proprio decode`.
 #[derive(clap::Args)]
-pub(crate) struct Decode {
+pub(crate) struct DecodeArgs {
     /// gateway.toml, which lists the devices; its sources are not opened
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
@@ -72,7 +71,7 @@ impl StatedStamps {
 
 /// `proprio encode`.
 #[derive(clap::Args)]
-pub(crate) struct Encode {
+pub(crate) struct EncodeArgs {
     /// gateway.toml, which lists the devices
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
@@ -89,7 +88,7 @@ pub(crate) struct Encode {
 
 /// `proprio estimate`.
 #[derive(clap::Args)]
-pub(crate) struct Estimate {
+pub(crate) struct EstimateArgs {
     /// estimator.toml; default: the one that a recording has taken along
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -131,7 +130,7 @@ pub(crate) fn input(path: &Path) -> anyhow::Result<Box<dyn Read + Send>> {
 
 /// The output file of a conversion. It is renamed to its final name when complete: an error leaves
 /// no partial table, and a file that is both input and output is not destroyed before it is read.
-pub(crate) struct Output {
+pub(crate) struct OutputFile {
     writer: Option<BufWriter<Marked>>,
     new: Option<(tempfile::NamedTempFile, PathBuf)>,
 }
@@ -179,7 +178,7 @@ fn with_file(error: offline::ConversionError, input: &Path, output: &Path) -> an
     }
 }
 
-impl Output {
+impl OutputFile {
     pub(crate) fn new(path: &Path) -> anyhow::Result<Self> {
         let special = std::fs::metadata(path).is_ok_and(|m| !m.is_file());
         let unwritable = || format!("{}: cannot be written", path.display());
@@ -244,12 +243,12 @@ fn report_table(log: &Path, report: &TableReport) {
 }
 
 /// Decodes a log.
-pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
+pub(crate) fn decode(args: &DecodeArgs) -> anyhow::Result<()> {
     let plan = Plan::load(&args.config)?;
     let log = samples::log(input(&args.log)?, &args.log)
         .with_context(|| args.log.display().to_string())?;
     let log = BufReader::with_capacity(1 << 18, log);
-    let mut out = Output::new(&args.out)?;
+    let mut out = OutputFile::new(&args.out)?;
     let columns = if args.all {
         Columns::All
     } else {
@@ -263,27 +262,37 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
         out.finish()
             .with_context(|| args.out.display().to_string())?;
     }
-    for bad in &report.bad {
-        eprintln!("{}: skipped: {bad}", args.log.display());
+    print_decoded(args, &report);
+    if report.samples == 0 {
+        bail!(
+            "{}: no sample in {} frames: {}",
+            args.log.display(),
+            report.frames,
+            why_none(&report)
+        );
     }
-    let told = [&report.doubt, &report.several, &report.step_back];
-    for told in told.into_iter().flatten() {
-        eprintln!("{}: {told}", args.log.display());
+    Ok(())
+}
+
+/// Says what was decoded, and what not.
+fn print_decoded(args: &DecodeArgs, report: &DecodeReport) {
+    let log = args.log.display();
+    for bad in &report.bad {
+        eprintln!("{log}: skipped: {bad}");
+    }
+    let notes = [&report.doubt, &report.several, &report.step_back];
+    for note in notes.into_iter().flatten() {
+        eprintln!("{log}: {note}");
     }
     if report.dropped > 0 {
         eprintln!(
-            "{}: {} frames were lost during the recording, as it says",
-            args.log.display(),
+            "{log}: {} frames were lost during the recording, as it says",
             report.dropped
         );
     }
     let parts = report.format.map_or("lines", LogFormat::parts);
     if report.bad_lines > report.bad.len() as u64 {
-        eprintln!(
-            "{}: {} {parts} skipped in all",
-            args.log.display(),
-            report.bad_lines
-        );
+        eprintln!("{log}: {} {parts} skipped in all", report.bad_lines);
     }
     for device in &report.devices {
         if let Some(refusal) = &device.refusal {
@@ -297,58 +306,42 @@ pub(crate) fn decode(args: &Decode) -> anyhow::Result<()> {
         }
     }
     if args.json {
-        let devices: Vec<_> = report
-            .devices
-            .iter()
-            .map(|d| {
-                let counts = d.counts.iter();
-                let counts: serde_json::Map<_, _> = counts
-                    .map(|(c, n)| (c.word().to_owned(), json!(n)))
-                    .collect();
-                json!({
-                    "name": d.name, "frames": d.frames, "readings": d.readings, "counts": counts,
-                    "refusal": d.refusal, "lack": d.lack,
-                })
-            })
-            .collect();
-        let format = report.format.map(|format| format.to_string());
-        let summary = json!({
-            "format": format, "stamps": report.stamps.word(),
-            "frames": report.frames, "samples": report.samples, "unclaimed": report.unclaimed,
-            "bad_lines": report.bad_lines, "other_interfaces": report.other_interfaces,
-            "other_interface_names": report.other_names,
-            "error_frames": report.error_frames, "dropped": report.dropped,
-            "out_of_order": report.out_of_order, "devices": devices,
-        });
-        print_json(&args.out, &summary);
-    } else {
+        return print_json(&args.out, &decoded_json(report));
+    }
+    eprintln!(
+        "{} frames, {} samples; {} frames of unknown devices, {} of other interfaces, {} {parts} \
+         skipped",
+        report.frames, report.samples, report.unclaimed, report.other_interfaces, report.bad_lines
+    );
+    if !report.other_names.is_empty() {
+        // Of an adapter named by its serial number the log does not say which interface it was.
         eprintln!(
-            "{} frames, {} samples; {} frames of unknown devices, {} of other interfaces, {} \
-             {parts} skipped",
-            report.frames,
-            report.samples,
-            report.unclaimed,
-            report.other_interfaces,
-            report.bad_lines
-        );
-        if !report.other_names.is_empty() {
-            // Of an adapter named by its serial number the log does not say which interface it was.
-            eprintln!(
-                "other interfaces: {}; a bus takes the frames of its interface, and of an \
-                 interface with the bus's own name",
-                report.other_names.join(", ")
-            );
-        }
-    }
-    if report.samples == 0 {
-        bail!(
-            "{}: no sample in {} frames: {}",
-            args.log.display(),
-            report.frames,
-            why_none(&report)
+            "other interfaces: {}; a bus takes the frames of its interface, and of an interface \
+             with the bus's own name",
+            report.other_names.join(", ")
         );
     }
-    Ok(())
+}
+
+fn decoded_json(report: &DecodeReport) -> serde_json::Value {
+    let devices = report.devices.iter().map(|d| {
+        let counts = d.counts.iter();
+        let counts: serde_json::Map<_, _> = counts
+            .map(|(c, n)| (c.word().to_owned(), json!(n)))
+            .collect();
+        json!({
+            "name": d.name, "frames": d.frames, "readings": d.readings, "counts": counts,
+            "refusal": d.refusal, "lack": d.lack,
+        })
+    });
+    json!({
+        "format": report.format.map(|format| format.to_string()), "stamps": report.stamps.word(),
+        "frames": report.frames, "samples": report.samples, "unclaimed": report.unclaimed,
+        "bad_lines": report.bad_lines, "other_interfaces": report.other_interfaces,
+        "other_interface_names": report.other_names,
+        "error_frames": report.error_frames, "dropped": report.dropped,
+        "out_of_order": report.out_of_order, "devices": devices.collect::<Vec<_>>(),
+    })
 }
 
 /// Why a log gives no sample.
@@ -366,10 +359,10 @@ fn why_none(report: &DecodeReport) -> &'static str {
 }
 
 /// Encodes a table.
-pub(crate) fn encode(args: &Encode) -> anyhow::Result<()> {
+pub(crate) fn encode(args: &EncodeArgs) -> anyhow::Result<()> {
     let plan = Plan::load(&args.config)?;
     let samples = samples::table(input(&args.samples)?, &args.samples)?;
-    let mut out = Output::new(&args.out)?;
+    let mut out = OutputFile::new(&args.out)?;
     let report = offline::encode(&plan, samples, out.writer())
         .map_err(|e| with_file(e, &args.samples, &args.out))?;
     if report.samples > 0 {
@@ -476,7 +469,7 @@ impl Configured {
 }
 
 /// Estimates from a table.
-pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
+pub(crate) fn estimate(args: &EstimateArgs) -> anyhow::Result<()> {
     let configured = Configured::new(
         args.config.as_deref(),
         args.parameters.as_deref(),
@@ -489,7 +482,7 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
         .then(|| assessor(args, config, &setup))
         .transpose()?;
     let log = samples::table(input(&args.samples)?, &args.samples)?;
-    let mut out = Output::new(&args.out)?;
+    let mut out = OutputFile::new(&args.out)?;
     let report = estimates::estimate(setup, log, out.writer(), assessor.as_mut());
     let report = match report {
         Ok(report) => report,
@@ -506,44 +499,61 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
             .with_context(|| args.out.display().to_string())?;
     }
     report_table(&args.samples, &report.log);
+    print_trouble(args, config, &report);
+    let assessment = assessor.map(Assessor::finish);
+    print_estimated(args, &report, assessment.as_ref());
+    if report.estimates == 0 {
+        bail!(
+            "{}: the trigger channel has no sample, so there is no estimate",
+            args.samples.display()
+        );
+    }
+    Ok(())
+}
+
+/// Says what is odd about samples and configuration.
+fn print_trouble(args: &EstimateArgs, config: &Path, report: &estimates::EstimateReport) {
+    let (samples, config) = (args.samples.display(), config.display());
     if !report.unused_channels.is_empty() {
         eprintln!(
-            "{}: not in {}: {}",
-            args.samples.display(),
-            config.display(),
+            "{samples}: not in {config}: {}",
             report.unused_channels.join(", ")
         );
     }
     let [late, backward, not_finite] = report.dropped;
     if late + backward + not_finite > 0 {
         eprintln!(
-            "{}: samples dropped, the first in line {}: {late} late (stamped before an estimate \
-             that was already made), {backward} not later than their channel's last, \
+            "{samples}: samples dropped, the first in line {}: {late} late (stamped before an \
+             estimate that was already made), {backward} not later than their channel's last, \
              {not_finite} not finite",
-            args.samples.display(),
             report.first_dropped.unwrap_or_default()
         );
     }
     if let Some((line, from, to)) = report.step_back {
         eprintln!(
-            "{}: at line {line} the time steps back by {} s, from {from} s to {to} s: what is not \
-             later than its channel's last sample is dropped. Cut the table there, and estimate \
-             from the parts one by one",
-            args.samples.display(),
+            "{samples}: at line {line} the time steps back by {} s, from {from} s to {to} s: what \
+             is not later than its channel's last sample is dropped. Cut the table there, and \
+             estimate from the parts one by one",
             from.saturating_sub(to)
         );
     }
     for (t, likelier) in &report.likelier {
         eprintln!(
-            "{}: from {t} s on the readings contradict {}: more likely, {likelier}; torques that \
-             depend on it are withheld",
-            args.samples.display(),
-            config.display()
+            "{samples}: from {t} s on the readings contradict {config}: more likely, {likelier}; \
+             torques that depend on it are withheld"
         );
     }
+}
+
+/// Says what was estimated, and how good that is if it was assessed.
+fn print_estimated(
+    args: &EstimateArgs,
+    report: &estimates::EstimateReport,
+    assessment: Option<&Assessment>,
+) {
     let withheld: u64 = report.withheld.values().sum();
-    let assessment = assessor.map(Assessor::finish);
     if args.json {
+        let [late, backward, not_finite] = report.dropped;
         let mut summary = json!({
             "estimates": report.estimates, "torques_withheld": withheld,
             "withheld_by_reason": report.withheld,
@@ -553,32 +563,24 @@ pub(crate) fn estimate(args: &Estimate) -> anyhow::Result<()> {
                 "t": t.seconds(), "likelier": text,
             })).collect::<Vec<_>>(),
         });
-        if let Some(assessment) = &assessment {
+        if let Some(assessment) = assessment {
             summary["assessment"] = assessment_json(assessment);
         }
-        print_json(&args.out, &summary);
-    } else {
-        let reasons: Vec<String> = (report.withheld.iter())
-            .map(|(reason, count)| format!("{count} {}", reason.replace('_', " ")))
-            .collect();
-        eprintln!(
-            "{} estimates from {} rows; {withheld} torques withheld{}{}",
-            report.estimates,
-            report.log.rows,
-            if reasons.is_empty() { "" } else { ": " },
-            reasons.join(", ")
-        );
-        if let Some(assessment) = &assessment {
-            print_assessment(assessment);
-        }
+        return print_json(&args.out, &summary);
     }
-    if report.estimates == 0 {
-        bail!(
-            "{}: the trigger channel has no sample, so there is no estimate",
-            args.samples.display()
-        );
+    let reasons: Vec<String> = (report.withheld.iter())
+        .map(|(reason, count)| format!("{count} {}", reason.replace('_', " ")))
+        .collect();
+    eprintln!(
+        "{} estimates from {} rows; {withheld} torques withheld{}{}",
+        report.estimates,
+        report.log.rows,
+        if reasons.is_empty() { "" } else { ": " },
+        reasons.join(", ")
+    );
+    if let Some(assessment) = assessment {
+        print_assessment(assessment);
     }
-    Ok(())
 }
 
 /// The part of a log that is checked for implausible channels \[bytes\]: half an hour of a robot's
@@ -592,7 +594,7 @@ pub(crate) fn is_file(log: &Path) -> bool {
 
 /// Warns of implausible channels in the log before the estimation. Errors of reading are reported
 /// by the estimation itself; a log that can be read only once is not checked.
-fn warn_of_implausible(args: &Estimate, setup: &Setup) {
+fn warn_of_implausible(args: &EstimateArgs, setup: &Setup) {
     let log = is_file(&args.samples)
         .then(|| File::open(&args.samples).ok())
         .flatten();
@@ -611,7 +613,7 @@ fn warn_of_implausible(args: &Estimate, setup: &Setup) {
 }
 
 /// Reads the log once before the estimation.
-fn assessor(args: &Estimate, config: &Path, setup: &Setup) -> anyhow::Result<Assessor> {
+fn assessor(args: &EstimateArgs, config: &Path, setup: &Setup) -> anyhow::Result<Assessor> {
     let log = samples::table(input(&args.samples)?, &args.samples)?;
     if !is_file(&args.samples) {
         bail!(
@@ -634,7 +636,7 @@ fn assessment_json(assessment: &Assessment) -> serde_json::Value {
         of.iter().map(entry).collect()
     };
     json!({
-        "predicted": summary::predicted(&assessment.predicted), "changes": assessment.changes,
+        "predicted": assessment.predicted, "changes": assessment.changes,
         "residuals": coverage(&assessment.residuals), "torques": coverage(&assessment.torques),
     })
 }

@@ -10,9 +10,9 @@ use std::io;
 
 /// `proprio ctl`.
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct CtlArgs {
     #[command(subcommand)]
-    verb: Verb,
+    verb: CtlVerb,
     /// The robot; default: the only one whose gateway runs
     #[arg(long, global = true, value_name = "NAME")]
     robot: Option<String>,
@@ -22,7 +22,7 @@ pub(crate) struct Args {
 }
 
 #[derive(clap::Subcommand)]
-enum Verb {
+enum CtlVerb {
     /// The gateway and its buses
     Status,
     /// The devices: state, driver, bus, channels
@@ -54,7 +54,7 @@ enum Verb {
     Snapshot,
 }
 
-impl Verb {
+impl CtlVerb {
     const fn server(&self) -> Server {
         match self {
             Self::Snapshot => Server::Recorder,
@@ -64,16 +64,16 @@ impl Verb {
 }
 
 /// Asks the gateway, or a recorder.
-pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
+pub(crate) fn run(args: &CtlArgs, domain: &DomainConfig) -> anyhow::Result<()> {
     let server = args.verb.server();
     let robot = robot(args.robot.as_deref(), domain, server)?;
     let line = match &args.verb {
-        Verb::Status => json!({ "do": "status" }),
-        Verb::Devices => json!({ "do": "devices" }),
-        Verb::Tare { device } => json!({ "do": "tare", "device": device }),
-        Verb::Calibration { device } => json!({ "do": "calibration", "device": device }),
-        Verb::Reload => json!({ "do": "reload" }),
-        Verb::Snapshot => json!({ "do": "snapshot" }),
+        CtlVerb::Status => json!({ "do": "status" }),
+        CtlVerb::Devices => json!({ "do": "devices" }),
+        CtlVerb::Tare { device } => json!({ "do": "tare", "device": device }),
+        CtlVerb::Calibration { device } => json!({ "do": "calibration", "device": device }),
+        CtlVerb::Reload => json!({ "do": "reload" }),
+        CtlVerb::Snapshot => json!({ "do": "snapshot" }),
     };
     let text = ask(domain, server, &robot, &line.to_string())
         .map_err(|error| match error.kind() {
@@ -102,12 +102,12 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     }
     if !args.json {
         match args.verb {
-            Verb::Status => status(&answer),
-            Verb::Devices => devices(&answer),
-            Verb::Tare { .. } => tared(&answer),
-            Verb::Calibration { .. } => calibration(&answer),
-            Verb::Reload => reloaded(&answer),
-            Verb::Snapshot => print_line!("{} is written", word(&answer, "file")),
+            CtlVerb::Status => status(&answer),
+            CtlVerb::Devices => devices(&answer),
+            CtlVerb::Tare { .. } => tared(&answer),
+            CtlVerb::Calibration { .. } => calibration(&answer),
+            CtlVerb::Reload => reloaded(&answer),
+            CtlVerb::Snapshot => print_line!("{} is written", word(&answer, "file")),
         }
     }
     let problems: Vec<_> = list(&answer, "problems")

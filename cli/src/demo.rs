@@ -13,20 +13,20 @@ mod processes;
 mod result;
 mod watching;
 
-pub(crate) use experiment::Args;
+pub(crate) use experiment::DemoArgs;
 
 use crate::folder::{read, with_files};
+use crate::running::interrupted_by;
 use anyhow::{Context, bail};
 use experiment::Experiment;
 use processes::Processes;
 use proprio_estimator::config::ConfigError;
-use proprio_simulator::{Fault, FaultError, Robot, Settings, Simulator};
+use proprio_simulator::{FaultError, InjectedFault, SimulatedRobot, SimulationSettings, Simulator};
 use proprio_topics::Nanos;
 use proprio_topics::ipc::{Domain, DomainConfig};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 use std::fs;
 use std::path::Path;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
 use watching::watch;
 
@@ -34,41 +34,11 @@ use watching::watch;
 const DEFAULT: &str = "default";
 
 /// Runs the demonstration.
-pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
-    let original = Robot::open(&args.robot)?;
-    // Check the faults before anything is started.
-    let faults = args
-        .fault
-        .iter()
-        .map(|f| f.parse::<Fault>())
-        .collect::<Result<Vec<_>, _>>()?;
-    if let Some((text, _)) =
-        (args.fault.iter().zip(&faults)).find(|(_, fault)| fault.begin() >= args.seconds)
-    {
-        return Err(FaultError::AfterEnd {
-            text: text.clone(),
-            seconds: args.seconds,
-        }
-        .into());
-    }
-    Simulator::new(
-        &original,
-        &Settings {
-            faults,
-            ..Settings::default()
-        },
-        Nanos::ZERO,
-    )?;
+pub(crate) fn run(args: &DemoArgs, domain: &DomainConfig) -> anyhow::Result<()> {
+    let original = SimulatedRobot::open(&args.robot)?;
+    check_faults(args, &original)?;
     // Ctrl-C reaches the child processes too. This process must outlive them to clean up.
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [
-        signal_hook::consts::SIGTERM,
-        signal_hook::consts::SIGINT,
-        signal_hook::consts::SIGHUP,
-        signal_hook::consts::SIGQUIT,
-    ] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot catch signals")?;
-    }
+    let stop = interrupted_by(&[SIGTERM, SIGINT, SIGHUP, SIGQUIT])?;
     fs::create_dir_all(&args.out)
         .with_context(|| format!("{}: cannot be created", args.out.display()))?;
     let out = args.out.canonicalize()?;
@@ -87,7 +57,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     };
     let folder = private.path().join("robot");
     copy_robot(&original, &args.bus, &folder)?;
-    let robot = Robot::load(&folder)?;
+    let robot = SimulatedRobot::load(&folder)?;
     let experiment = Experiment::prepare(args, &robot, &out)?;
 
     print_line!(
@@ -132,9 +102,29 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     )
 }
 
+/// Checks the faults before anything is started.
+fn check_faults(args: &DemoArgs, robot: &SimulatedRobot) -> anyhow::Result<()> {
+    let faults = args.fault.iter().map(|f| f.parse::<InjectedFault>());
+    let faults = faults.collect::<Result<Vec<_>, _>>()?;
+    let mut named = args.fault.iter().zip(&faults);
+    if let Some((text, _)) = named.find(|(_, fault)| fault.begin() >= args.seconds) {
+        return Err(FaultError::AfterEnd {
+            text: text.clone(),
+            seconds: args.seconds,
+        }
+        .into());
+    }
+    let settings = SimulationSettings {
+        faults,
+        ..SimulationSettings::default()
+    };
+    Simulator::new(robot, &settings, Nanos::ZERO)?;
+    Ok(())
+}
+
 /// Copies the robot's configuration, and all files that it names, to the folder `to`. If `buses`
 /// are given, they replace the sources of its buses.
-fn copy_robot(robot: &Robot, buses: &[String], to: &Path) -> anyhow::Result<()> {
+fn copy_robot(robot: &SimulatedRobot, buses: &[String], to: &Path) -> anyhow::Result<()> {
     let mut gateway = read(&robot.folder.join("gateway.toml"))?;
     if let (false, Some(toml::Value::Array(list))) = (buses.is_empty(), gateway.get_mut("bus")) {
         if buses.len() == 1 && list.len() > 1 {

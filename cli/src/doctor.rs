@@ -22,7 +22,7 @@ const RAMFS_MAGIC: FsType = FsType(0x8584_58f6);
 
 /// `proprio doctor`.
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct DoctorArgs {
     /// Print the findings as JSON
     #[arg(long)]
     json: bool,
@@ -30,7 +30,7 @@ pub(crate) struct Args {
 
 /// The result of a check.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Verdict {
+enum Readiness {
     /// No problem.
     Ok,
     /// It works with limitations.
@@ -39,15 +39,15 @@ enum Verdict {
     Failed,
 }
 
-struct Finding {
+struct CheckResult {
     what: &'static str,
-    verdict: Verdict,
+    verdict: Readiness,
     says: String,
     hint: String,
 }
 
 /// Runs all checks; fails if one finds that Proprio cannot run.
-pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
+pub(crate) fn run(args: &DoctorArgs, domain: &DomainConfig) -> anyhow::Result<()> {
     let mut findings = vec![can()];
     findings.extend(interfaces());
     findings.extend([
@@ -78,7 +78,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     }
     let failed: Vec<_> = findings
         .iter()
-        .filter(|f| f.verdict == Verdict::Failed)
+        .filter(|f| f.verdict == Readiness::Failed)
         .map(|f| f.what)
         .collect();
     if failed.is_empty() {
@@ -88,20 +88,25 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     }
 }
 
-const fn word(verdict: Verdict) -> &'static str {
+const fn word(verdict: Readiness) -> &'static str {
     match verdict {
-        Verdict::Ok => "ok",
-        Verdict::Lacking => "lacking",
-        Verdict::Failed => "FAILED",
+        Readiness::Ok => "ok",
+        Readiness::Lacking => "lacking",
+        Readiness::Failed => "FAILED",
     }
 }
 
-fn finding(what: &'static str, verdict: Verdict, says: impl Into<String>, hint: &str) -> Finding {
-    Finding {
+fn finding(
+    what: &'static str,
+    verdict: Readiness,
+    says: impl Into<String>,
+    hint: &str,
+) -> CheckResult {
+    CheckResult {
         what,
         verdict,
         says: says.into(),
-        hint: if verdict == Verdict::Ok {
+        hint: if verdict == Readiness::Ok {
             String::new()
         } else {
             hint.into()
@@ -109,7 +114,7 @@ fn finding(what: &'static str, verdict: Verdict, says: impl Into<String>, hint: 
     }
 }
 
-fn can() -> Finding {
+fn can() -> CheckResult {
     // SockProtocol has no CAN_RAW; family and type suffice to test whether the kernel has CAN.
     match nix::sys::socket::socket(
         AddressFamily::Can,
@@ -119,23 +124,23 @@ fn can() -> Finding {
     ) {
         Ok(_) => finding(
             "kernel CAN",
-            Verdict::Ok,
+            Readiness::Ok,
             "the kernel has raw CAN sockets",
             "",
         ),
         // An existing family refuses protocol 0; a missing family returns a different error.
         Err(nix::Error::EPROTONOSUPPORT | nix::Error::EPROTOTYPE) => {
-            finding("kernel CAN", Verdict::Ok, "the kernel has CAN", "")
+            finding("kernel CAN", Readiness::Ok, "the kernel has CAN", "")
         }
         Err(nix::Error::EPERM | nix::Error::EACCES) => finding(
             "kernel CAN",
-            Verdict::Lacking,
+            Readiness::Lacking,
             "the kernel has CAN, but this user has no permission to open it",
             "give the process CAP_NET_RAW, or run it as another user",
         ),
         Err(error) => finding(
             "kernel CAN",
-            Verdict::Lacking,
+            Readiness::Lacking,
             format!("the kernel has no CAN ({error})"),
             "`modprobe can-raw` if the kernel has it as a module; otherwise use the virtual bus: \
              source = { kind = \"virtual\", name = \"...\" }",
@@ -143,7 +148,7 @@ fn can() -> Finding {
     }
 }
 
-fn interfaces() -> Vec<Finding> {
+fn interfaces() -> Vec<CheckResult> {
     let mut netlink = Netlink::default();
     let mut findings = Vec::new();
     let sys = Path::new(adapter::SYS);
@@ -166,7 +171,7 @@ fn interfaces() -> Vec<Finding> {
             Ok(health) => interface(name, &system, &health),
             Err(error) => finding(
                 INTERFACE,
-                Verdict::Lacking,
+                Readiness::Lacking,
                 format!("{system}; its controller is not known ({error})"),
                 "allow AF_NETLINK sockets",
             ),
@@ -178,7 +183,7 @@ fn interfaces() -> Vec<Finding> {
                     real one up";
         findings.push(finding(
             INTERFACE,
-            Verdict::Lacking,
+            Readiness::Lacking,
             "no CAN interface",
             hint,
         ));
@@ -189,7 +194,7 @@ fn interfaces() -> Vec<Finding> {
 const INTERFACE: &str = "CAN interfaces";
 
 /// The finding about interface `name`, of which the system says `system`.
-fn interface(name: &str, system: &str, health: &InterfaceHealth) -> Finding {
+fn interface(name: &str, system: &str, health: &InterfaceHealth) -> CheckResult {
     let mut says = system.to_owned();
     let _ = write!(
         says,
@@ -232,23 +237,23 @@ fn interface(name: &str, system: &str, health: &InterfaceHealth) -> Finding {
     );
     let (verdict, hint) = match controller {
         Controller::BusOff => (
-            Verdict::Lacking,
+            Readiness::Lacking,
             format!(
                 "bus-off: check the cable, the termination and the bit-rate, then `ip link set \
                  {name} type can restart`"
             ),
         ),
         Controller::Warning | Controller::Passive => (
-            Verdict::Lacking,
+            Readiness::Lacking,
             "many errors: check the cable, the termination and the bit-rate".to_owned(),
         ),
-        Controller::Unknown => (Verdict::Ok, String::new()),
+        Controller::Unknown => (Readiness::Ok, String::new()),
         // A stopped one is that of an interface that is down.
         Controller::Active | Controller::Stopped | Controller::Sleeping
             if health.restart_ms == 0 =>
         {
             (
-                Verdict::Lacking,
+                Readiness::Lacking,
                 format!(
                     "restart-ms 0: after too many errors (bus-off) it stays off until a person \
                      restarts it; `ip link set {name} down && ip link set {name} up type can \
@@ -257,13 +262,13 @@ fn interface(name: &str, system: &str, health: &InterfaceHealth) -> Finding {
             )
         }
         Controller::Active | Controller::Stopped | Controller::Sleeping => {
-            (Verdict::Ok, String::new())
+            (Readiness::Ok, String::new())
         }
     };
     finding(INTERFACE, verdict, says, &hint)
 }
 
-fn virtual_bus(domain: &DomainConfig) -> Finding {
+fn virtual_bus(domain: &DomainConfig) -> CheckResult {
     let clock = Monotonic;
     let name = format!("doctor-{}", std::process::id());
     let test = || -> Result<Nanos, String> {
@@ -284,20 +289,20 @@ fn virtual_bus(domain: &DomainConfig) -> Finding {
     match test() {
         Ok(took) => finding(
             "virtual bus",
-            Verdict::Ok,
+            Readiness::Ok,
             format!("a frame arrives after {} us", took.0 / 1000),
             "",
         ),
         Err(problem) => finding(
             "virtual bus",
-            Verdict::Lacking,
+            Readiness::Lacking,
             problem,
             "`ip link set lo up`; IPv4 multicast on it must not be filtered",
         ),
     }
 }
 
-fn shared_memory(domain: &DomainConfig) -> Finding {
+fn shared_memory(domain: &DomainConfig) -> CheckResult {
     let probe = DomainConfig {
         name: format!("doctor-{}", std::process::id()),
         ..domain.clone()
@@ -309,7 +314,7 @@ fn shared_memory(domain: &DomainConfig) -> Finding {
     match opened {
         Ok(()) if !in_memory => finding(
             "shared memory",
-            Verdict::Lacking,
+            Readiness::Lacking,
             format!(
                 "a domain opens, but its folder {} is on a disk: starts and restarts wait for the \
                  disk, for seconds if others write to it",
@@ -328,9 +333,9 @@ fn shared_memory(domain: &DomainConfig) -> Finding {
                 probe.base.display()
             );
             let (verdict, remedy) = match free >= one + more {
-                true => (Verdict::Ok, ""),
+                true => (Readiness::Ok, ""),
                 false => (
-                    Verdict::Lacking,
+                    Readiness::Lacking,
                     "remove files in /dev/shm, or `mount -o remount,size=256M /dev/shm`; in a \
                      container --shm-size",
                 ),
@@ -339,14 +344,14 @@ fn shared_memory(domain: &DomainConfig) -> Finding {
         }
         Err(error) => finding(
             "shared memory",
-            Verdict::Failed,
+            Readiness::Failed,
             error.to_string(),
             "gateway, estimator and consumers need it",
         ),
     }
 }
 
-fn buffers() -> Finding {
+fn buffers() -> CheckResult {
     const WANTED: u64 = 4 << 20;
     let number = |path: &str| {
         fs::read_to_string(path)
@@ -357,14 +362,14 @@ fn buffers() -> Finding {
     if most >= WANTED || has_capability(CAP_NET_ADMIN) {
         return finding(
             "receive buffers",
-            Verdict::Ok,
+            Readiness::Ok,
             "a burst of thousands of frames fits",
             "",
         );
     }
     finding(
         "receive buffers",
-        Verdict::Lacking,
+        Readiness::Lacking,
         format!(
             "at most {most} bytes: room for about {} frames while the gateway is not scheduled",
             most / 768
@@ -373,7 +378,7 @@ fn buffers() -> Finding {
     )
 }
 
-fn open_files() -> Finding {
+fn open_files() -> CheckResult {
     // With two buses and three readers, a gateway holds 41 and an estimator 58; a bus or a reader
     // more adds two or three to each. The most buses and a dozen readers stay below this.
     const WANTED: u64 = 256;
@@ -381,14 +386,14 @@ fn open_files() -> Finding {
     if limit >= WANTED {
         return finding(
             "open files",
-            Verdict::Ok,
+            Readiness::Ok,
             format!("a process may open {limit}; a run needs {WANTED} at most"),
             "",
         );
     }
     finding(
         "open files",
-        Verdict::Lacking,
+        Readiness::Lacking,
         format!("a process may open {limit}; a run needs {WANTED} at most"),
         "`ulimit -n 1024` in the shell, or LimitNOFILE=1024 in the systemd unit",
     )
@@ -411,7 +416,7 @@ fn has_capability(number: u32) -> bool {
     mask.is_some_and(|m| m >> number & 1 == 1)
 }
 
-fn realtime() -> Finding {
+fn realtime() -> CheckResult {
     let limit = getrlimit(Resource::RLIMIT_RTPRIO).map_or(0, |(soft, _)| soft);
     let rt_kernel = fs::read_to_string("/sys/kernel/realtime").is_ok_and(|t| t.trim() == "1");
     let kernel = if rt_kernel {
@@ -422,29 +427,29 @@ fn realtime() -> Finding {
     if limit > 0 || has_capability(CAP_SYS_NICE) {
         return finding(
             "real-time",
-            Verdict::Ok,
+            Readiness::Ok,
             format!("SCHED_FIFO is allowed; {kernel}"),
             "",
         );
     }
     finding(
         "real-time",
-        Verdict::Lacking,
+        Readiness::Lacking,
         format!("SCHED_FIFO is not allowed; {kernel}"),
         "LimitRTPRIO=80 in the systemd unit, or `ulimit -r 80`; needed only for realtime = \
          { priority = ... }",
     )
 }
 
-fn locked_memory() -> Finding {
+fn locked_memory() -> CheckResult {
     const WANTED: u64 = 256 << 20;
     let limit = getrlimit(Resource::RLIMIT_MEMLOCK).map_or(0, |(soft, _)| soft);
     if limit >= WANTED || has_capability(CAP_IPC_LOCK) {
-        return finding("locked memory", Verdict::Ok, "memory can be locked", "");
+        return finding("locked memory", Readiness::Ok, "memory can be locked", "");
     }
     finding(
         "locked memory",
-        Verdict::Lacking,
+        Readiness::Lacking,
         format!("at most {limit} bytes can be locked"),
         "LimitMEMLOCK=infinity in the systemd unit, or `ulimit -l unlimited`; needed only for \
          realtime = { priority = ... }",
@@ -466,18 +471,18 @@ mod tests {
             ..InterfaceHealth::default()
         };
         for (controller, restart_ms, verdict, hint) in [
-            (Controller::Active, 100, Verdict::Ok, ""),
-            (Controller::Active, 0, Verdict::Lacking, "restart-ms 100"),
-            (Controller::Stopped, 0, Verdict::Lacking, "restart-ms 100"),
-            (Controller::Passive, 100, Verdict::Lacking, "many errors"),
+            (Controller::Active, 100, Readiness::Ok, ""),
+            (Controller::Active, 0, Readiness::Lacking, "restart-ms 100"),
+            (Controller::Stopped, 0, Readiness::Lacking, "restart-ms 100"),
+            (Controller::Passive, 100, Readiness::Lacking, "many errors"),
             (
                 Controller::BusOff,
                 100,
-                Verdict::Lacking,
+                Readiness::Lacking,
                 "can5 type can restart",
             ),
             // A virtual interface has no controller.
-            (Controller::Unknown, 0, Verdict::Ok, ""),
+            (Controller::Unknown, 0, Readiness::Ok, ""),
         ] {
             let finding = interface(
                 "can5",
@@ -486,7 +491,7 @@ mod tests {
             );
             assert!(finding.verdict == verdict, "{controller:?}");
             assert!(finding.hint.contains(hint), "{}", finding.hint);
-            assert_eq!(finding.hint.is_empty(), verdict == Verdict::Ok);
+            assert_eq!(finding.hint.is_empty(), verdict == Readiness::Ok);
             for fact in ["can5: up", "classic CAN", "received 77"] {
                 assert!(finding.says.contains(fact), "{}", finding.says);
             }

@@ -1,8 +1,9 @@
 //! `proprio echo`: the samples of a channel, the torques or the contacts of a running system, as
 //! they come.
 
+use crate::names::find;
 use crate::running::interrupted;
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
 use proprio_bridge::{DescriptionReader, next, one_robot, open};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Topic, Unavailable, monotonic};
 use proprio_topics::{
@@ -15,7 +16,7 @@ use std::sync::atomic::Ordering::Relaxed;
 
 /// `proprio echo`.
 #[derive(clap::Args)]
-pub(crate) struct Echo {
+pub(crate) struct EchoArgs {
     /// The channel: the name of a joint or sensor
     #[arg(
         required_unless_present_any = ["torques", "contacts"],
@@ -49,7 +50,7 @@ const PATIENCE: Nanos = Nanos::from_millis(2000);
 const LOOK: Nanos = Nanos::from_millis(500);
 
 /// Prints what is asked for.
-pub(crate) fn run(args: &Echo, config: &DomainConfig) -> anyhow::Result<()> {
+pub(crate) fn run(args: &EchoArgs, config: &DomainConfig) -> anyhow::Result<()> {
     let domain = open(config)?;
     let robot = one_robot(&domain, args.robot.as_deref())?;
     let printed = match (&args.channel, &args.torques, &args.contacts) {
@@ -73,7 +74,7 @@ pub(crate) fn run(args: &Echo, config: &DomainConfig) -> anyhow::Result<()> {
     }
 }
 
-/// The names of a role, and an error that names the nearest for a name that is none of them.
+/// An error for the first of `wanted` that is no name of this role.
 fn check(
     description: &Description,
     role: Role,
@@ -82,22 +83,18 @@ fn check(
 ) -> anyhow::Result<()> {
     let names = || {
         let entries = description.entries().iter().filter(|e| e.role == role);
-        entries.map(|entry| entry.name.as_str())
+        entries.map(|entry| (entry.name.as_str(), ()))
     };
-    for name in wanted {
-        if !names().any(|known| known == name) {
-            let hint = proprio_estimator::setup::nearest(name, names());
-            bail!("there is no {what} {name:?}{hint}");
-        }
-    }
-    Ok(())
+    wanted.iter().try_for_each(|name| {
+        find(name, names).map_err(|hint| anyhow!("there is no {what} {name:?}{hint}"))
+    })
 }
 
 /// Prints each payload of a topic with `print`, which returns whether it printed a line, until
 /// interrupted or `args.count` is reached. What has come is printed at once, a line a payload.
 /// Gateway and estimator make a damaged domain again: then it goes on in that.
 fn follow<T: Topic>(
-    args: &Echo,
+    args: &EchoArgs,
     mut domain: Domain,
     robot: &str,
     mut described: DescriptionReader,
@@ -143,7 +140,7 @@ fn follow<T: Topic>(
     Ok(())
 }
 
-fn channels(args: &Echo, domain: Domain, robot: &str, channel: &str) -> anyhow::Result<()> {
+fn channels(args: &EchoArgs, domain: Domain, robot: &str, channel: &str) -> anyhow::Result<()> {
     let described = DescriptionReader::by(&domain, robot, Publisher::Gateway)?
         .context("the robot's gateway is not running")?;
     let wanted = [channel.to_owned()];
@@ -269,7 +266,7 @@ pub(crate) fn torque_json(torque: f64, deviation: f64, withheld: Option<&Unavail
     object(keys, withheld)
 }
 
-fn torques(args: &Echo, domain: Domain, robot: &str, joints: &[String]) -> anyhow::Result<()> {
+fn torques(args: &EchoArgs, domain: Domain, robot: &str, joints: &[String]) -> anyhow::Result<()> {
     let described = estimator(&domain, robot, (Role::Joint, "joint"), joints)?;
     let is_wanted = |name: &str| joints.is_empty() || joints.iter().any(|joint| joint == name);
     follow(
@@ -305,7 +302,7 @@ fn torques(args: &Echo, domain: Domain, robot: &str, joints: &[String]) -> anyho
 }
 
 fn contacts_of(
-    args: &Echo,
+    args: &EchoArgs,
     domain: Domain,
     robot: &str,
     contacts: &[String],

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 /// `proprio estimator`.
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct EstimatorArgs {
     /// The configuration file
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
@@ -31,7 +31,7 @@ pub(crate) struct Args {
 }
 
 /// Runs the daemon, or checks the configuration.
-pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
+pub(crate) fn run(args: &EstimatorArgs, domain: &DomainConfig) -> anyhow::Result<()> {
     if !args.check {
         return daemon::run(&args.config, domain);
     }

@@ -1,17 +1,18 @@
 //! `proprio excite`: the motion that lessens the deviations of torques the most, as a table, with
 //! a forecast of what it is good for.
 
-use crate::convert::Output;
+use crate::convert::OutputFile;
 use crate::identifiable::{short, torque_of, unit, without};
 use crate::identify::progress_bar;
+use crate::names::find;
 use anyhow::Context;
-use proprio_dynamics::model::{Frame, Limits};
+use proprio_dynamics::model::{Frame, Limits, Model};
 use proprio_dynamics::regressor::identifiable::ParameterColumn;
 use proprio_dynamics::spatial::Pose;
 use proprio_estimator::config::{Base, Config, ConfigError};
 use proprio_estimator::daemon;
 use proprio_estimator::parameters::Parameters;
-use proprio_estimator::setup::{Setup, frame, nearest};
+use proprio_estimator::setup::{Setup, frame};
 use proprio_identification::forecast::SensorNoise;
 use proprio_identification::robot::IdentificationInput;
 use proprio_identification::{CovarianceRoot, Robot};
@@ -30,7 +31,7 @@ const SECONDS: [f64; 2] = [4.0, 120.0];
 
 /// `proprio excite`.
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct ExciteArgs {
     /// estimator.toml
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
@@ -69,7 +70,7 @@ pub(crate) struct Args {
 }
 
 /// Plans a motion.
-pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+pub(crate) fn run(args: &ExciteArgs) -> anyhow::Result<()> {
     let (config, mut setup) = daemon::load(&args.config, |config| {
         // What was identified earlier counts only if it is named.
         config.parameters = None;
@@ -93,7 +94,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let plan = planner.plan(&mut |done| bar.set_position((1000.0 * done) as u64));
     bar.finish_and_clear();
     let plan = plan.with_context(file)?;
-    let mut out = Output::new(&args.out)?;
+    let mut out = OutputFile::new(&args.out)?;
     let unwritable = || format!("{}: cannot be written", args.out.display());
     write(out.writer(), &plan.series, &robot).with_context(unwritable)?;
     out.finish().with_context(unwritable)?;
@@ -102,7 +103,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 
 /// What is asked, with names resolved.
 fn task<'a>(
-    args: &Args,
+    args: &ExciteArgs,
     config: &Config,
     robot: &'a Robot,
     known: Option<(CovarianceRoot, Vec<SensorNoise>)>,
@@ -194,6 +195,9 @@ fn numbers(text: &str) -> Option<Vec<f64>> {
     numbers.filter(|all| all.iter().all(|number| number.is_finite()))
 }
 
+/// Lower, upper, velocity, acceleration; those that are known.
+type KnownLimits = [Option<f64>; 4];
+
 /// The limits of each joint: given ones, else those of the URDF.
 fn limits(
     robot: &Robot,
@@ -201,72 +205,11 @@ fn limits(
     given: &[String],
 ) -> Result<Vec<Option<JointLimits>>, String> {
     let model = &robot.model;
-    let joint = |dof: usize| model.dof_joint(dof).unwrap_or_default();
-    // Lower, upper, velocity, acceleration: those of the joint, and of the joints that follow it.
-    let mut own: Vec<[Option<f64>; 4]> = (0..model.dof_count())
-        .map(|dof| {
-            let range = model.limits(joint(dof));
-            let velocity = model.velocity(joint(dof));
-            let of_leader = [
-                range.map(|own| own.lower),
-                range.map(|own| own.upper),
-                velocity,
-                None,
-            ];
-            let all = model.joints().iter().enumerate();
-            let followers =
-                all.filter(|(number, own)| own.dof == Some(dof) && *number != joint(dof));
-            followers.fold(of_leader, |[lower, upper, velocity, _], (number, own)| {
-                let at = |limit: f64| (limit - own.offset) / own.ratio;
-                let range = model.limits(number).filter(|_| own.ratio != 0.0);
-                let range = range.map(|range| (at(range.lower), at(range.upper)));
-                let range = range.map(|(a, b)| (a.min(b), a.max(b)));
-                let least =
-                    |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b).reduce(f64::min);
-                let most = |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b).reduce(f64::max);
-                let rate = model.velocity(number).map(|rate| rate / own.ratio.abs());
-                [
-                    most(lower, range.map(|range| range.0)),
-                    least(upper, range.map(|range| range.1)),
-                    least(velocity, rate.filter(|rate| rate.is_finite())),
-                    None,
-                ]
-            })
-        })
+    let mut own: Vec<KnownLimits> = (0..model.dof_count())
+        .map(|dof| urdf_limits(model, dof))
         .collect();
     for text in given {
-        let at = format!("--limit {text}");
-        let usage = || format!("{at}: write JOINT=LOWER,UPPER[,VELOCITY[,ACCELERATION]]");
-        let (name, values) = text.split_once('=').ok_or_else(usage)?;
-        let dof = dofs
-            .iter()
-            .copied()
-            .find(|&dof| model.dof_name(dof) == name);
-        let dof = dof.ok_or_else(|| {
-            let hint = nearest(name, dofs.iter().map(|&dof| model.dof_name(dof)));
-            format!("{at}: {name:?} is not a moving joint that is measured{hint}")
-        })?;
-        let values = numbers(values).filter(|all| (2..=4).contains(&all.len()));
-        let values = values.ok_or_else(usage)?;
-        let value = |at: usize| values.get(at).copied();
-        let (lower, upper) = (value(0).unwrap_or(0.0), value(1).unwrap_or(0.0));
-        if lower > upper || values.iter().skip(2).any(|value| *value <= 0.0) {
-            return Err(format!(
-                "{at}: the lower position must be at most the upper one, velocity and \
-                 acceleration above 0"
-            ));
-        }
-        if let Some(inside) = model.limits(joint(dof))
-            && (lower < inside.lower || upper > inside.upper)
-        {
-            let Limits { lower, upper } = inside;
-            return Err(format!("{at}: the URDF allows {lower} to {upper} only"));
-        }
-        if let (Some(most), Some(velocity)) = (model.velocity(joint(dof)), value(2))
-            && velocity > most
-        {
-            return Err(format!("{at}: the URDF allows a velocity of {most} only"));
-        }
+        let (dof, values) = given_limits(model, dofs, text)?;
         for (place, value) in own[dof].iter_mut().zip(values) {
             *place = Some(value);
         }
@@ -294,6 +237,70 @@ fn limits(
         })
     };
     Ok((0..model.dof_count()).map(complete).collect())
+}
+
+/// The limits of a degree of freedom in the URDF: those of its joint, and of the joints that follow
+/// it.
+fn urdf_limits(model: &Model, dof: usize) -> KnownLimits {
+    let leader = model.dof_joint(dof).unwrap_or_default();
+    let range = model.limits(leader);
+    let of_leader = [
+        range.map(|own| own.lower),
+        range.map(|own| own.upper),
+        model.velocity(leader),
+        None,
+    ];
+    let all = model.joints().iter().enumerate();
+    let followers = all.filter(|(number, own)| own.dof == Some(dof) && *number != leader);
+    followers.fold(of_leader, |[lower, upper, velocity, _], (number, own)| {
+        let at = |limit: f64| (limit - own.offset) / own.ratio;
+        let range = model.limits(number).filter(|_| own.ratio != 0.0);
+        let range = range.map(|range| (at(range.lower), at(range.upper)));
+        let range = range.map(|(a, b)| (a.min(b), a.max(b)));
+        let least = |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b).reduce(f64::min);
+        let most = |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b).reduce(f64::max);
+        let rate = model.velocity(number).map(|rate| rate / own.ratio.abs());
+        [
+            most(lower, range.map(|range| range.0)),
+            least(upper, range.map(|range| range.1)),
+            least(velocity, rate.filter(|rate| rate.is_finite())),
+            None,
+        ]
+    })
+}
+
+/// The degree of freedom and the limits of `JOINT=LOWER,UPPER[,VELOCITY[,ACCELERATION]]`, which lie
+/// within those of the URDF.
+fn given_limits(model: &Model, dofs: &[usize], text: &str) -> Result<(usize, Vec<f64>), String> {
+    let at = format!("--limit {text}");
+    let usage = || format!("{at}: write JOINT=LOWER,UPPER[,VELOCITY[,ACCELERATION]]");
+    let (name, values) = text.split_once('=').ok_or_else(usage)?;
+    let dof = find(name, || dofs.iter().map(|&dof| (model.dof_name(dof), dof)));
+    let dof =
+        dof.map_err(|hint| format!("{at}: {name:?} is not a moving joint that is measured{hint}"))?;
+    let joint = model.dof_joint(dof).unwrap_or_default();
+    let values = numbers(values).filter(|all| (2..=4).contains(&all.len()));
+    let values = values.ok_or_else(usage)?;
+    let value = |at: usize| values.get(at).copied();
+    let (lower, upper) = (value(0).unwrap_or(0.0), value(1).unwrap_or(0.0));
+    if lower > upper || values.iter().skip(2).any(|value| *value <= 0.0) {
+        return Err(format!(
+            "{at}: the lower position must be at most the upper one, velocity and acceleration \
+             above 0"
+        ));
+    }
+    if let Some(inside) = model.limits(joint)
+        && (lower < inside.lower || upper > inside.upper)
+    {
+        let Limits { lower, upper } = inside;
+        return Err(format!("{at}: the URDF allows {lower} to {upper} only"));
+    }
+    if let (Some(most), Some(velocity)) = (model.velocity(joint), value(2))
+        && velocity > most
+    {
+        return Err(format!("{at}: the URDF allows a velocity of {most} only"));
+    }
+    Ok((dof, values))
 }
 
 /// A box, from `LINK@X,Y,Z=XMIN,XMAX,YMIN,YMAX,ZMIN,ZMAX`.
@@ -354,7 +361,7 @@ fn write(mut out: impl Write, series: &Series, robot: &Robot) -> io::Result<()> 
 }
 
 /// Prints the forecast.
-fn report(args: &Args, plan: &Plan, robot: &Robot, wanted: &[usize]) -> anyhow::Result<()> {
+fn report(args: &ExciteArgs, plan: &Plan, robot: &Robot, wanted: &[usize]) -> anyhow::Result<()> {
     let model = &robot.model;
     let start = plan.series.at(0.0).position;
     let torques = || plan.before.iter().zip(&plan.after);

@@ -14,7 +14,7 @@ const PAGES: &[(&str, &str, &str)] = include!(concat!(env!("OUT_DIR"), "/pages.r
 
 /// The command line of `help`.
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct HelpArgs {
     /// A verb, a key (max_silence_ms, input.max_silence_ms), a driver (canopen_drive), a reason or
     /// a device's state (unexplained, silent), a page; `topics` lists the pages
     #[arg(value_name = "WORD")]
@@ -22,7 +22,7 @@ pub(crate) struct Args {
 }
 
 /// A section or a page that can be asked for.
-struct Entry {
+struct Article {
     /// Its name: `bus.device.address`, `unexplained`, `canopen_drive`.
     name: String,
     /// Its page's title, if it is the whole page.
@@ -30,7 +30,7 @@ struct Entry {
     text: &'static str,
 }
 
-impl Entry {
+impl Article {
     /// Whether `word` is its name, or the last part of it.
     fn is(&self, word: &str) -> bool {
         if self.title.is_some_and(|title| title.to_lowercase() == word) {
@@ -42,7 +42,7 @@ impl Entry {
 }
 
 /// All sections that have a name, and all pages, by the name of their file.
-fn entries() -> Vec<Entry> {
+fn entries() -> Vec<Article> {
     let mut all = Vec::new();
     for &(title, path, text) in PAGES {
         let file = path
@@ -57,7 +57,7 @@ fn entries() -> Vec<Entry> {
             .trim_end_matches(".md");
         let name = if file == "index" { folder } else { file };
         let title = Some(title);
-        all.push(Entry {
+        all.push(Article {
             name: name.into(),
             title,
             text,
@@ -81,7 +81,7 @@ fn entries() -> Vec<Entry> {
                 } else {
                     word
                 };
-                all.push(Entry {
+                all.push(Article {
                     name,
                     title: None,
                     text: section,
@@ -105,7 +105,7 @@ fn headings(text: &'static str) -> impl Iterator<Item = (usize, &'static str)> {
 
 /// What `proprio help` with these words shows.
 #[derive(Debug, PartialEq)]
-enum Answer {
+enum Lookup {
     /// The help of a verb: `proprio VERB --help`.
     Verb(Vec<String>),
     /// A text.
@@ -116,13 +116,13 @@ enum Answer {
     Unknown(String),
 }
 
-fn answer(words: &[String], program: &Command) -> Answer {
+fn answer(words: &[String], program: &Command) -> Lookup {
     let is_verb = |word: &str| program.find_subcommand(word).is_some();
     let Some(first) = words.first() else {
-        return Answer::Verb(Vec::new());
+        return Lookup::Verb(Vec::new());
     };
     if is_verb(first) {
-        return Answer::Verb(words.to_vec());
+        return Lookup::Verb(words.to_vec());
     }
     let word = words.join(" ");
     let word = word.trim_matches(['[', ']', '`']);
@@ -133,17 +133,17 @@ fn answer(words: &[String], program: &Command) -> Answer {
             true => format!("{:<18} {title}\n", title.to_lowercase()),
             false => format!("{:<18} {title}\n", entry.name),
         });
-        return Answer::Text(lines.collect());
+        return Lookup::Text(lines.collect());
     }
     let lower = word.to_lowercase();
-    let mut found: Vec<&Entry> = all.iter().filter(|entry| entry.name == lower).collect();
+    let mut found: Vec<&Article> = all.iter().filter(|entry| entry.name == lower).collect();
     if found.is_empty() {
         found = all.iter().filter(|entry| entry.is(&lower)).collect();
     }
     if found.is_empty() {
         // A key without its unit.
         let begin = format!("{lower}_");
-        let is_begun = |entry: &&Entry| {
+        let is_begun = |entry: &&Article| {
             let mut ends = entry.name.match_indices(&begin).map(|(at, _)| at);
             ends.any(|at| at == 0 || entry.name.as_bytes().get(at - 1) == Some(&b'.'))
         };
@@ -158,7 +158,7 @@ fn answer(words: &[String], program: &Command) -> Answer {
                 [entry.name.as_str(), last]
             });
             let verbs = program.get_subcommands().map(Command::get_name);
-            Answer::Unknown(did_you_mean(&lower, names.chain(verbs)))
+            Lookup::Unknown(did_you_mean(&lower, names.chain(verbs)))
         }
         // One, also if it is described twice, as for each kind of base.
         1 => {
@@ -168,9 +168,9 @@ fn answer(words: &[String], program: &Command) -> Answer {
                 }
                 _ => entry.text.trim_end().to_owned(),
             });
-            Answer::Text(texts.collect::<Vec<_>>().join("\n\n"))
+            Lookup::Text(texts.collect::<Vec<_>>().join("\n\n"))
         }
-        _ => Answer::Several(names),
+        _ => Lookup::Several(names),
     }
 }
 
@@ -241,21 +241,21 @@ fn without_links(text: &str) -> String {
 }
 
 /// Shows what the words of `args` name; `program` is the whole command line.
-pub(crate) fn run(args: &Args, mut program: Command) {
+pub(crate) fn run(args: &HelpArgs, mut program: Command) {
     let word = args.words.join(" ");
     match answer(&args.words, &program) {
-        Answer::Verb(words) => print_help_of(&words, program),
-        Answer::Text(text) => {
+        Lookup::Verb(words) => print_help_of(&words, program),
+        Lookup::Text(text) => {
             print_line!("{}", plain(&text, is_for_a_person()));
         }
-        Answer::Several(names) => {
+        Lookup::Several(names) => {
             let lines = names.iter().map(|name| format!("  proprio help {name}\n"));
             print_line!(
                 "{word} is in several places:\n{}",
                 lines.collect::<String>().trim_end()
             );
         }
-        Answer::Unknown(near) => wrong(
+        Lookup::Unknown(near) => wrong(
             &mut program,
             &format!("nothing is called {word:?}{near}; `proprio help topics` lists the pages"),
         ),
@@ -265,19 +265,19 @@ pub(crate) fn run(args: &Args, mut program: Command) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Args as Line;
-    use clap::{CommandFactory as _, Parser as _};
+    use crate::CommandLine;
+    use clap::CommandFactory as _;
 
-    fn ask(words: &str) -> Answer {
+    fn ask(words: &str) -> Lookup {
         answer(
             &words.split(' ').map(ToOwned::to_owned).collect::<Vec<_>>(),
-            &Line::command(),
+            &CommandLine::command(),
         )
     }
 
     fn text(words: &str) -> String {
         match ask(words) {
-            Answer::Text(text) => plain(&text, false),
+            Lookup::Text(text) => plain(&text, false),
             other => panic!("{words}: {other:?}"),
         }
     }
@@ -311,7 +311,7 @@ mod tests {
 
     #[test]
     fn what_is_in_several_places_is_listed_and_near_words_are_named() {
-        let Answer::Several(names) = ask("max_silence_ms") else {
+        let Lookup::Several(names) = ask("max_silence_ms") else {
             panic!("{:?}", ask("max_silence_ms"))
         };
         for name in [
@@ -320,7 +320,7 @@ mod tests {
             "skin.max_silence_ms",
         ] {
             assert!(names.iter().any(|one| one == name), "{names:?}");
-            assert!(matches!(ask(name), Answer::Text(_)), "{name}");
+            assert!(matches!(ask(name), Lookup::Text(_)), "{name}");
         }
         for (wrong, near) in [
             ("max_silense_ms", "max_silence_ms"),
@@ -328,7 +328,7 @@ mod tests {
             ("unexplaned", "unexplained"),
             ("gatway", "gateway"),
         ] {
-            let Answer::Unknown(text) = ask(wrong) else {
+            let Lookup::Unknown(text) = ask(wrong) else {
                 panic!("{:?}", ask(wrong))
             };
             assert!(
@@ -342,9 +342,12 @@ mod tests {
     fn verbs_keep_their_help() {
         for verb in ["gateway", "estimator", "ctl tare"] {
             let words: Vec<String> = verb.split(' ').map(ToOwned::to_owned).collect();
-            assert_eq!(ask(verb), Answer::Verb(words));
+            assert_eq!(ask(verb), Lookup::Verb(words));
         }
-        assert_eq!(answer(&[], &Line::command()), Answer::Verb(Vec::new()));
+        assert_eq!(
+            answer(&[], &CommandLine::command()),
+            Lookup::Verb(Vec::new())
+        );
     }
 
     /// Each name that is listed shows one text, so that nobody is sent in a circle.
@@ -353,10 +356,14 @@ mod tests {
         for entry in entries() {
             let shown = ask(entry
                 .title
-                .filter(|_| Line::command().find_subcommand(&entry.name).is_some())
+                .filter(|_| {
+                    CommandLine::command()
+                        .find_subcommand(&entry.name)
+                        .is_some()
+                })
                 .unwrap_or(&entry.name));
             assert!(
-                matches!(shown, Answer::Text(_)),
+                matches!(shown, Lookup::Text(_)),
                 "{}: {shown:?}",
                 entry.name
             );
@@ -374,78 +381,17 @@ mod tests {
         let all = reasons.chain(states).chain(links).chain(drivers);
         for word in all.filter(|word| !well.contains(word)) {
             assert!(
-                matches!(ask(word), Answer::Text(_)),
+                matches!(ask(word), Lookup::Text(_)),
                 "{word}: {:?}",
                 ask(word)
             );
         }
     }
 
-    /// The commands of a document: whole ones of its blocks, and parts of them in lines of text.
-    fn commands(text: &str) -> Vec<(String, bool)> {
-        let mut all = Vec::new();
-        for (number, part) in text.split("```").enumerate() {
-            if number % 2 == 0 {
-                let inline = part.split('`').skip(1).step_by(2);
-                all.extend(inline.map(|line| (line.replace('\n', " "), false)));
-            } else if let Some(block) = part.strip_prefix("sh\n") {
-                let block = block.replace("\\\n", " ");
-                all.extend(block.lines().map(|line| (line.to_owned(), true)));
-            }
-        }
-        all
-    }
-
-    /// What is given to `proprio` in this line of a shell, if anything is.
-    fn arguments(line: &str) -> Option<Vec<String>> {
-        let line = line.replace("cargo run --release -- ", "proprio ");
-        let line = line
-            .strip_prefix("source <(")
-            .map_or(line.as_str(), |rest| rest.trim_end_matches(')'));
-        let line = line.strip_prefix("sudo -u proprio ").unwrap_or(line);
-        let line = line.strip_prefix("sudo ").unwrap_or(line);
-        let line = line.strip_prefix("target/release/").unwrap_or(line);
-        let line = line.strip_prefix("proprio ")?;
-        Some(line.split_whitespace().map(ToOwned::to_owned).collect())
-    }
-
-    /// In every document, each command has legal options and values; those in blocks are whole.
-    #[test]
-    fn each_command_of_the_documents_is_legal() {
-        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-        let others = ["README.md", "SECURITY.md", "CONTRIBUTING.md"]
-            .map(|name| std::fs::read_to_string(root.join(name)).expect("a document"));
-        let mut count = 0;
-        let texts = PAGES
-            .iter()
-            .map(|(_, _, text)| *text)
-            .chain(others.iter().map(String::as_str));
-        for (line, is_whole) in texts.flat_map(commands) {
-            let Some(mut arguments) = arguments(&line) else {
-                continue;
-            };
-            // In text a word in capitals stands for any: `proprio ctl tare SENSOR`.
-            if !is_whole {
-                arguments.push("--help".into());
-            }
-            let parsed = Line::try_parse_from(["proprio".to_owned()].into_iter().chain(arguments));
-            let problem = parsed
-                .err()
-                .filter(|error| error.kind() != ErrorKind::DisplayHelp);
-            assert!(
-                problem.is_none(),
-                "`{line}`: {}",
-                problem.map_or_else(String::new, |e| e.to_string())
-            );
-            count += 1;
-        }
-        assert!(count > 80, "{count} commands");
-    }
-
     #[test]
     fn the_page_of_commands_has_each() {
         let page = text("commands");
-        for verb in Line::command().get_subcommands() {
+        for verb in CommandLine::command().get_subcommands() {
             assert!(
                 page.contains(&format!("| `{}` |", verb.get_name())),
                 "{}",

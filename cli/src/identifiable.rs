@@ -1,8 +1,10 @@
 //! `proprio identifiable`: what a robot's F/T sensors can tell of its torques at all, and which
 //! further sensor, or the motion of which joint, would tell more.
 
+use crate::names::find;
 use anyhow::Context;
 use proprio_dynamics::model::Model;
+use proprio_estimator::check::significant;
 use proprio_estimator::config::{Config, ConfigError, ForceTorque};
 use proprio_estimator::setup::{Setup, nearest};
 use proprio_identification::{Robot, parallel};
@@ -25,7 +27,7 @@ const NAMED: usize = 3;
 
 /// `proprio identifiable`.
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct IdentifiableArgs {
     /// The robot's URDF
     #[arg(value_name = "ROBOT.urdf", required_unless_present = "config")]
     urdf: Option<PathBuf>,
@@ -60,7 +62,7 @@ pub(crate) struct Args {
 }
 
 /// A set of sensors, and what it tells.
-struct Set {
+struct SensorPlacement {
     names: Vec<String>,
     config: Config,
     /// As it works.
@@ -86,7 +88,7 @@ struct Remedies {
 }
 
 /// Tells what is identifiable.
-pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+pub(crate) fn run(args: &IdentifiableArgs) -> anyhow::Result<()> {
     let (file, config) = match (&args.config, &args.urdf) {
         (Some(file), _) => (file, Config::load(file)?),
         (None, Some(urdf)) => (urdf, of_urdf(urdf, &args.base)?),
@@ -109,7 +111,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         let workspace = Workspace::new(&robot, STATES).with_context(about)?;
         let knowledge = Knowledge::of(&free, &regime(&free), &workspace).with_context(about)?;
         let names = config.force_torque.iter().map(|ft| ft.joint.clone());
-        Ok(Set {
+        Ok(SensorPlacement {
             names: names.collect(),
             config,
             robot,
@@ -118,7 +120,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             knowledge,
         })
     });
-    let sets = sets.collect::<anyhow::Result<Vec<Set>>>()?;
+    let sets = sets.collect::<anyhow::Result<Vec<SensorPlacement>>>()?;
     let remedies = sets.iter().map(|set| {
         let dof = match &args.joint {
             Some(name) => Some(torque_of(&set.robot, name).map_err(wrong)?),
@@ -160,10 +162,8 @@ pub(crate) fn torque_of(robot: &Robot, name: &str) -> Result<usize, String> {
 pub(crate) fn without(robot: &Robot, absent: &[String]) -> Result<Robot, String> {
     let mut free = robot.clone();
     for name in absent {
-        let contact = robot.contact(name).ok_or_else(|| {
-            let hint = nearest(name, robot.contact_names());
-            format!("--absent {name}: there is no such [[contact]]{hint}")
-        })?;
+        let contact = find(name, || robot.contact_names().zip(0..))
+            .map_err(|hint| format!("--absent {name}: there is no such [[contact]]{hint}"))?;
         if robot.support == Some(contact) {
             return Err(format!("--absent {name}: it carries the base"));
         }
@@ -179,11 +179,10 @@ pub(crate) fn unit(model: &Model, dof: usize) -> &'static str {
 
 /// A number with two digits.
 pub(crate) fn short(number: f64) -> String {
-    let digits = match number.abs() {
-        x if x < NOTHING => return "0".into(),
-        x => (1.0 - x.log10().floor()).max(0.0),
-    };
-    format!("{number:.*}", digits as usize)
+    match number.abs() < NOTHING {
+        true => "0".into(),
+        false => significant(number, 2),
+    }
 }
 
 /// The configuration of a robot of which only the URDF is known.
@@ -208,6 +207,7 @@ fn of_urdf(urdf: &Path, base: &str) -> Result<Config, ConfigError> {
 fn with_sensors(config: &Config, names: &str) -> Result<Config, String> {
     let model = Model::from_file(&config.model, &[]);
     let model = model.map_err(|error| format!("{}: {error}", config.model.display()))?;
+    let joints = joints(&model);
     let mut new = config.clone();
     new.force_torque.clear();
     new.output.trigger = None;
@@ -216,13 +216,9 @@ fn with_sensors(config: &Config, names: &str) -> Result<Config, String> {
         .map(str::trim)
         .filter(|name| !name.is_empty())
     {
-        if !joints(&model).iter().any(|own| own == name) {
-            let joints = joints(&model);
-            let hint = nearest(name, joints.iter().map(String::as_str));
-            return Err(format!(
-                "--sensors {names}: {name:?} is not a joint of the URDF{hint}"
-            ));
-        }
+        find(name, || joints.iter().map(|own| (own.as_str(), ()))).map_err(|hint| {
+            format!("--sensors {names}: {name:?} is not a joint of the URDF{hint}")
+        })?;
         if new.force_torque.iter().any(|own| own.joint == name) {
             return Err(format!("--sensors {names}: {name} is named twice"));
         }
@@ -256,7 +252,11 @@ fn joints(model: &Model) -> Vec<String> {
 
 /// What would lessen the deviation of the torque of a degree of freedom, or of the most uncertain
 /// one.
-fn remedies(set: &Set, absent: &[String], dof: Option<usize>) -> anyhow::Result<Option<Remedies>> {
+fn remedies(
+    set: &SensorPlacement,
+    absent: &[String],
+    dof: Option<usize>,
+) -> anyhow::Result<Option<Remedies>> {
     let model = &set.robot.model;
     let torques = set.knowledge.torques.iter();
     // A torque that contacts leave undetermined is as uncertain as can be.
@@ -322,7 +322,7 @@ fn remedies(set: &Set, absent: &[String], dof: Option<usize>) -> anyhow::Result<
     }))
 }
 
-impl Set {
+impl SensorPlacement {
     /// Where the sensors are, in words.
     fn title(&self) -> String {
         match self.names.as_slice() {

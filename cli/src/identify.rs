@@ -20,7 +20,9 @@ use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use logs::{names, open, read};
 use proprio_dynamics::model::Model;
+use proprio_estimator::config::Config;
 use proprio_estimator::export;
+use proprio_estimator::setup::Setup;
 use proprio_identification::robot::IdentificationInput;
 use proprio_identification::{Options, Outcome, Progress, Role, Severity, Verdict, identify};
 use std::fs;
@@ -29,7 +31,7 @@ use std::path::{Path, PathBuf};
 
 /// `proprio identify`.
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct IdentifyArgs {
     /// estimator.toml
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
@@ -64,7 +66,7 @@ const FILES: [&str; 4] = [
 ];
 
 /// Identifies.
-pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+pub(crate) fn run(args: &IdentifyArgs) -> anyhow::Result<()> {
     if let Some(name) = &args.payload {
         return payload::run(
             &args.config,
@@ -80,117 +82,35 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         config.parameters = None;
         config.identification.enabled = false;
     })?;
-    // Read now: it may be a result of an earlier run, which is removed below.
-    let urdf = Model::read_text(&config.model)?;
-    let files: Vec<(&PathBuf, Role)> = args
-        .samples
-        .iter()
-        .map(|f| (f, Role::Train))
-        .chain(args.validate.iter().map(|f| (f, Role::Validate)))
-        .collect();
-    let mut tables = Vec::new();
-    for (file, _) in &files {
-        tables.push(open(file, &args.config, &setup)?);
-    }
-    // All inputs are open. Remove the results of an earlier run, which could be mistaken for
-    // results of this one.
-    fs::create_dir_all(out).with_context(|| format!("{}: cannot be created", out.display()))?;
-    for name in FILES {
-        let file = out.join(name);
-        match fs::remove_file(&file) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                return Err(error)
-                    .with_context(|| format!("{}: cannot be replaced", file.display()));
-            }
-            _ => {}
-        }
-    }
-
-    let names = names(&files);
-    let options = Options {
-        inputs: config.identification.inputs.clone(),
-    };
-    let bar = progress_bar();
-    let show = |step: &str, done: f64| {
-        bar.set_position((done * 1000.0) as u64);
-        bar.set_message(step.to_owned());
-    };
-    // Reading takes a fifth of the time.
-    let of_reading = 0.2;
-    let mut datasets = Vec::new();
-    for (number, (((_, role), table), name)) in files.iter().zip(&mut tables).zip(names).enumerate()
-    {
-        show(
-            &format!("reading {name}"),
-            of_reading * number as f64 / files.len() as f64,
-        );
-        datasets.push(read(&setup, &name, *role, table)?);
-    }
-    let result = identify(
-        &setup.robot,
-        datasets,
-        &options,
-        &mut |progress: &Progress| {
-            show(
-                &progress.step,
-                of_reading + (1.0 - of_reading) * progress.done,
-            );
+    let train = args.samples.iter().map(|f| (f, Role::Train));
+    let validate = args.validate.iter().map(|f| (f, Role::Validate));
+    let inputs = Inputs {
+        config_file: &args.config,
+        // Read now: it may be a result of an earlier run, which is removed below.
+        urdf: Model::read_text(&config.model)?,
+        options: Options {
+            inputs: config.identification.inputs.clone(),
         },
-    );
-    if result.is_err() {
-        bar.finish_and_clear();
-    }
-    let outcome = result?;
-
+        config,
+        setup,
+        files: train.chain(validate).collect(),
+        bar: progress_bar(),
+    };
+    let outcome = inputs.identify(out)?;
     let advice = Advice::of(&outcome);
     let mut json = summary::summary(&outcome, &advice);
-    let mut found = Vec::new();
-    if advice.grade != Grade::Reject {
-        let mut parameters = export::parameters(
-            &outcome,
-            &setup.robot,
-            concat!("proprio ", env!("CARGO_PKG_VERSION")),
-        )?;
-        // What was identified from torques is no opinion of its own on them.
-        let is_second = !options.inputs.contains(&IdentificationInput::Torque)
-            && !setup.robot.structure.sensors().is_empty();
-        if is_second {
-            show("drives", 1.0);
-            found = drives::identify(&setup, &parameters, &outcome, &files, &args.config)
-                .unwrap_or_else(|error| {
-                    tracing::warn!("the drives give no second opinion: {error:#}");
-                    Vec::new()
-                });
-        }
-        let drives = found.iter().filter_map(|(_, drive)| drive.as_ref().ok());
-        parameters.set_drives(&drives.cloned().collect::<Vec<_>>())?;
-        let file = out.join("parameters.toml");
-        parameters
-            .save(&file)
-            .with_context(|| file.display().to_string())?;
-        let urdf = parameters
-            .urdf(&urdf, &setup.robot)
-            .with_context(|| config.model.display().to_string())?;
-        write(out, "identified.urdf", &urdf)?;
-    }
-    bar.finish_and_clear();
+    let found = match advice.grade {
+        Grade::Reject => Vec::new(),
+        _ => inputs.write_parameters(&outcome, out)?,
+    };
+    inputs.bar.finish_and_clear();
     json["drives"] = drives::in_json(&found);
     let mut text = serde_json::to_string_pretty(&json)?;
     text.push('\n');
     // The summary is written last: if it exists, the others do.
     write(out, "report.html", &page::page(&outcome, &advice))?;
     write(out, "summary.json", &text)?;
-    for (log, finding) in findings(&outcome).filter(|(_, f)| f.severity > Severity::Note) {
-        let place = log.map(|l| format!("{}: ", l.file)).unwrap_or_default();
-        eprintln!(
-            "{}: {place}{}",
-            summary::severity(finding.severity),
-            sentence(&finding.text)
-        );
-    }
-    for warning in drives::warnings(&found) {
-        eprintln!("warning: {warning}");
-    }
+    print_warnings(&outcome, &found);
     if args.json {
         print_line!("{json}");
     } else {
@@ -209,6 +129,115 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         );
     }
     Ok(())
+}
+
+/// What is identified from.
+struct Inputs<'a> {
+    config_file: &'a Path,
+    config: Config,
+    setup: Setup,
+    urdf: String,
+    options: Options,
+    files: Vec<(&'a PathBuf, Role)>,
+    bar: ProgressBar,
+}
+
+impl Inputs<'_> {
+    fn show(&self, step: &str, done: f64) {
+        self.bar.set_position((done * 1000.0) as u64);
+        self.bar.set_message(step.to_owned());
+    }
+
+    /// Reads the logs, and identifies; the results of an earlier run are removed from `out`.
+    fn identify(&self, out: &Path) -> anyhow::Result<Outcome> {
+        let mut tables = Vec::new();
+        for (file, _) in &self.files {
+            tables.push(open(file, self.config_file, &self.setup)?);
+        }
+        // All inputs are open.
+        remove_earlier(out)?;
+        let names = names(&self.files);
+        // Reading takes a fifth of the time.
+        let reading = 0.2;
+        let mut datasets = Vec::new();
+        for (((_, role), table), name) in self.files.iter().zip(&mut tables).zip(names) {
+            let done = reading * datasets.len() as f64 / self.files.len() as f64;
+            self.show(&format!("reading {name}"), done);
+            datasets.push(read(&self.setup, &name, *role, table)?);
+        }
+        let mut progress = |at: &Progress| self.show(&at.step, reading + (1.0 - reading) * at.done);
+        let result = identify(&self.setup.robot, datasets, &self.options, &mut progress);
+        if result.is_err() {
+            self.bar.finish_and_clear();
+        }
+        Ok(result?)
+    }
+
+    /// Writes parameters.toml and identified.urdf; returns what was found of the drives.
+    fn write_parameters(
+        &self,
+        outcome: &Outcome,
+        out: &Path,
+    ) -> anyhow::Result<Vec<drives::Found>> {
+        let setup = &self.setup;
+        let program = concat!("proprio ", env!("CARGO_PKG_VERSION"));
+        let mut parameters = export::parameters(outcome, &setup.robot, program)?;
+        let mut found = Vec::new();
+        // What was identified from torques is no opinion of its own on them.
+        let is_second = !self.options.inputs.contains(&IdentificationInput::Torque)
+            && !setup.robot.structure.sensors().is_empty();
+        if is_second {
+            self.show("drives", 1.0);
+            found = drives::identify(setup, &parameters, outcome, &self.files, self.config_file)
+                .unwrap_or_else(|error| {
+                    tracing::warn!("the drives give no second opinion: {error:#}");
+                    Vec::new()
+                });
+        }
+        let drives = found.iter().filter_map(|(_, drive)| drive.as_ref().ok());
+        parameters.set_drives(&drives.cloned().collect::<Vec<_>>())?;
+        let file = out.join("parameters.toml");
+        parameters
+            .save(&file)
+            .with_context(|| file.display().to_string())?;
+        let urdf = parameters
+            .urdf(&self.urdf, &setup.robot)
+            .with_context(|| self.config.model.display().to_string())?;
+        write(out, "identified.urdf", &urdf)?;
+        Ok(found)
+    }
+}
+
+/// Makes the folder of the results, and removes those of an earlier run, which could be mistaken
+/// for results of this one.
+fn remove_earlier(out: &Path) -> anyhow::Result<()> {
+    fs::create_dir_all(out).with_context(|| format!("{}: cannot be created", out.display()))?;
+    for name in FILES {
+        let file = out.join(name);
+        match fs::remove_file(&file) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                return Err(error)
+                    .with_context(|| format!("{}: cannot be replaced", file.display()));
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// Says what was found in the logs, and what is odd about the drives.
+fn print_warnings(outcome: &Outcome, found: &[drives::Found]) {
+    for (log, finding) in findings(outcome).filter(|(_, f)| f.severity > Severity::Note) {
+        let place = log.map(|l| format!("{}: ", l.file)).unwrap_or_default();
+        eprintln!(
+            "{}: {place}{}",
+            summary::severity(finding.severity),
+            sentence(&finding.text)
+        );
+    }
+    for warning in drives::warnings(found) {
+        eprintln!("warning: {warning}");
+    }
 }
 
 /// A progress bar if stderr is a terminal.

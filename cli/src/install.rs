@@ -46,7 +46,7 @@ const SERVICES: [Service; 2] = [
 
 /// `proprio install`.
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct InstallArgs {
     /// The robot's folder: gateway.toml, estimator.toml or both, and the files that they name;
     /// default: what /etc/proprio holds already
     #[arg(long, value_name = "DIR")]
@@ -63,7 +63,7 @@ pub(crate) struct Args {
 }
 
 /// What is done to the system; its text is what `--dry-run` prints.
-enum Step {
+enum InstallStep {
     /// Writes `bytes` to `to`, in one step.
     Write {
         to: PathBuf,
@@ -73,7 +73,7 @@ enum Step {
     Run(Vec<String>),
 }
 
-impl fmt::Display for Step {
+impl fmt::Display for InstallStep {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Write { to, mode, .. } => write!(f, "write {} (mode {mode:o})", to.display()),
@@ -82,7 +82,7 @@ impl fmt::Display for Step {
     }
 }
 
-impl Step {
+impl InstallStep {
     fn run(&self) -> anyhow::Result<()> {
         match self {
             Self::Write { to, bytes, mode } => {
@@ -110,7 +110,7 @@ impl Step {
 }
 
 /// Installs.
-pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+pub(crate) fn run(args: &InstallArgs) -> anyhow::Result<()> {
     let is_image = args.root != Path::new("/");
     if !(args.dry_run || is_image || nix::unistd::geteuid().is_root()) {
         bail!("only root can install: sudo proprio install ... (--dry-run prints the steps)");
@@ -154,17 +154,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             let to = args.root.join(UNITS).join(service.unit);
             steps.push(write(to, service.text.into(), 0o644));
         }
-        steps.push(Step::Run(in_image("systemd-sysusers").collect()));
+        steps.push(InstallStep::Run(in_image("systemd-sysusers").collect()));
     }
     if let Some(folder) = &args.config {
         steps.extend(configuration(folder, &etc, args.force)?);
     }
     let enable = in_image("systemctl").chain(words("enable"));
-    steps.push(Step::Run(enable.chain(units()).collect()));
+    steps.push(InstallStep::Run(enable.chain(units()).collect()));
     if !is_image {
-        steps.push(Step::Run(words("systemctl daemon-reload").collect()));
+        steps.push(InstallStep::Run(words("systemctl daemon-reload").collect()));
         let restart = words("systemctl restart").chain(units());
-        steps.push(Step::Run(restart.collect()));
+        steps.push(InstallStep::Run(restart.collect()));
     }
 
     for step in &steps {
@@ -197,8 +197,8 @@ fn refuse_copies(root: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn write(to: PathBuf, bytes: Vec<u8>, mode: u32) -> Step {
-    Step::Write { to, bytes, mode }
+fn write(to: PathBuf, bytes: Vec<u8>, mode: u32) -> InstallStep {
+    InstallStep::Write { to, bytes, mode }
 }
 
 /// Reads the configuration in `folder` as the daemons do.
@@ -216,7 +216,7 @@ fn check(folder: &Path) -> anyhow::Result<()> {
 /// The copies of the configuration in `folder` into `etc`, with the files that it names. A file
 /// that is there and differs is an error, unless by `force`: it may hold what was measured on the
 /// robot.
-fn configuration(folder: &Path, etc: &Path, force: bool) -> anyhow::Result<Vec<Step>> {
+fn configuration(folder: &Path, etc: &Path, force: bool) -> anyhow::Result<Vec<InstallStep>> {
     let mut names = BTreeSet::new();
     for config in SERVICES.map(|service| service.config) {
         let file = folder.join(config);

@@ -15,6 +15,7 @@ mod help;
 mod identifiable;
 mod identify;
 mod install;
+mod names;
 mod programs;
 mod record;
 mod report;
@@ -29,7 +30,7 @@ mod top;
 mod why;
 
 use clap::{CommandFactory as _, Parser, Subcommand};
-use proprio_topics::ipc::DomainConfig;
+use proprio_topics::ipc::{DomainConfig, DomainError};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -39,7 +40,7 @@ use std::process::ExitCode;
 /// Exit codes: 0 success, 2 wrong configuration or command line, 1 any other failure.
 #[derive(Parser)]
 #[command(name = "proprio", version, about, disable_help_subcommand = true)]
-struct Args {
+struct CommandLine {
     #[command(subcommand)]
     verb: Verb,
     /// The shared-memory domain: only processes of one domain see each other [env: PROPRIO_DOMAIN]
@@ -51,53 +52,53 @@ struct Args {
 #[derive(Subcommand)]
 enum Verb {
     /// Simulate a robot, run gateway and estimator on it, and compare with the truth
-    Demo(demo::Args),
+    Demo(demo::DemoArgs),
     /// Run the gateway daemon: read CAN buses, publish samples in shared memory
-    Gateway(Daemon),
+    Gateway(GatewayArgs),
     /// Run the estimator daemon: read samples, publish joint torques and contact wrenches
-    Estimator(estimator::Args),
+    Estimator(estimator::EstimatorArgs),
     /// Run only the simulated robot: its boards on a bus
-    Simulate(simulate::Args),
+    Simulate(simulate::SimulateArgs),
     /// Find out which devices are on a bus, or in a recorded log
-    Scan(scan::Args),
+    Scan(scan::ScanArgs),
     /// Write a gateway.toml for the devices that are found on the buses of this machine
-    Setup(setup::Args),
+    Setup(setup::SetupArgs),
     /// Convert a recorded CAN log to a table of samples in SI units
-    Decode(convert::Decode),
+    Decode(convert::DecodeArgs),
     /// Convert a table of samples to a CAN log: the inverse of decode
-    Encode(convert::Encode),
+    Encode(convert::EncodeArgs),
     /// Convert a recording (MCAP) to a table of its samples or estimates
-    Table(table::Args),
+    Table(table::TableArgs),
     /// Estimate joint torques and contact wrenches from a table of samples
-    Estimate(convert::Estimate),
+    Estimate(convert::EstimateArgs),
     /// Tell what a robot's F/T sensors can identify, and which torques rest on CAD for ever
-    Identifiable(identifiable::Args),
+    Identifiable(identifiable::IdentifiableArgs),
     /// Plan the motion that lessens the uncertainty of torques the most
-    Excite(excite::Args),
+    Excite(excite::ExciteArgs),
     /// Identify inertial parameters from recorded tables of samples and write a report
-    Identify(identify::Args),
+    Identify(identify::IdentifyArgs),
     /// Show the robots of a running system: processes, buses, devices, channels, estimates
-    Status(status::Status),
+    Status(status::StatusArgs),
     /// Show a running robot on the whole terminal: torques, contacts, channels, buses
-    Top(top::Top),
+    Top(top::TopArgs),
     /// Say why a torque is what it is, how uncertain it is and why, or why it is withheld
-    Why(why::Args),
+    Why(why::WhyArgs),
     /// Print the samples of a channel, the torques or the contacts as they come
-    Echo(echo::Echo),
+    Echo(echo::EchoArgs),
     /// Record what a robot measures and feels: a table, a recording, a black box
-    Record(record::Record),
+    Record(record::RecordArgs),
     /// Ask a running gateway: its state, its devices, a tare, a changed configuration
-    Ctl(ctl::Args),
+    Ctl(ctl::CtlArgs),
     /// Let Foxglove look at a running robot (the program proprio-view)
-    View(programs::Args),
+    View(programs::ProgramArgs),
     /// Publish a running robot to ROS 2 (the program proprio-ros2)
-    Ros2(programs::Args),
+    Ros2(programs::ProgramArgs),
     /// Check this machine: CAN, permissions, shared memory, buffers, real-time limits
-    Doctor(doctor::Args),
+    Doctor(doctor::DoctorArgs),
     /// Install this program, its systemd units and a robot's configuration
-    Install(install::Args),
+    Install(install::InstallArgs),
     /// Show a page of the book: a key, a driver, a reason, a verb; `help topics` lists all
-    Help(help::Args),
+    Help(help::HelpArgs),
     /// Print the completions of a shell: `source <(proprio completions bash)`
     Completions {
         /// The shell
@@ -106,7 +107,7 @@ enum Verb {
 }
 
 #[derive(clap::Args)]
-struct Daemon {
+struct GatewayArgs {
     /// The configuration file
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
@@ -116,7 +117,7 @@ struct Daemon {
 }
 
 fn main() -> ExitCode {
-    let args = Args::parse();
+    let args = CommandLine::parse();
     let is_journal = proprio_gateway::daemon::start_logging();
     // Recordings: what reads logs reads their frames.
     proprio_gateway::log::convert_with(samples::log_of_file);
@@ -149,12 +150,12 @@ fn main() -> ExitCode {
         Verb::Doctor(args) => doctor::run(&args, &domain),
         Verb::Install(args) => install::run(&args),
         Verb::Help(args) => {
-            help::run(&args, Args::command());
+            help::run(&args, CommandLine::command());
             Ok(())
         }
         Verb::Completions { shell } => {
             let mut script = Vec::new();
-            clap_complete::generate(shell, &mut Args::command(), "proprio", &mut script);
+            clap_complete::generate(shell, &mut CommandLine::command(), "proprio", &mut script);
             print_part!("{}", String::from_utf8_lossy(&script));
             Ok(())
         }
@@ -177,10 +178,20 @@ fn fail(error: &anyhow::Error, is_journal: bool) -> ExitCode {
     } else {
         eprintln!("error: {error:#}");
     }
-    let configuration = proprio_simulator::is_configuration(error)
-        || proprio_gateway::daemon::is_configuration(error)
-        || proprio_estimator::daemon::is_configuration(error);
-    ExitCode::from(if configuration { 2 } else { 1 })
+    ExitCode::from(if is_configuration(error) { 2 } else { 1 })
+}
+
+/// Whether a wrong configuration is at the root of an error.
+fn is_configuration(error: &anyhow::Error) -> bool {
+    error.chain().any(|cause| {
+        cause.is::<proprio_gateway::plan::PlanError>()
+            || cause.is::<proprio_estimator::config::ConfigError>()
+            || cause.is::<proprio_simulator::SimulatorError>()
+            || cause.is::<proprio_simulator::SimulatedRobotError>()
+            || cause.is::<proprio_simulator::FaultError>()
+            || cause.is::<proprio_simulator::RunOptionsError>()
+            || (cause.downcast_ref()).is_some_and(DomainError::is_configuration)
+    })
 }
 
 #[cfg(test)]
@@ -193,7 +204,7 @@ mod tests {
     #[test]
     fn the_man_pages_are_new() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../packaging/man");
-        let mut program = Args::command();
+        let mut program = CommandLine::command();
         program.build();
         for verb in [&program].into_iter().chain(program.get_subcommands()) {
             let name = verb.get_display_name().unwrap_or_else(|| verb.get_name());

@@ -11,7 +11,7 @@ use std::process::Command;
 /// What is passed on.
 #[derive(clap::Args)]
 #[command(disable_help_flag = true)]
-pub(crate) struct Args {
+pub(crate) struct ProgramArgs {
     /// Its own arguments; `--help` lists them
     #[arg(
         trailing_var_arg = true,
@@ -22,7 +22,7 @@ pub(crate) struct Args {
 }
 
 /// Becomes `proprio-<name>`: the program beside this one, or else one in the PATH.
-pub(crate) fn run(name: &str, args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
+pub(crate) fn run(name: &str, args: &ProgramArgs, domain: &DomainConfig) -> anyhow::Result<()> {
     let program = format!("proprio-{name}");
     let beside = std::env::current_exe().ok();
     let beside = beside.and_then(|own| Some(own.parent()?.join(&program)));

@@ -10,9 +10,9 @@ mod output;
 use crate::running::interrupted;
 use anyhow::bail;
 use black_box::BlackBox;
-use frames::Frames;
+use frames::RawFrames;
 use gaps::Gaps;
-use output::{Output, Split, create};
+use output::{Destination, Split, create};
 use proprio_bridge::{Event, Heard, Listener};
 use proprio_drivers::Frame;
 use proprio_gateway::clock::realtime_offset;
@@ -21,6 +21,7 @@ use proprio_recording::About;
 use proprio_topics::Nanos;
 use proprio_topics::csv::{Columns, Series, Value};
 use proprio_topics::ipc::{DomainConfig, monotonic};
+use std::io;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -36,7 +37,7 @@ const FRAMES: usize = 4096;
 
 /// `proprio record`.
 #[derive(clap::Args)]
-pub(crate) struct Record {
+pub(crate) struct RecordArgs {
     /// The table of samples: a new file. One that ends with .mcap is a recording of samples,
     /// torques, contacts and health, which Foxglove, PlotJuggler and `identify` read. With --ring,
     /// a folder
@@ -72,7 +73,7 @@ pub(crate) struct Record {
     ring: Option<f64>,
 }
 
-impl Record {
+impl RecordArgs {
     /// What is written; `series` are the channels and contacts that are there.
     fn output(
         &self,
@@ -80,7 +81,7 @@ impl Record {
         series: &[Series],
         config: &DomainConfig,
         now: Nanos,
-    ) -> anyhow::Result<Output> {
+    ) -> anyhow::Result<Destination> {
         let is_table = self.out.extension().is_none_or(|it| it != "mcap");
         if self.ring.is_none() && is_table {
             if !self.frames.is_empty() || !self.config.is_empty() || self.split.is_some() {
@@ -91,7 +92,7 @@ impl Record {
                 false => Columns::Main,
             };
             let file = create(&self.out, self.force)?;
-            return Ok(Output::table(file, series, columns)?);
+            return Ok(Destination::table(file, series, columns)?);
         }
         let about = About {
             robot: robot.to_owned(),
@@ -104,7 +105,7 @@ impl Record {
             false => bail!("{seconds} s: more than 0 and less than 1e6 s are possible"),
         };
         match (self.ring, self.split) {
-            (Some(seconds), _) => Ok(Output::BlackBox(Box::new(BlackBox::new(
+            (Some(seconds), _) => Ok(Destination::BlackBox(Box::new(BlackBox::new(
                 about,
                 series,
                 span(seconds)?,
@@ -113,15 +114,15 @@ impl Record {
             )?))),
             (None, Some(seconds)) => {
                 let split = Split::new(&self.out, self.force, span(seconds)?);
-                Output::split(split, about, series, now)
+                Destination::split(split, about, series, now)
             }
-            (None, None) => Output::recording(create(&self.out, self.force)?, about, series),
+            (None, None) => Destination::recording(create(&self.out, self.force)?, about, series),
         }
     }
 }
 
 /// What is recorded, in the order of time.
-enum Item {
+enum RecordItem {
     Heard(Heard),
     /// On the bus with this number.
     Frame(usize, Frame),
@@ -129,19 +130,106 @@ enum Item {
 
 /// What was recorded.
 #[derive(Default)]
-struct Counts {
+struct RecordedCounts {
     samples: u64,
     torques: u64,
     frames: u64,
 }
 
+/// A recording in progress: what is heard is sorted, and written.
+struct Session {
+    /// The names of the buses whose frames are recorded.
+    buses: Vec<String>,
+    order: InOrder<RecordItem>,
+    gaps: Gaps,
+    counts: RecordedCounts,
+    out: Destination,
+}
+
+impl Session {
+    /// Something heard or a frame of `t`; `series` are all that are known by now.
+    fn push(&mut self, t: Nanos, item: RecordItem, series: &[Series]) -> io::Result<()> {
+        let Self {
+            buses, order, out, ..
+        } = self;
+        order.push(t, item, |t, item| write(buses, out, t, item, series))
+    }
+
+    fn hear(&mut self, event: Event, series: &[Series]) -> io::Result<()> {
+        let Event {
+            mut t,
+            epoch,
+            heard,
+        } = event;
+        match &heard {
+            Heard::Value(_, Value::Reading(..)) => {
+                self.counts.samples += 1;
+                self.gaps.see(epoch, t);
+            }
+            // What was declared long before arrives with the next declaration.
+            Heard::Value(_, Value::Contact(_)) => t = t.max(self.order.passed_on()),
+            Heard::Torques(..) => self.counts.torques += 1,
+            _ => {}
+        }
+        self.push(t, RecordItem::Heard(heard), series)
+    }
+
+    /// Writes what no longer waits at `now` to be sorted.
+    fn advance(&mut self, now: Nanos, series: &[Series]) -> io::Result<()> {
+        let Self {
+            buses, order, out, ..
+        } = self;
+        order.advance(now, |t, item| write(buses, out, t, item, series))
+    }
+
+    /// Writes all that waits.
+    fn write_all(&mut self, series: &[Series]) -> io::Result<()> {
+        let Self {
+            buses, order, out, ..
+        } = self;
+        order.finish(|t, item| write(buses, out, t, item, series))
+    }
+
+    /// Tells a black box what has happened; returns whether a file of it is asked for.
+    fn watch(&mut self, now: Nanos, series: &[Series]) -> io::Result<bool> {
+        let is_silent = self.gaps.wait(now);
+        let Destination::BlackBox(black_box) = &mut self.out else {
+            return Ok(false);
+        };
+        if is_silent {
+            black_box.happened(now, "no_samples".to_owned());
+        }
+        let is_asked = black_box.is_asked();
+        if is_asked {
+            self.write_all(series)?;
+        }
+        Ok(is_asked)
+    }
+}
+
+fn write(
+    buses: &[String],
+    out: &mut Destination,
+    t: Nanos,
+    item: &RecordItem,
+    series: &[Series],
+) -> io::Result<()> {
+    match item {
+        RecordItem::Heard(heard) => out.push(t, heard, series),
+        RecordItem::Frame(bus, frame) => {
+            let bus = buses.get(*bus).map_or("", String::as_str);
+            out.frame(bus, frame)
+        }
+    }
+}
+
 /// Records what a robot sends.
-pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
+pub(crate) fn run(args: &RecordArgs, config: &DomainConfig) -> anyhow::Result<()> {
     let stop = interrupted()?;
     // Before the listener's: they come first, and wait.
     let frames = match args.frames.is_empty() {
         true => None,
-        false => Some(Frames::open(&args.frames, config)?),
+        false => Some(RawFrames::open(&args.frames, config)?),
     };
     let robot = args.robot.as_deref();
     // A black box is started with the machine, perhaps before the daemons.
@@ -156,72 +244,61 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
         }
     };
     let began = monotonic();
-    let mut out = args.output(listener.robot(), listener.series(), config, began)?;
-    let mut gaps = Gaps::new(listener.description());
-    let mut order = InOrder::<Item>::new(REORDER);
-    let mut counts = Counts::default();
+    let mut session = Session {
+        buses: (frames.as_ref()).map_or(Vec::new(), |frames| frames.buses.clone()),
+        order: InOrder::new(REORDER),
+        gaps: Gaps::new(listener.description()),
+        counts: RecordedCounts::default(),
+        out: args.output(listener.robot(), listener.series(), config, began)?,
+    };
     let end = (args.seconds).map(|seconds| began + Nanos::from_seconds(seconds));
     let mut next_flush = began;
-    let buses = frames.as_ref().map_or(&[][..], |frames| &frames.buses);
-    let write = |t, item: &Item, series: &[Series], out: &mut Output| match item {
-        Item::Heard(heard) => out.push(t, heard, series),
-        Item::Frame(bus, frame) => {
-            let bus = buses.get(*bus).map_or("", String::as_str);
-            out.frame(bus, frame)
-        }
-    };
     while !stop.load(Relaxed) && end.is_none_or(|end| monotonic() < end) {
         let now = monotonic();
         for _ in 0..FRAMES {
-            let Some((bus, frame)) = frames.as_ref().and_then(Frames::next) else {
+            let Some((bus, frame)) = frames.as_ref().and_then(RawFrames::next) else {
                 break;
             };
-            counts.frames += 1;
-            let item = Item::Frame(bus, frame);
-            order.push(frame.t, item, |t, it| {
-                write(t, it, listener.series(), &mut out)
-            })?;
+            session.counts.frames += 1;
+            let item = RecordItem::Frame(bus, frame);
+            session.push(frame.t, item, listener.series())?;
         }
         listener.poll(now, |listener, event| -> anyhow::Result<()> {
-            let Event {
-                mut t,
-                epoch,
-                heard,
-            } = event;
-            match &heard {
-                Heard::Value(_, Value::Reading(..)) => {
-                    counts.samples += 1;
-                    gaps.see(epoch, t);
-                }
-                // What was declared long before arrives with the next declaration.
-                Heard::Value(_, Value::Contact(_)) => t = t.max(order.passed_on()),
-                Heard::Torques(..) => counts.torques += 1,
-                _ => {}
-            }
-            let item = Item::Heard(heard);
-            Ok(order.push(t, item, |t, it| write(t, it, listener.series(), &mut out))?)
+            Ok(session.hear(event, listener.series())?)
         })?;
-        order.advance(now, |t, it| write(t, it, listener.series(), &mut out))?;
-        let is_silent = gaps.wait(now);
-        if let Output::BlackBox(black_box) = &mut out {
-            if is_silent {
-                black_box.happened(now, "no_samples".to_owned());
-            }
-            if black_box.is_asked() {
-                order.finish(|t, it| write(t, it, listener.series(), &mut out))?;
-                next_flush = now;
-            }
+        session.advance(now, listener.series())?;
+        if session.watch(now, listener.series())? {
+            next_flush = now;
         }
         if now >= next_flush {
             next_flush = now + FLUSH;
-            out.flush(now, listener.series())?;
+            session.out.flush(now, listener.series())?;
         }
         listener.wait((now + Nanos::from_millis(100)).min(end.unwrap_or(Nanos::MAX)));
     }
-    order.finish(|t, it| write(t, it, listener.series(), &mut out))?;
+    session.write_all(listener.series())?;
+    let lost_frames = frames.as_ref().map(RawFrames::lost);
+    finish(args, session, &listener, began, lost_frames)
+}
+
+/// Ends the recording, and says what it has.
+fn finish(
+    args: &RecordArgs,
+    session: Session,
+    listener: &Listener,
+    began: Nanos,
+    lost_frames: Option<u64>,
+) -> anyhow::Result<()> {
+    let Session {
+        order,
+        gaps,
+        counts,
+        out,
+        ..
+    } = session;
     let without_column = out.without_column();
-    let is_table = matches!(out, Output::Table(_));
-    let told = out.finish(monotonic(), listener.series())?;
+    let is_table = matches!(out, Destination::Table(_));
+    let note = out.finish(monotonic(), listener.series())?;
     print_line!(
         "{}: {} samples in {:.1} s, {} lost, {} out of order",
         args.out.display(),
@@ -237,11 +314,11 @@ pub(crate) fn run(args: &Record, config: &DomainConfig) -> anyhow::Result<()> {
             counts.torques
         );
     }
-    if let Some(frames) = &frames {
-        print_line!("{} frames, {} lost", counts.frames, frames.lost());
+    if let Some(lost) = lost_frames {
+        print_line!("{} frames, {lost} lost", counts.frames);
     }
-    if let Some(told) = told {
-        print_line!("{told}");
+    if let Some(note) = note {
+        print_line!("{note}");
     }
     let without = gaps.summary(monotonic());
     if !without.is_empty() {

@@ -7,6 +7,7 @@ pub(crate) mod plot;
 
 pub(crate) use escape::escape;
 
+use proprio_estimator::check::significant;
 use std::fmt::Write as _;
 
 /// The style sheet. Colours after Okabe and Ito, which the colour-blind can distinguish.
@@ -122,13 +123,13 @@ impl From<f64> for Cell {
 
 /// A table, which scrolls horizontally if the page is too narrow for it.
 #[derive(Debug, Clone)]
-pub(crate) struct Table {
+pub(crate) struct ReportTable {
     caption: String,
     head: Vec<String>,
     rows: Vec<Vec<Cell>>,
 }
 
-impl Table {
+impl ReportTable {
     pub(crate) fn new(caption: &str, head: &[&str]) -> Self {
         Self {
             caption: caption.to_owned(),
@@ -229,7 +230,7 @@ pub(crate) fn short(value: f64) -> String {
     digits(value, 2)
 }
 
-fn digits(value: f64, count: i32) -> String {
+fn digits(value: f64, count: u8) -> String {
     if value == 0.0 {
         return "0".into();
     }
@@ -244,14 +245,12 @@ fn digits(value: f64, count: i32) -> String {
         };
     }
     // Rounding may add a digit: 9.996 becomes 10.0.
-    let rounded: f64 = format!("{value:.*e}", (count - 1) as usize)
-        .parse()
-        .unwrap_or(value);
+    let scientific = format!("{value:.*e}", usize::from(count) - 1);
+    let rounded: f64 = scientific.parse().unwrap_or(value);
     let power = rounded.abs().log10().floor() as i32;
-    let text = if (-4..=5).contains(&power) {
-        format!("{rounded:.*}", (count - 1 - power).max(0) as usize)
-    } else {
-        format!("{rounded:.*e}", (count - 1) as usize)
+    let text = match power {
+        -4..=5 => significant(rounded, count),
+        _ => scientific,
     };
     text.replace('-', "−")
 }
@@ -278,7 +277,7 @@ mod tests {
 
     #[test]
     fn names_from_files_can_not_break_the_page() {
-        let mut table = Table::new("a & b", &["<x>"]);
+        let mut table = ReportTable::new("a & b", &["<x>"]);
         table.row(vec!["<script>".into(), f64::NAN.into()]);
         let html = page(
             "<b>",

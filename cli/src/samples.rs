@@ -14,7 +14,7 @@ use tempfile::TempDir;
 
 /// What becomes of a recording.
 #[derive(Clone, Copy)]
-enum Into {
+enum Conversion {
     /// A table; `from_table`: what is one already stays as it is.
     Table {
         from_table: bool,
@@ -31,21 +31,21 @@ pub(crate) fn of_recording(
     estimates: bool,
 ) -> anyhow::Result<Bytes> {
     let what = match estimates {
-        true => Into::Estimates,
-        false => Into::Table { from_table: false },
+        true => Conversion::Estimates,
+        false => Conversion::Table { from_table: false },
     };
     convert(input, path, what).with_context(|| format!("{}: cannot be read", path.display()))
 }
 
 /// The table that `input` is, or has as a recording.
 pub(crate) fn table(input: impl Read + Send + 'static, path: &Path) -> anyhow::Result<Bytes> {
-    convert(input, path, Into::Table { from_table: true })
+    convert(input, path, Conversion::Table { from_table: true })
         .with_context(|| format!("{}: cannot be read", path.display()))
 }
 
 /// The log that `input` is, or has as a recording with raw frames.
 pub(crate) fn log(input: impl Read + Send + 'static, path: &Path) -> io::Result<Bytes> {
-    convert(input, path, Into::Frames)
+    convert(input, path, Conversion::Frames)
 }
 
 /// The log in this file.
@@ -53,14 +53,20 @@ pub(crate) fn log_of_file(file: File, path: &Path) -> io::Result<Bytes> {
     log(file, path)
 }
 
-fn convert(mut input: impl Read + Send + 'static, path: &Path, what: Into) -> io::Result<Bytes> {
+fn convert(
+    mut input: impl Read + Send + 'static,
+    path: &Path,
+    what: Conversion,
+) -> io::Result<Bytes> {
     let mut beginning = Vec::new();
     input.by_ref().take(8).read_to_end(&mut beginning)?;
     let is_recording = is_mcap(&beginning);
     let whole = Cursor::new(beginning).chain(input);
     match (is_recording, what) {
         (true, _) => {}
-        (false, Into::Table { from_table: true } | Into::Frames) => return Ok(Bytes::of(whole)),
+        (false, Conversion::Table { from_table: true } | Conversion::Frames) => {
+            return Ok(Bytes::of(whole));
+        }
         (false, _) => return Err(io::Error::other("it is no recording (MCAP)")),
     }
     let (pipe, to) = io::pipe()?;
@@ -69,9 +75,9 @@ fn convert(mut input: impl Read + Send + 'static, path: &Path, what: Into) -> io
         .spawn(move || {
             let whole = BufReader::new(whole);
             match what {
-                Into::Table { .. } => to_table(whole, to),
-                Into::Estimates => to_estimates(whole, to),
-                Into::Frames => to_log(whole, to),
+                Conversion::Table { .. } => to_table(whole, to),
+                Conversion::Estimates => to_estimates(whole, to),
+                Conversion::Frames => to_log(whole, to),
             }
         })?;
     Ok(Bytes::of(Converted {

@@ -30,7 +30,7 @@ frame meanwhile: switch them on at least 6 s before a scan that asks.";
 /// `proprio scan`.
 #[derive(clap::Args)]
 #[command(after_help = WARNING)]
-pub(crate) struct Args {
+pub(crate) struct ScanArgs {
     /// The bus: can0 or virtual:NAME
     #[arg(
         long,
@@ -104,7 +104,7 @@ pub(crate) fn open_bus(
 }
 
 /// What was heard on a bus.
-pub(crate) struct Heard {
+pub(crate) struct ScanResult {
     pub(crate) traffic: Traffic,
     /// How many questions were sent.
     pub(crate) asked: usize,
@@ -116,7 +116,7 @@ impl How {
         &self,
         source: &FrameSource,
         domain: &DomainConfig,
-    ) -> anyhow::Result<Heard> {
+    ) -> anyhow::Result<ScanResult> {
         let (mut link, interface) = open_bus(source, domain)?;
         let fd = interface.is_none_or(|interface| {
             let health = Netlink::default().ask(&interface);
@@ -133,12 +133,12 @@ impl How {
             let named: Vec<&str> = self.ask.iter().map(String::as_str).collect();
             asked = scan::ask(&mut *link, &Monotonic, &named, fd, &mut traffic)?;
         }
-        Ok(Heard { traffic, asked })
+        Ok(ScanResult { traffic, asked })
     }
 }
 
 /// Scans a bus or a log, and prints what is found.
-pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
+pub(crate) fn run(args: &ScanArgs, domain: &DomainConfig) -> anyhow::Result<()> {
     let mut buses = Vec::new();
     let mut notes = Vec::new();
     match (&args.bus, &args.log) {
@@ -275,9 +275,15 @@ fn as_text(name: &str, how: &str, heard: &Traffic, devices: &[FoundDevice]) -> S
             }
         });
     }
-    if count == 0 {
-        return text;
+    if count > 0 {
+        text += &streams(heard, devices);
     }
+    text
+}
+
+/// The table of the identifiers that were heard.
+fn streams(heard: &Traffic, devices: &[FoundDevice]) -> String {
+    let mut text = String::new();
     let _ = writeln!(
         text,
         "\n{:<10} {:>9} {:>8} {:>5}  {:<8} {:<16} device",

@@ -4,12 +4,11 @@
 use crate::scan::{How, WARNING};
 use anyhow::{Context as _, bail};
 use proprio_gateway::config::FrameSource;
-use proprio_gateway::link::adapter::{self, Adapter};
+use proprio_gateway::link::adapter::{self, Adapter, Present};
 use proprio_gateway::link::interface::{Interfaces as _, Netlink};
 use proprio_gateway::plan::Plan;
 use proprio_gateway::scan::{ScannedBus, devices, file};
 use proprio_simulator::parse_bus;
-use proprio_topics::InterfaceHealth;
 use proprio_topics::ipc::DomainConfig;
 use std::fs::{self, OpenOptions};
 use std::io::Write as _;
@@ -18,7 +17,7 @@ use std::path::{Path, PathBuf};
 /// `proprio setup`.
 #[derive(clap::Args)]
 #[command(after_help = WARNING)]
-pub(crate) struct Args {
+pub(crate) struct SetupArgs {
     /// The folder of the configuration; it is made if it is not there
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -36,7 +35,7 @@ pub(crate) struct Args {
 }
 
 /// Scans and writes.
-pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
+pub(crate) fn run(args: &SetupArgs, domain: &DomainConfig) -> anyhow::Result<()> {
     let target = args.out.join("gateway.toml");
     // Before the scan, which takes its time.
     if target.exists() && !args.force {
@@ -46,18 +45,7 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
         );
     }
     let present = adapter::present(Path::new(adapter::SYS));
-    let mut sources = Vec::new();
-    for bus in &args.bus {
-        let source = parse_bus(bus)?;
-        if sources.contains(&source) {
-            bail!("--bus {bus} is given twice");
-        }
-        sources.push(source);
-    }
-    if args.bus.is_empty() {
-        let all = present.iter().map(|present| present.interface.clone());
-        sources.extend(all.map(|name| FrameSource::SocketCan(Adapter::Interface(name))));
-    }
+    let sources = sources(&args.bus, &present)?;
     if sources.is_empty() {
         bail!(
             "this machine has no CAN interface (`proprio doctor` says why); --bus virtual:NAME \
@@ -66,47 +54,14 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     }
     let mut buses = Vec::new();
     for source in &sources {
-        let (interface, name) = match source {
-            FrameSource::SocketCan(Adapter::Interface(name)) => (Some(name), name.clone()),
-            FrameSource::Virtual { name } => (None, name.clone()),
-            FrameSource::SocketCan(_) | FrameSource::Replay { .. } => continue,
-        };
-        let heard = match (args.how.scan(source, domain), args.bus.is_empty()) {
-            (Ok(heard), _) => heard,
+        match scanned(args, source, sources.len() > 1, &present, domain) {
+            Ok(bus) => buses.extend(bus),
             // Of all interfaces, one that is down is no reason to leave out the others.
-            (Err(error), true) => {
+            Err((name, error)) if args.bus.is_empty() => {
                 eprintln!("bus {name}: left out: {error:#}");
-                continue;
             }
-            (Err(error), false) => return Err(error.context(format!("bus {name}"))),
-        };
-        let health = interface.map(|name| Netlink::default().ask(name));
-        let health = health
-            .and_then(Result::ok)
-            .unwrap_or(InterfaceHealth::default());
-        let prefix = match sources.len() {
-            1 => String::new(),
-            _ => format!("{name}_"),
-        };
-        let lasting = match (interface, source) {
-            (Some(name), _) => FrameSource::SocketCan(Adapter::lasting(name, &present)),
-            (None, source) => source.clone(),
-        };
-        let bus = ScannedBus {
-            interface: (interface.filter(|_| lasting != *source).cloned()).unwrap_or_default(),
-            source: lasting,
-            bit_rates: (health.bit_rate, health.data_bit_rate),
-            devices: devices(&heard.traffic, &prefix),
-            name,
-        };
-        match bus.devices.len() {
-            0 => eprintln!(
-                "bus {}: no device was recognised; `proprio scan` says what was heard",
-                bus.name
-            ),
-            count => eprintln!("bus {}: {count} devices", bus.name),
+            Err((name, error)) => return Err(error.context(format!("bus {name}"))),
         }
-        buses.push(bus);
     }
     if buses.is_empty() {
         bail!("no bus could be scanned: nothing was written");
@@ -132,4 +87,66 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
     );
     print_line!("    proprio gateway --config {} --check", target.display());
     Ok(())
+}
+
+/// The buses that are named, else all CAN interfaces.
+fn sources(named: &[String], present: &[Present]) -> anyhow::Result<Vec<FrameSource>> {
+    let mut sources = Vec::new();
+    for bus in named {
+        let source = parse_bus(bus)?;
+        if sources.contains(&source) {
+            bail!("--bus {bus} is given twice");
+        }
+        sources.push(source);
+    }
+    if named.is_empty() {
+        let interfaces = present.iter().map(|present| present.interface.clone());
+        sources.extend(interfaces.map(|name| FrameSource::SocketCan(Adapter::Interface(name))));
+    }
+    Ok(sources)
+}
+
+/// What is on a bus. If there are several, devices have its name before theirs.
+///
+/// # Errors
+/// The bus's name, and why it cannot be scanned.
+fn scanned(
+    args: &SetupArgs,
+    source: &FrameSource,
+    is_one_of_several: bool,
+    present: &[Present],
+    domain: &DomainConfig,
+) -> Result<Option<ScannedBus>, (String, anyhow::Error)> {
+    let (interface, name) = match source {
+        FrameSource::SocketCan(Adapter::Interface(name)) => (Some(name), name.clone()),
+        FrameSource::Virtual { name } => (None, name.clone()),
+        FrameSource::SocketCan(_) | FrameSource::Replay { .. } => return Ok(None),
+    };
+    let heard = args.how.scan(source, domain);
+    let heard = heard.map_err(|error| (name.clone(), error))?;
+    let health = interface.map(|name| Netlink::default().ask(name));
+    let health = health.and_then(Result::ok).unwrap_or_default();
+    let prefix = match is_one_of_several {
+        false => String::new(),
+        true => format!("{name}_"),
+    };
+    let lasting = match interface {
+        Some(name) => FrameSource::SocketCan(Adapter::lasting(name, present)),
+        None => source.clone(),
+    };
+    let bus = ScannedBus {
+        interface: (interface.filter(|_| lasting != *source).cloned()).unwrap_or_default(),
+        source: lasting,
+        bit_rates: (health.bit_rate, health.data_bit_rate),
+        devices: devices(&heard.traffic, &prefix),
+        name,
+    };
+    match bus.devices.len() {
+        0 => eprintln!(
+            "bus {}: no device was recognised; `proprio scan` says what was heard",
+            bus.name
+        ),
+        count => eprintln!("bus {}: {count} devices", bus.name),
+    }
+    Ok(Some(bus))
 }

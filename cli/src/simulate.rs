@@ -1,16 +1,14 @@
 //! `proprio simulate`: runs only the simulated robot, its boards on a bus.
 
-use anyhow::Context;
-use proprio_simulator::{Fault, Options, Robot, Settings, parse_bus};
+use crate::running::interrupted;
+use proprio_simulator::{InjectedFault, RunOptions, SimulatedRobot, SimulationSettings, parse_bus};
 use proprio_topics::ipc::{Domain, DomainConfig, Writer, monotonic};
 use proprio_topics::{ContactDeclaration, ContactState, Name, Nanos};
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 /// `proprio simulate`.
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct SimulateArgs {
     /// The robot: a folder in config/, or a path
     #[arg(long, value_name = "NAME", default_value = "icub_left_arm")]
     robot: String,
@@ -57,14 +55,14 @@ fn still(text: &str) -> Result<f64, String> {
 }
 
 /// Runs the simulated robot.
-pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
-    let robot = Robot::open(&args.robot)?;
+pub(crate) fn run(args: &SimulateArgs, domain: &DomainConfig) -> anyhow::Result<()> {
+    let robot = SimulatedRobot::open(&args.robot)?;
     let faults = args
         .fault
         .iter()
-        .map(|f| f.parse::<Fault>())
+        .map(|f| f.parse::<InjectedFault>())
         .collect::<Result<Vec<_>, _>>()?;
-    let options = Options {
+    let options = RunOptions {
         buses: args
             .bus
             .iter()
@@ -72,22 +70,19 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
             .collect::<Result<_, _>>()?,
         domain: domain.name.clone(),
         seconds: args.seconds,
-        settings: Settings {
+        settings: SimulationSettings {
             seed: args.seed,
             still: args.still,
             push: !args.no_push,
             faults,
-            ..Settings::default()
+            ..SimulationSettings::default()
         },
         truth: args.truth.clone(),
     };
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot catch signals")?;
-    }
+    let stop = interrupted()?;
     let mut skin = args
         .skin
-        .then(|| Skin::open(domain, &robot.config.robot))
+        .then(|| TouchPublisher::open(domain, &robot.config.robot))
         .transpose()?;
     let mut declare = |contact: &str, at, active| {
         if let Some(skin) = &mut skin {
@@ -109,9 +104,9 @@ pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
 }
 
 /// Publishes the touches of the robot as contact declarations.
-struct Skin(Writer<ContactDeclaration>);
+struct TouchPublisher(Writer<ContactDeclaration>);
 
-impl Skin {
+impl TouchPublisher {
     fn open(domain: &DomainConfig, robot: &str) -> anyhow::Result<Self> {
         let domain = Domain::open(domain)?;
         Ok(Self(Writer::create(&domain, robot, domain.epoch())?))

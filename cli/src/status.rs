@@ -7,17 +7,18 @@ use proprio_topics::ipc::{
     Domain, DomainConfig, PortError, Reader, RobotPresence, Topic, Unavailable, monotonic,
 };
 use proprio_topics::{
-    Controller, Counter, Description, DeviceHealth, DeviceState, EstimatorHealth, GatewayHealth,
-    Kind, LinkState, MAX_CHANNELS, Nanos, Publisher, Quality, Role, Sample, TorqueEstimate, axes,
+    BusHealth, Controller, Counter, Description, DeviceHealth, DeviceState, EstimatorHealth,
+    GatewayHealth, Kind, LinkState, MAX_CHANNELS, Nanos, Publisher, Quality, Refusal, Role, Sample,
+    TorqueEstimate, axes,
 };
-use serde_json::{Value as Json, json};
+use serde_json::{Map, Value as Json, json};
 use std::collections::BTreeMap;
 
 /// How long `status` counts samples and estimates.
 const WINDOW: Nanos = Nanos::from_millis(1000);
 /// `proprio status`.
 #[derive(clap::Args)]
-pub(crate) struct Status {
+pub(crate) struct StatusArgs {
     /// Show only this robot
     #[arg(long, value_name = "NAME")]
     robot: Option<String>,
@@ -50,7 +51,7 @@ pub(crate) fn newest<T: Topic>(domain: &Domain, robot: &str) -> Result<Option<T>
 
 /// What a channel sent during the window.
 #[derive(Debug, Clone, Copy, Default)]
-struct Seen {
+struct ChannelActivity {
     count: u64,
     last: Option<Nanos>,
     quality: Quality,
@@ -64,7 +65,7 @@ struct Glance {
     /// Estimates per second.
     estimates: f64,
     description: Option<Description>,
-    channels: Vec<Seen>,
+    channels: Vec<ChannelActivity>,
     /// The newest torques of the window, and the estimator's names.
     torques: Option<(TorqueEstimate, Description)>,
     /// The end of the window in which they were counted, and its duration.
@@ -79,7 +80,7 @@ impl Glance {
         let description = description.map(|described| *described.newest());
         let names = DescriptionReader::by(domain, &robot, Publisher::Estimator)?;
         let mut estimates = Reader::<TorqueEstimate>::open(domain, &robot).ok();
-        let mut channels = vec![Seen::default(); MAX_CHANNELS];
+        let mut channels = vec![ChannelActivity::default(); MAX_CHANNELS];
         // Who publishes no description has no health either; each look for it takes half a second.
         let is_described = names.is_some();
         let health = || match is_described {
@@ -172,84 +173,6 @@ impl Glance {
     }
 
     fn json(&self) -> Json {
-        let gateway = self.gateway.as_ref().map(|health| {
-            let buses: Vec<_> = health
-                .buses()
-                .iter()
-                .map(|bus| {
-                    let interface = &bus.interface;
-                    json!({
-                        "name": bus.name.as_str(),
-                        "link": bus.link.get().map(LinkState::word),
-                        "frames": bus.frames, "unclaimed": bus.unclaimed, "dropped": bus.dropped,
-                        "error_frames": bus.error_frames, "sent": bus.sent,
-                        "send_failures": bus.send_failures, "queue_full": bus.queue_full,
-                        "link_losses": bus.link_losses, "published": bus.published,
-                        "publish_failures": bus.publish_failures,
-                        "load": bus.load, "frame_rate_hz": bus.frame_rate,
-                        "controller": interface.controller.get().map(Controller::word),
-                        "tx_error_counter": interface.tx_error_counter,
-                        "rx_error_counter": interface.rx_error_counter,
-                        "bit_rate": interface.bit_rate, "data_bit_rate": interface.data_bit_rate,
-                        "restart_ms": interface.restart_ms,
-                    })
-                })
-                .collect();
-            let devices: Vec<_> = health
-                .devices()
-                .iter()
-                .map(|device| {
-                    let counters: serde_json::Map<_, _> = Counter::ALL
-                        .into_iter()
-                        .zip(device.counters)
-                        .map(|(counter, count)| (counter.word().to_owned(), json!(count)))
-                        .collect();
-                    json!({
-                        "name": device.name.as_str(),
-                        "bus": device.bus,
-                        "state": device.state.get().map(DeviceState::word),
-                        "refusal": proprio_topics::Refusal::from_code(device.refusal)
-                            .map(|refusal| refusal.to_string()),
-                        "frozen": axes(device.frozen_axes).to_string(),
-                        "out_of_range": axes(device.beyond_axes).to_string(),
-                        "counters": counters,
-                    })
-                })
-                .collect();
-            json!({
-                "up_s": (self.now - health.started).seconds(),
-                "buses": buses,
-                "devices": devices,
-            })
-        });
-        let torques: serde_json::Map<_, _> = self
-            .torques()
-            .map(|(name, torque, deviation, withheld)| {
-                let value = torque_json(torque, deviation, withheld.as_ref());
-                (name.to_owned(), value)
-            })
-            .collect();
-        let estimator = self.estimator.as_ref().map(|health| {
-            let identification: serde_json::Map<_, _> = health
-                .identification
-                .counts()
-                .into_iter()
-                .map(|(word, count)| (word.to_owned(), json!(count)))
-                .collect();
-            json!({
-                "up_s": (self.now - health.started).seconds(),
-                "estimates_hz": self.estimates,
-                "estimates": health.estimates, "withheld": health.withheld,
-                "samples": health.samples, "lost": health.lost, "late": health.late,
-                "last_estimate_s": self.since_last_estimate(),
-                "torques": torques,
-                "identification": {
-                    "groups": health.identification.groups,
-                    "paused": health.identification.paused,
-                    "counts": identification,
-                },
-            })
-        });
         let channels: Vec<_> = self
             .channels()
             .map(|(name, kind, rate, age, quality)| {
@@ -259,11 +182,49 @@ impl Glance {
                 })
             })
             .collect();
+        let gateway = self.gateway.as_ref().map(|health| {
+            json!({
+                "up_s": (self.now - health.started).seconds(),
+                "buses": health.buses().iter().map(bus_json).collect::<Vec<_>>(),
+                "devices": health.devices().iter().map(device_json).collect::<Vec<_>>(),
+            })
+        });
+        let estimator = self
+            .estimator
+            .as_ref()
+            .map(|health| self.estimator_json(health));
         json!({
             "robot": self.presence.name,
             "gateway": { "is": self.presence.gateway.to_string(), "health": gateway },
             "estimator": { "is": self.presence.estimator.to_string(), "health": estimator },
             "channels": channels,
+        })
+    }
+
+    fn estimator_json(&self, health: &EstimatorHealth) -> Json {
+        let torques: Map<_, _> = self
+            .torques()
+            .map(|(name, torque, deviation, withheld)| {
+                let value = torque_json(torque, deviation, withheld.as_ref());
+                (name.to_owned(), value)
+            })
+            .collect();
+        let counts = health.identification.counts().into_iter();
+        let counts: Map<_, _> = counts
+            .map(|(word, count)| (word.to_owned(), json!(count)))
+            .collect();
+        json!({
+            "up_s": (self.now - health.started).seconds(),
+            "estimates_hz": self.estimates,
+            "estimates": health.estimates, "withheld": health.withheld,
+            "samples": health.samples, "lost": health.lost, "late": health.late,
+            "last_estimate_s": self.since_last_estimate(),
+            "torques": torques,
+            "identification": {
+                "groups": health.identification.groups,
+                "paused": health.identification.paused,
+                "counts": counts,
+            },
         })
     }
 
@@ -338,6 +299,41 @@ impl Glance {
     }
 }
 
+fn bus_json(bus: &BusHealth) -> Json {
+    let interface = &bus.interface;
+    json!({
+        "name": bus.name.as_str(),
+        "link": bus.link.get().map(LinkState::word),
+        "frames": bus.frames, "unclaimed": bus.unclaimed, "dropped": bus.dropped,
+        "error_frames": bus.error_frames, "sent": bus.sent,
+        "send_failures": bus.send_failures, "queue_full": bus.queue_full,
+        "link_losses": bus.link_losses, "published": bus.published,
+        "publish_failures": bus.publish_failures,
+        "load": bus.load, "frame_rate_hz": bus.frame_rate,
+        "controller": interface.controller.get().map(Controller::word),
+        "tx_error_counter": interface.tx_error_counter,
+        "rx_error_counter": interface.rx_error_counter,
+        "bit_rate": interface.bit_rate, "data_bit_rate": interface.data_bit_rate,
+        "restart_ms": interface.restart_ms,
+    })
+}
+
+fn device_json(device: &DeviceHealth) -> Json {
+    let counters = Counter::ALL.into_iter().zip(device.counters);
+    let counters: Map<_, _> = counters
+        .map(|(counter, count)| (counter.word().to_owned(), json!(count)))
+        .collect();
+    json!({
+        "name": device.name.as_str(),
+        "bus": device.bus,
+        "state": device.state.get().map(DeviceState::word),
+        "refusal": Refusal::from_code(device.refusal).map(|refusal| refusal.to_string()),
+        "frozen": axes(device.frozen_axes).to_string(),
+        "out_of_range": axes(device.beyond_axes).to_string(),
+        "counters": counters,
+    })
+}
+
 /// The load of a bus: its share, if the bit rate is known, and its frames per second.
 pub(crate) fn load(share: f64, frame_rate: f64) -> String {
     let share = match share.is_nan() {
@@ -356,7 +352,7 @@ pub(crate) fn counts(device: &DeviceHealth, except: &[Counter]) -> String {
 }
 
 /// Shows the robots of the domain.
-pub(crate) fn run(args: &Status, config: &DomainConfig) -> anyhow::Result<()> {
+pub(crate) fn run(args: &StatusArgs, config: &DomainConfig) -> anyhow::Result<()> {
     let domain = open(config)?;
     let glances = robots(&domain, args.robot.as_deref())?
         .into_iter()

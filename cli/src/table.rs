@@ -1,6 +1,6 @@
 //! `proprio table`: makes a table of a recording (MCAP).
 
-use crate::convert::{Output, input};
+use crate::convert::{OutputFile, input};
 use crate::samples::of_recording;
 use anyhow::Context;
 use std::io;
@@ -8,7 +8,7 @@ use std::path::PathBuf;
 
 /// `proprio table`.
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct TableArgs {
     /// The recording (MCAP)
     #[arg(long, value_name = "FILE")]
     recording: PathBuf,
@@ -21,10 +21,10 @@ pub(crate) struct Args {
 }
 
 /// Makes a table of a recording.
-pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+pub(crate) fn run(args: &TableArgs) -> anyhow::Result<()> {
     let path = &args.recording;
     let mut table = of_recording(input(path)?, path, args.estimates)?;
-    let mut out = Output::new(&args.out)?;
+    let mut out = OutputFile::new(&args.out)?;
     io::copy(&mut table, &mut out.writer()).with_context(|| path.display().to_string())?;
     out.finish().with_context(|| args.out.display().to_string())
 }

@@ -1,8 +1,8 @@
 //! `proprio top`: a running robot on the screen of a terminal.
 //!
 //! ```text
-//! shared memory -> follow: a thread -> Snapshot -> View -> the terminal
-//!                  (ports)             (pure)      (pure: keys, drawing)
+//! shared memory -> follow: a thread -> RobotState -> Screen -> the terminal
+//!                  (ports)             (pure)        (pure: keys, drawing)
 //! ```
 
 mod follow;
@@ -18,12 +18,12 @@ use follow::follow;
 use proprio_topics::ipc::{DomainConfig, monotonic};
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event};
-use snapshot::Snapshot;
+use snapshot::RobotState;
 use std::io::{IsTerminal as _, stdout};
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::mpsc::{Receiver, Sender, TryRecvError, channel, sync_channel};
 use std::time::Duration;
-use view::{View, Wish};
+use view::{Screen, Wish};
 
 /// How often the screen is drawn, without a key.
 const DRAW: Duration = Duration::from_millis(100);
@@ -32,21 +32,21 @@ const FAREWELL: Duration = Duration::from_millis(1000);
 
 /// `proprio top`.
 #[derive(clap::Args)]
-pub(crate) struct Top {
+pub(crate) struct TopArgs {
     /// The robot that is shown first; default: the first one (key r: the next)
     #[arg(long, value_name = "NAME")]
     robot: Option<String>,
 }
 
 /// Shows a robot until a key or a signal ends it.
-pub(crate) fn run(args: &Top, config: &DomainConfig) -> anyhow::Result<()> {
+pub(crate) fn run(args: &TopArgs, config: &DomainConfig) -> anyhow::Result<()> {
     if !stdout().is_terminal() {
         bail!("standard output is no terminal: `proprio status` prints the same once");
     }
     let (ask, wanted) = channel();
     let (out, snapshots) = sync_channel(1);
     let (config, robot) = (config.clone(), args.robot.clone());
-    let view = View::new(&config.name, monotonic());
+    let view = Screen::new(&config.name, monotonic());
     // First, so that the domain keeps the panics that it catches from the terminal's hook.
     let terminal = ratatui::try_init().context("the terminal cannot be used");
     let shown = terminal.and_then(|terminal| {
@@ -64,8 +64,8 @@ pub(crate) fn run(args: &Top, config: &DomainConfig) -> anyhow::Result<()> {
 
 fn show(
     mut terminal: DefaultTerminal,
-    mut view: View,
-    snapshots: &Receiver<Snapshot>,
+    mut view: Screen,
+    snapshots: &Receiver<RobotState>,
     ask: &Sender<String>,
 ) -> anyhow::Result<()> {
     let stop = interrupted()?;

@@ -16,11 +16,11 @@ use proprio_topics::ipc::DomainConfig;
 use proprio_topics::{Nanos, Reason, Source, TorqueBudget};
 use serde_json::json;
 use std::path::PathBuf;
-use story::{Known, Story, digits, names, percent, shares};
+use story::{Story, TorqueCase, digits, names, percent, shares};
 
 /// `proprio why`.
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct WhyArgs {
     /// The joint
     joint: String,
     /// The robot; default: the only one in the domain
@@ -63,7 +63,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 }
 
 /// Says why.
-pub(crate) fn run(args: &Args, domain: &DomainConfig) -> anyhow::Result<()> {
+pub(crate) fn run(args: &WhyArgs, domain: &DomainConfig) -> anyhow::Result<()> {
     let (known, at, spells) = match &args.samples {
         None => (
             live::know(domain, args.robot.as_deref(), &args.joint)?,
@@ -131,7 +131,7 @@ fn print_budget(budget: &TorqueBudget) {
         ),
     }
     let shares = shares(budget);
-    let matters = |share: &&story::Share| percent(share, budget) >= LEAST;
+    let matters = |share: &&story::VarianceShare| percent(share, budget) >= LEAST;
     let count = shares.iter().take(MOST).take_while(matters).count();
     let (shown, rest) = shares.split_at(count.max(1).min(shares.len()));
     for share in shown {
@@ -199,7 +199,12 @@ fn print_spells(spells: &[Spell]) {
     }
 }
 
-fn in_json(known: &Known, story: &Story, at: Option<Nanos>, spells: &[Spell]) -> serde_json::Value {
+fn in_json(
+    known: &TorqueCase,
+    story: &Story,
+    at: Option<Nanos>,
+    spells: &[Spell],
+) -> serde_json::Value {
     let times = spells.iter().map(|spell| {
         json!({
             "from": spell.begin.seconds(), "to": spell.end.seconds(),

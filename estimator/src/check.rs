@@ -14,7 +14,7 @@
 mod withheld;
 
 use withheld::Still;
-pub use withheld::Withheld;
+pub use withheld::{Withheld, significant};
 
 use crate::config::STANDARD_GRAVITY;
 use crate::pipeline::Pipeline;

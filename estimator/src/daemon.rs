@@ -18,8 +18,8 @@ use crate::setup::Setup;
 use anyhow::{Context, anyhow};
 use proprio_identification::online::{Hypothesis, Paused};
 use proprio_topics::ipc::{
-    Domain, DomainConfig, DomainError, PortError, Reader, Renewal, Renewing, Topic, Watch, Writer,
-    monotonic, open_files_remedy,
+    Domain, DomainConfig, PortError, Reader, Renewal, Renewing, Topic, Watch, Writer, monotonic,
+    open_files_remedy,
 };
 use proprio_topics::{
     ContactDeclaration, ContactEstimate, Description, DriveEstimate, EstimatorHealth,
@@ -109,16 +109,6 @@ pub fn load(file: &Path, adjust: impl FnOnce(&mut Config)) -> Result<(Config, Se
         tracing::warn!("{}: {warning}", file.display());
     }
     Ok((config, setup))
-}
-
-/// Whether an error of [`run`] is a wrong configuration: then the exit code is 2, else 1.
-pub fn is_configuration(error: &anyhow::Error) -> bool {
-    error.chain().any(|cause| {
-        cause.is::<ConfigError>()
-            || cause
-                .downcast_ref()
-                .is_some_and(DomainError::is_configuration)
-    })
 }
 
 async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::Result<()> {

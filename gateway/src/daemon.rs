@@ -16,11 +16,11 @@ use crate::journal::Journal;
 use crate::link::adapter::{self, Adapter};
 use crate::link::interface::{Netlink, Observer};
 use crate::operator::Operator;
-use crate::plan::{Plan, PlanError};
+use crate::plan::Plan;
 use crate::thread::{BusThread, join, statuses};
 use crate::watch;
 use anyhow::{Context, anyhow, bail};
-use proprio_topics::ipc::{Domain, DomainConfig, DomainError, Writer, open_files_remedy};
+use proprio_topics::ipc::{Domain, DomainConfig, Writer, open_files_remedy};
 use proprio_topics::{Description, GatewayHealth, Nanos};
 use sd_notify::NotifyState;
 use std::io::Write as _;
@@ -40,8 +40,8 @@ const LOOK: Duration = Duration::from_millis(5);
 /// Runs the gateway until SIGTERM, SIGINT, or the end of its logs.
 ///
 /// # Errors
-/// An error chain with cause, place and remedy; its root is a [`PlanError`] if the configuration
-/// is wrong.
+/// An error chain with cause, place and remedy; its root is a [`crate::plan::PlanError`] if the
+/// configuration is wrong.
 pub fn run(config: &Path, domain: &DomainConfig, check: bool) -> anyhow::Result<()> {
     let plan = Plan::load_live(config)?;
     if check {
@@ -77,16 +77,6 @@ fn adapters(plan: &Plan, sys: &Path) -> String {
         _ => None,
     });
     lines.collect()
-}
-
-/// Whether an error of [`run`] is a wrong configuration (exit code 2, otherwise 1).
-pub fn is_configuration(error: &anyhow::Error) -> bool {
-    error.chain().any(|cause| {
-        cause.is::<PlanError>()
-            || cause
-                .downcast_ref()
-                .is_some_and(DomainError::is_configuration)
-    })
 }
 
 async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyhow::Result<()> {

@@ -3,8 +3,8 @@
 //! inertias, and the estimator gets these.
 
 use crate::noise::Random;
-use crate::robot::{Robot, RobotError};
-use crate::settings::Settings;
+use crate::robot::{SimulatedRobot, SimulatedRobotError};
+use crate::settings::SimulationSettings;
 use crate::truth::Simulation;
 use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::{Mat3, Pose, RigidInertia, Vec3};
@@ -26,10 +26,14 @@ const INSTANTS: (u32, f64) = (25, 0.9);
 /// tenth of their RMS (by `relative / 2` if that is less).
 ///
 /// # Errors
-/// [`RobotError`]: the robot cannot be simulated, or its URDF cannot be read.
-pub fn wrong_urdf(robot: &Robot, settings: &Settings, relative: f64) -> Result<String, RobotError> {
+/// [`SimulatedRobotError`]: the robot cannot be simulated, or its URDF cannot be read.
+pub fn wrong_urdf(
+    robot: &SimulatedRobot,
+    settings: &SimulationSettings,
+    relative: f64,
+) -> Result<String, SimulatedRobotError> {
     let file = &robot.config.model;
-    let wrong = |cause| RobotError::Model {
+    let wrong = |cause| SimulatedRobotError::Model {
         file: file.clone(),
         cause: Box::new(cause),
     };
@@ -72,8 +76,11 @@ pub fn wrong_urdf(robot: &Robot, settings: &Settings, relative: f64) -> Result<S
 }
 
 /// Per joint, its torque at the instants compared, without pushes.
-fn torques(robot: &Robot, settings: &Settings) -> Result<Vec<Vec<f64>>, RobotError> {
-    let settings = Settings {
+fn torques(
+    robot: &SimulatedRobot,
+    settings: &SimulationSettings,
+) -> Result<Vec<Vec<f64>>, SimulatedRobotError> {
+    let settings = SimulationSettings {
         push: false,
         faults: Vec::new(),
         ..settings.clone()
@@ -125,7 +132,7 @@ fn another_body(body: &RigidInertia, relative: f64, random: &mut Random) -> Rigi
 mod tests {
     use super::*;
 
-    fn model(robot: &Robot, text: &str) -> Model {
+    fn model(robot: &SimulatedRobot, text: &str) -> Model {
         let keep: Vec<&str> = robot
             .config
             .force_torque
@@ -137,8 +144,8 @@ mod tests {
 
     #[test]
     fn the_wrong_urdf_is_of_bodies_that_exist_and_is_as_wrong_as_asked() {
-        let robot = Robot::open("icub_left_arm").unwrap();
-        let text = wrong_urdf(&robot, &Settings::default(), 0.2).unwrap();
+        let robot = SimulatedRobot::open("icub_left_arm").unwrap();
+        let text = wrong_urdf(&robot, &SimulationSettings::default(), 0.2).unwrap();
         let wrong = model(&robot, &text);
         assert_eq!(wrong.link_count(), robot.model.link_count());
         for (link, (body, truth)) in wrong
@@ -175,11 +182,11 @@ mod tests {
 
     #[test]
     fn every_torque_is_off_and_the_seed_counts() {
-        let robot = Robot::open("icub_left_arm").unwrap();
+        let robot = SimulatedRobot::open("icub_left_arm").unwrap();
         for seed in [1, 2, 3] {
-            let settings = Settings {
+            let settings = SimulationSettings {
                 seed,
-                ..Settings::default()
+                ..SimulationSettings::default()
             };
             let text = wrong_urdf(&robot, &settings, 0.2).unwrap();
             assert_eq!(
@@ -203,9 +210,9 @@ mod tests {
             }
         }
         let [one, two] = [1, 2].map(|seed| {
-            let settings = Settings {
+            let settings = SimulationSettings {
                 seed,
-                ..Settings::default()
+                ..SimulationSettings::default()
             };
             wrong_urdf(&robot, &settings, 0.2).unwrap()
         });

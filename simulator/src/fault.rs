@@ -27,20 +27,20 @@ use std::str::FromStr;
 
 /// One fault.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Fault {
+pub enum InjectedFault {
     /// Frames are lost on all buses.
     Lost {
         /// Probability for each frame, 0 to 1.
         probability: f64,
         /// When.
-        window: Window,
+        window: TimeWindow,
     },
     /// A board neither sends nor listens.
     Silent {
         /// Which.
         device: String,
         /// When.
-        window: Window,
+        window: TimeWindow,
     },
     /// A board loses its state and starts again.
     Reboot {
@@ -54,14 +54,14 @@ pub enum Fault {
         /// Which.
         device: String,
         /// When.
-        window: Window,
+        window: TimeWindow,
     },
     /// A board repeats its last reading.
     Freeze {
         /// Which.
         device: String,
         /// When.
-        window: Window,
+        window: TimeWindow,
     },
     /// One F/T reading is far from the truth.
     Spike {
@@ -77,14 +77,14 @@ pub enum Fault {
         /// How old they are \[s\].
         age: f64,
         /// When.
-        window: Window,
+        window: TimeWindow,
     },
     /// Second halves of readings are late.
     LateHalf {
         /// Whose.
         device: String,
         /// When.
-        window: Window,
+        window: TimeWindow,
         /// Only the first reading in the window.
         once: bool,
     },
@@ -99,7 +99,7 @@ pub enum Fault {
         /// Its direction in the link's frame, of any length; default: along the x axis.
         along: Option<[f64; 3]>,
         /// When.
-        window: Window,
+        window: TimeWindow,
     },
     /// A joint does not move.
     Still {
@@ -112,14 +112,14 @@ pub enum Fault {
 
 /// A time window in seconds since the start of the simulation, excluding its end.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Window {
+pub struct TimeWindow {
     /// Start \[s\].
     pub from: f64,
     /// End \[s\], excluded; infinite if the window never ends.
     pub until: f64,
 }
 
-impl Window {
+impl TimeWindow {
     /// The whole simulation.
     pub const ALWAYS: Self = Self {
         from: 0.0,
@@ -194,7 +194,7 @@ pub enum FaultError {
 const EXAMPLES: &str =
     "\"lost:0.01\", \"silent:l_arm_ft_sensor@3..4\", \"spike:l_arm_ft_sensor@6\"";
 
-impl Fault {
+impl InjectedFault {
     /// When it begins \[s\].
     #[must_use]
     pub fn begin(&self) -> f64 {
@@ -229,14 +229,11 @@ impl Fault {
 
 /// `5`, as seconds.
 fn instant(text: &str) -> Option<f64> {
-    text.trim()
-        .parse()
-        .ok()
-        .filter(|t: &f64| t.is_finite() && *t >= 0.0)
+    number(text.trim()).filter(|t| *t >= 0.0)
 }
 
 /// `3..4` or `3..`.
-fn window(text: &str) -> Option<Window> {
+fn window(text: &str) -> Option<TimeWindow> {
     let (from, until) = text.split_once("..")?;
     let from = instant(from)?;
     let until = if until.trim().is_empty() {
@@ -244,161 +241,175 @@ fn window(text: &str) -> Option<Window> {
     } else {
         instant(until)?
     };
-    (from < until).then_some(Window { from, until })
+    (from < until).then_some(TimeWindow { from, until })
+}
+
+/// A finite number.
+fn number(text: &str) -> Option<f64> {
+    text.parse().ok().filter(|x: &f64| x.is_finite())
+}
+
+/// `NAME=REST` with a name.
+fn named(text: &str) -> Option<(String, &str)> {
+    let (name, rest) = text.split_once('=')?;
+    (!name.is_empty()).then(|| (name.to_owned(), rest))
 }
 
 /// `0.03,-0.07,0`.
 fn vector(text: &str) -> Option<[f64; 3]> {
-    let numbers: Option<Vec<f64>> = text.split(',').map(|x| x.trim().parse().ok()).collect();
-    let vector: [f64; 3] = numbers?.try_into().ok()?;
-    vector.iter().all(|x| x.is_finite()).then_some(vector)
+    let numbers: Option<Vec<f64>> = text.split(',').map(|x| number(x.trim())).collect();
+    numbers?.try_into().ok()
 }
 
-impl FromStr for Fault {
+/// The kinds of faults, their forms, and an example of each.
+const FORMS: [(&str, &str, &str); 10] = [
+    (
+        "lost",
+        "lost:PROBABILITY[@FROM..UNTIL] with a probability from 0 to 1",
+        "\"lost:0.01\"",
+    ),
+    (
+        "silent",
+        "silent:BOARD@FROM..UNTIL",
+        "\"silent:l_arm_ft_sensor@3..4\"",
+    ),
+    (
+        "reboot",
+        "reboot:BOARD@TIME",
+        "\"reboot:l_arm_ft_sensor@5\"",
+    ),
+    (
+        "saturate",
+        "saturate:BOARD@FROM..UNTIL",
+        "\"saturate:l_arm_ft_sensor@5..5.5\"",
+    ),
+    (
+        "freeze",
+        "freeze:BOARD@FROM..UNTIL",
+        "\"freeze:l_arm_ft_sensor@5..6\"",
+    ),
+    ("spike", "spike:BOARD@TIME", "\"spike:l_arm_ft_sensor@6\""),
+    (
+        "late",
+        "late:BOARD=SECONDS@FROM..UNTIL",
+        "\"late:l_arm_ft_sensor=0.02@5..8\"",
+    ),
+    (
+        "late_half",
+        "late_half:BOARD@FROM..UNTIL or late_half:BOARD@TIME",
+        "\"late_half:l_arm_ft_sensor@2..8\"",
+    ),
+    (
+        "push",
+        "push:LINK=NEWTONS[:X,Y,Z[:DX,DY,DZ]]@FROM..UNTIL",
+        "\"push:l_forearm=20@8..9\"",
+    ),
+    ("still", "still:JOINT[=RAD]", "\"still:l_elbow=0.8\""),
+];
+
+impl FromStr for InjectedFault {
     type Err = FaultError;
 
     fn from_str(text: &str) -> Result<Self, FaultError> {
         let (kind, rest) = text.split_once(':').unwrap_or((text, ""));
-        let form = |form, example| FaultError::Form {
-            text: text.to_owned(),
-            form,
-            example,
-        };
         let (what, when) = match rest.rsplit_once('@') {
             Some((what, when)) => (what, Some(when)),
             None => (rest, None),
         };
+        let known = FORMS.into_iter().find(|(own, ..)| *own == kind);
+        let (_, form, example) = known.ok_or_else(|| FaultError::Kind {
+            text: text.to_owned(),
+            kind: kind.to_owned(),
+        })?;
+        Self::parse(kind, what, when).ok_or_else(|| FaultError::Form {
+            text: text.to_owned(),
+            form,
+            example,
+        })
+    }
+}
+
+impl InjectedFault {
+    /// The fault `kind:what@when`; `None` if it has not the form of its kind.
+    fn parse(kind: &str, what: &str, when: Option<&str>) -> Option<Self> {
         let device = what.to_owned();
-        let named = !what.is_empty();
-        let span = when.and_then(window).filter(|_| named);
-        let moment = when.and_then(instant).filter(|_| named);
-        match kind {
-            "lost" => {
-                let probability = what.parse().ok().filter(|p: &f64| (0.0..=1.0).contains(p));
-                let window = when.map_or(Some(Window::ALWAYS), window);
-                match (probability, window) {
-                    (Some(probability), Some(window)) => Ok(Self::Lost {
-                        probability,
-                        window,
-                    }),
-                    _ => Err(form(
-                        "lost:PROBABILITY[@FROM..UNTIL] with a probability from 0 to 1",
-                        "\"lost:0.01\"",
-                    )),
+        let is_named = !what.is_empty();
+        let span = when.and_then(window).filter(|_| is_named);
+        let moment = when.and_then(instant).filter(|_| is_named);
+        Some(match kind {
+            "lost" => Self::Lost {
+                probability: number(what).filter(|p| (0.0..=1.0).contains(p))?,
+                window: when.map_or(Some(TimeWindow::ALWAYS), window)?,
+            },
+            "silent" => Self::Silent {
+                device,
+                window: span?,
+            },
+            "saturate" => Self::Saturate {
+                device,
+                window: span?,
+            },
+            "freeze" => Self::Freeze {
+                device,
+                window: span?,
+            },
+            "reboot" => Self::Reboot {
+                device,
+                at: moment?,
+            },
+            "spike" => Self::Spike {
+                device,
+                at: moment?,
+            },
+            "late" => {
+                let (device, age) = named(what)?;
+                Self::Late {
+                    device,
+                    age: number(age.trim()).filter(|age| *age > 0.0)?,
+                    window: span?,
                 }
             }
-            "silent" => span
-                .map(|window| Self::Silent { device, window })
-                .ok_or_else(|| {
-                    form(
-                        "silent:BOARD@FROM..UNTIL",
-                        "\"silent:l_arm_ft_sensor@3..4\"",
-                    )
-                }),
-            "saturate" => span
-                .map(|window| Self::Saturate { device, window })
-                .ok_or_else(|| {
-                    form(
-                        "saturate:BOARD@FROM..UNTIL",
-                        "\"saturate:l_arm_ft_sensor@5..5.5\"",
-                    )
-                }),
-            "freeze" => span
-                .map(|window| Self::Freeze { device, window })
-                .ok_or_else(|| {
-                    form(
-                        "freeze:BOARD@FROM..UNTIL",
-                        "\"freeze:l_arm_ft_sensor@5..6\"",
-                    )
-                }),
-            "reboot" => moment
-                .map(|at| Self::Reboot { device, at })
-                .ok_or_else(|| form("reboot:BOARD@TIME", "\"reboot:l_arm_ft_sensor@5\"")),
-            "spike" => moment
-                .map(|at| Self::Spike { device, at })
-                .ok_or_else(|| form("spike:BOARD@TIME", "\"spike:l_arm_ft_sensor@6\"")),
-            "late" => {
-                let (device, age) = what.split_once('=').unwrap_or_default();
-                let age = age.trim().parse().ok();
-                let age = age.filter(|age: &f64| age.is_finite() && *age > 0.0);
-                match (age, span) {
-                    (Some(age), Some(window)) if !device.is_empty() => Ok(Self::Late {
-                        device: device.to_owned(),
-                        age,
-                        window,
-                    }),
-                    _ => Err(form(
-                        "late:BOARD=SECONDS@FROM..UNTIL",
-                        "\"late:l_arm_ft_sensor=0.02@5..8\"",
-                    )),
+            "late_half" => Self::LateHalf {
+                device,
+                window: span.or(moment.map(|from| TimeWindow {
+                    from,
+                    until: f64::INFINITY,
+                }))?,
+                once: span.is_none(),
+            },
+            "push" => {
+                let (link, rest) = named(what)?;
+                let mut parts = rest.split(':');
+                let force = number(parts.next()?.trim())?;
+                let at = parts.next().map(vector);
+                let along = parts.next().map(vector);
+                if parts.next().is_some() || along == Some(Some([0.0; 3])) {
+                    return None;
+                }
+                // A vector that is given must be one.
+                let given = |vector: Option<Option<_>>| vector.map_or(Some(None), |v| v.map(Some));
+                Self::Push {
+                    link,
+                    force,
+                    at: given(at)?,
+                    along: given(along)?,
+                    window: span?,
                 }
             }
             "still" => {
                 let (joint, at) = match what.split_once('=') {
-                    Some((joint, at)) => (joint, at.trim().parse().ok().map(Some)),
-                    None => (what, Some(None)),
+                    Some((joint, at)) => (joint, Some(number(at.trim())?)),
+                    None => (what, None),
                 };
-                let at = at.filter(|at: &Option<f64>| at.is_none_or(f64::is_finite));
-                match at {
-                    Some(at) if !joint.is_empty() && when.is_none() => Ok(Self::Still {
-                        joint: joint.to_owned(),
-                        at,
-                    }),
-                    _ => Err(form("still:JOINT[=RAD]", "\"still:l_elbow=0.8\"")),
-                }
+                let joint = joint.to_owned();
+                (!joint.is_empty() && when.is_none()).then_some(Self::Still { joint, at })?
             }
-            "late_half" => match (span, moment) {
-                (Some(window), _) => Ok(Self::LateHalf {
-                    device,
-                    window,
-                    once: false,
-                }),
-                (None, Some(from)) => Ok(Self::LateHalf {
-                    device,
-                    window: Window {
-                        from,
-                        until: f64::INFINITY,
-                    },
-                    once: true,
-                }),
-                (None, None) => Err(form(
-                    "late_half:BOARD@FROM..UNTIL or late_half:BOARD@TIME",
-                    "\"late_half:l_arm_ft_sensor@2..8\"",
-                )),
-            },
-            "push" => {
-                let (link, rest) = what.split_once('=').unwrap_or_default();
-                let mut parts = rest.split(':');
-                let force = parts.next().and_then(|force| force.trim().parse().ok());
-                let force = force.filter(|force: &f64| force.is_finite());
-                let (at, along) = (parts.next().map(vector), parts.next().map(vector));
-                let is_good = !link.is_empty()
-                    && parts.next().is_none()
-                    && at != Some(None)
-                    && along.is_none_or(|along| along.is_some_and(|along| along != [0.0; 3]));
-                match (span, force) {
-                    (Some(window), Some(force)) if is_good => Ok(Self::Push {
-                        link: link.to_owned(),
-                        force,
-                        at: at.flatten(),
-                        along: along.flatten(),
-                        window,
-                    }),
-                    _ => Err(form(
-                        "push:LINK=NEWTONS[:X,Y,Z[:DX,DY,DZ]]@FROM..UNTIL",
-                        "\"push:l_forearm=20@8..9\"",
-                    )),
-                }
-            }
-            _ => Err(FaultError::Kind {
-                text: text.to_owned(),
-                kind: kind.to_owned(),
-            }),
-        }
+            _ => return None,
+        })
     }
 }
 
-impl fmt::Display for Window {
+impl fmt::Display for TimeWindow {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.until.is_finite() {
             write!(f, "{}..{}", self.from, self.until)
@@ -408,14 +419,14 @@ impl fmt::Display for Window {
     }
 }
 
-impl fmt::Display for Fault {
+impl fmt::Display for InjectedFault {
     /// The fault in its text form.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Lost {
                 probability,
                 window,
-            } if *window == Window::ALWAYS => write!(f, "lost:{probability}"),
+            } if *window == TimeWindow::ALWAYS => write!(f, "lost:{probability}"),
             Self::Lost {
                 probability,
                 window,
@@ -486,7 +497,7 @@ mod tests {
             "push:l_hand=20:0.01,-0.02,0@3..4",
             "push:l_hand=20:0.01,-0.02,0:0,-1,0.5@3..4",
         ] {
-            assert_eq!(text.parse::<Fault>().unwrap().to_string(), text);
+            assert_eq!(text.parse::<InjectedFault>().unwrap().to_string(), text);
         }
     }
 
@@ -542,7 +553,7 @@ mod tests {
                 "push:LINK=NEWTONS[:X,Y,Z[:DX,DY,DZ]]@FROM..UNTIL",
             ),
         ] {
-            let message = text.parse::<Fault>().unwrap_err().to_string();
+            let message = text.parse::<InjectedFault>().unwrap_err().to_string();
             assert!(message.contains(expected), "{text}: {message}");
         }
     }

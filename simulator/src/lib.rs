@@ -34,11 +34,11 @@ pub mod trajectory;
 pub mod truth;
 
 pub use cad::wrong_urdf;
-pub use fault::{Fault, FaultError};
-pub use robot::{Robot, RobotError};
+pub use fault::{FaultError, InjectedFault};
+pub use robot::{SimulatedRobot, SimulatedRobotError};
 pub use run::{
-    Options, OptionsError, Skin, Summary, is_configuration, parse_bus, run, run_with_skin,
+    RunOptions, RunOptionsError, RunSummary, TouchListener, parse_bus, run, run_with_skin,
 };
-pub use settings::Settings;
+pub use settings::SimulationSettings;
 pub use simulator::{Simulator, SimulatorError};
-pub use truth::{PlannedPush, Simulation, Touch, Truth};
+pub use truth::{PlannedPush, Simulation, TouchEvent, Truth};

@@ -1,9 +1,9 @@
 //! Records the simulated robot without any link: writes a whole session, including the host's
 //! commands, to a CAN log as fast as possible, and its truth as a table.
 
-use crate::robot::Robot;
-use crate::settings::Settings;
-use crate::simulator::{BusCounts, Simulator, SimulatorError};
+use crate::robot::SimulatedRobot;
+use crate::settings::SimulationSettings;
+use crate::simulator::{BusCounts, BusSimulator, Simulator, SimulatorError};
 use crate::truth::Simulation;
 use proprio_drivers::{Frame, State};
 use proprio_gateway::config::FrameSource;
@@ -62,8 +62,8 @@ pub struct Recorded {
 /// # Errors
 /// [`RecordError`].
 pub fn record(
-    robot: &Robot,
-    settings: &Settings,
+    robot: &SimulatedRobot,
+    settings: &SimulationSettings,
     seconds: f64,
     t0: Nanos,
     mut log: impl Write,
@@ -72,29 +72,9 @@ pub fn record(
     let end = t0 + Nanos::from_seconds(seconds);
     let mut hosts = Vec::new();
     for (plan, number) in robot.plan.buses.iter().zip(0..) {
-        let decoder = Decoder::new(number, plan, None, Arc::new(BusStatus::new(number, plan)))
-            .map_err(|cause| RecordError::Device {
-                bus: plan.name.clone(),
-                cause,
-            })?;
-        hosts.push(Host {
-            decoder,
-            interface: interface(plan),
-            free: Nanos::MIN,
-            sent: 0,
-            commands: 0,
-        });
+        hosts.push(Host::new(plan, number)?);
     }
-    // Sorted by stamp: a frame that waits for its bus may be later than the next one of another
-    // bus.
-    let mut waiting: VecDeque<(Nanos, usize, Frame)> = VecDeque::new();
-    let enqueue = |waiting: &mut VecDeque<(Nanos, usize, Frame)>, bus, frame: Frame| {
-        let at = waiting
-            .iter()
-            .rposition(|(t, ..)| *t <= frame.t)
-            .map_or(0, |i| i + 1);
-        waiting.insert(at, (frame.t, bus, frame));
-    };
+    let mut waiting = FrameQueue::default();
     let mut now = t0;
     while now < end {
         for (bus, host) in hosts.iter_mut().enumerate() {
@@ -106,7 +86,7 @@ pub fn record(
                 let command = host.transfer(command, now);
                 host.commands += 1;
                 simulator.on_frame(bus, &command, now);
-                enqueue(&mut waiting, bus, command);
+                waiting.push(bus, command);
             }
         }
         while let Some((bus, frame)) = simulator.poll(now) {
@@ -116,19 +96,9 @@ pub fn record(
             let frame = host.transfer(frame, now);
             host.sent += 1;
             host.decoder.on_frame(&frame, |_| {});
-            enqueue(&mut waiting, bus, frame);
+            waiting.push(bus, frame);
         }
-        while let Some((t, bus, frame)) = waiting.front()
-            && *t <= now
-        {
-            write_log_line(
-                &mut log,
-                *t,
-                hosts.get(*bus).map_or("can0", |h| h.interface),
-                frame,
-            )?;
-            waiting.pop_front();
-        }
+        waiting.write_until(now, &hosts, &mut log)?;
         let wakes = hosts
             .iter()
             .filter_map(|h| h.decoder.next_wake())
@@ -137,19 +107,9 @@ pub fn record(
         // enough.
         now = wakes.min().unwrap_or(end).max(now + Nanos(1));
     }
-    for (t, bus, frame) in waiting {
-        write_log_line(
-            &mut log,
-            t,
-            hosts.get(bus).map_or("can0", |h| h.interface),
-            &frame,
-        )?;
-    }
+    waiting.write_until(Nanos::MAX, &hosts, &mut log)?;
     log.flush()?;
-    let counts = simulator
-        .buses()
-        .iter()
-        .map(crate::simulator::BusSimulator::counts);
+    let counts = simulator.buses().iter().map(BusSimulator::counts);
     Ok(hosts
         .iter()
         .zip(counts)
@@ -162,6 +122,36 @@ pub fn record(
         .collect())
 }
 
+/// Frames with the numbers of their buses, sorted by stamp: a frame that waits for its bus may be
+/// later than the next one of another bus.
+#[derive(Default)]
+struct FrameQueue(VecDeque<(usize, Frame)>);
+
+impl FrameQueue {
+    fn push(&mut self, bus: usize, frame: Frame) {
+        let before = self.0.iter().rposition(|(_, other)| other.t <= frame.t);
+        self.0.insert(before.map_or(0, |i| i + 1), (bus, frame));
+    }
+
+    /// Writes the frames that are stamped until `now` to the log.
+    fn write_until(
+        &mut self,
+        now: Nanos,
+        hosts: &[Host<'_>],
+        log: &mut impl Write,
+    ) -> io::Result<()> {
+        while let Some((bus, frame)) = self.0.front()
+            && frame.t <= now
+        {
+            let interface = hosts.get(*bus).map_or("can0", |h| h.interface);
+            write_log_line(&mut *log, frame.t, interface, frame)?;
+            self.0.pop_front();
+        }
+        Ok(())
+    }
+}
+
+/// The gateway's side of a bus.
 struct Host<'a> {
     decoder: Decoder,
     interface: &'a str,
@@ -171,7 +161,22 @@ struct Host<'a> {
     commands: u64,
 }
 
-impl Host<'_> {
+impl<'a> Host<'a> {
+    fn new(plan: &'a BusPlan, number: u32) -> Result<Self, RecordError> {
+        let status = Arc::new(BusStatus::new(number, plan));
+        let decoder = Decoder::new(number, plan, None, status);
+        Ok(Self {
+            decoder: decoder.map_err(|cause| RecordError::Device {
+                bus: plan.name.clone(),
+                cause,
+            })?,
+            interface: interface(plan),
+            free: Nanos::MIN,
+            sent: 0,
+            commands: 0,
+        })
+    }
+
     /// The frame with its time of arrival, after the earlier frames.
     fn transfer(&mut self, frame: Frame, now: Nanos) -> Frame {
         // Whole microseconds, as candump writes them: some versions of canplayer read only these.

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 /// One robot: the configuration of simulator, gateway and estimator.
 #[derive(Debug, Clone)]
-pub struct Robot {
+pub struct SimulatedRobot {
     /// The folder that it was loaded from.
     pub folder: PathBuf,
     /// Its buses and boards: gateway.toml, checked.
@@ -22,7 +22,7 @@ pub struct Robot {
 /// Why a robot cannot be loaded: a wrong name or a wrong configuration.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum RobotError {
+pub enum SimulatedRobotError {
     /// There is no folder of that name.
     #[error(
         "there is no robot {name:?} (no gateway.toml in {}); give the name of a folder \
@@ -59,7 +59,7 @@ pub enum RobotError {
     },
 }
 
-impl Robot {
+impl SimulatedRobot {
     /// The folders to search for robot `name`, in order: `name` itself as a path; `config/NAME` in
     /// the working directory, in the executable's folder and its parents, and in the source tree of
     /// this build; `/usr/share/proprio/config/NAME`; `/etc/proprio/NAME`.
@@ -93,15 +93,15 @@ impl Robot {
     /// Finds the folder of a robot by its name or path.
     ///
     /// # Errors
-    /// [`RobotError::NotFound`], with all folders searched.
-    pub fn find(name: &str) -> Result<PathBuf, RobotError> {
+    /// [`SimulatedRobotError::NotFound`], with all folders searched.
+    pub fn find(name: &str) -> Result<PathBuf, SimulatedRobotError> {
         let tried = Self::candidates(name);
         match tried
             .iter()
             .find(|folder| folder.join("gateway.toml").is_file())
         {
             Some(folder) => Ok(folder.clone()),
-            None => Err(RobotError::NotFound {
+            None => Err(SimulatedRobotError::NotFound {
                 name: name.to_owned(),
                 tried,
             }),
@@ -111,16 +111,16 @@ impl Robot {
     /// Finds and loads a robot by name or path.
     ///
     /// # Errors
-    /// [`RobotError`].
-    pub fn open(name: &str) -> Result<Self, RobotError> {
+    /// [`SimulatedRobotError`].
+    pub fn open(name: &str) -> Result<Self, SimulatedRobotError> {
         Self::load(&Self::find(name)?)
     }
 
     /// Loads the robot in `folder`.
     ///
     /// # Errors
-    /// [`RobotError`]: an unusable file, or files that do not match each other.
-    pub fn load(folder: &Path) -> Result<Self, RobotError> {
+    /// [`SimulatedRobotError`]: an unusable file, or files that do not match each other.
+    pub fn load(folder: &Path) -> Result<Self, SimulatedRobotError> {
         let plan = Plan::load(&folder.join("gateway.toml"))?;
         let config = Config::load(&folder.join("estimator.toml"))?;
         let keep: Vec<&str> = config
@@ -129,7 +129,7 @@ impl Robot {
             .map(|ft| ft.joint.as_str())
             .collect();
         let mut model =
-            Model::from_file(&config.model, &keep).map_err(|cause| RobotError::Model {
+            Model::from_file(&config.model, &keep).map_err(|cause| SimulatedRobotError::Model {
                 file: config.model.clone(),
                 cause: Box::new(cause),
             })?;
@@ -140,7 +140,7 @@ impl Robot {
                  each other",
                 plan.robot, config.robot
             );
-            return Err(RobotError::Mismatch {
+            return Err(SimulatedRobotError::Mismatch {
                 folder: folder.to_owned(),
                 problem,
             });
@@ -154,8 +154,8 @@ impl Robot {
     }
 
     /// The error for a contradiction between the files of this robot.
-    pub(crate) fn mismatch(&self, problem: String) -> RobotError {
-        RobotError::Mismatch {
+    pub(crate) fn mismatch(&self, problem: String) -> SimulatedRobotError {
+        SimulatedRobotError::Mismatch {
             folder: self.folder.clone(),
             problem,
         }
@@ -168,20 +168,22 @@ mod tests {
 
     #[test]
     fn the_robot_of_the_source_tree_is_found_from_anywhere() {
-        let robot = Robot::open("icub_left_arm").unwrap();
+        let robot = SimulatedRobot::open("icub_left_arm").unwrap();
         assert_eq!(robot.plan.robot, "icub_left_arm");
         assert_eq!(robot.model.dof_count(), 7);
         assert!(
             robot.model.joint("l_arm_ft_sensor").is_some(),
             "the F/T joint is kept"
         );
-        let by_path = Robot::open(robot.folder.to_str().unwrap()).unwrap();
+        let by_path = SimulatedRobot::open(robot.folder.to_str().unwrap()).unwrap();
         assert_eq!(by_path.plan.channels, robot.plan.channels);
     }
 
     #[test]
     fn a_robot_that_is_not_there_is_told_with_all_that_was_tried() {
-        let message = Robot::open("no_such_robot").unwrap_err().to_string();
+        let message = SimulatedRobot::open("no_such_robot")
+            .unwrap_err()
+            .to_string();
         for place in [
             "\"no_such_robot\"",
             "./config/no_such_robot",
@@ -192,14 +194,14 @@ mod tests {
         }
         // A path is not searched for elsewhere.
         assert_eq!(
-            Robot::candidates("some/where"),
+            SimulatedRobot::candidates("some/where"),
             [PathBuf::from("some/where")]
         );
     }
 
     #[test]
     fn files_that_do_not_fit_each_other_are_refused() {
-        let source = Robot::find("icub_left_arm").unwrap();
+        let source = SimulatedRobot::find("icub_left_arm").unwrap();
         let folder = tempfile::tempdir().unwrap();
         for file in ["gateway.toml", "estimator.toml", "model.urdf"] {
             std::fs::copy(source.join(file), folder.path().join(file)).unwrap();
@@ -211,11 +213,11 @@ mod tests {
             text.replace("robot = \"icub_left_arm\"", "robot = \"other\""),
         )
         .unwrap();
-        let message = Robot::load(folder.path()).unwrap_err().to_string();
+        let message = SimulatedRobot::load(folder.path()).unwrap_err().to_string();
         assert!(message.contains("robot = \"other\""), "{message}");
         std::fs::write(folder.path().join("model.urdf"), "<robot").unwrap();
         std::fs::write(&file, text).unwrap();
-        let message = Robot::load(folder.path()).unwrap_err().to_string();
+        let message = SimulatedRobot::load(folder.path()).unwrap_err().to_string();
         assert!(message.contains("model.urdf"), "{message}");
     }
 }

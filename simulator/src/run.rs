@@ -2,10 +2,10 @@
 //! buses, one thread per bus.
 
 use crate::record::write_truth;
-use crate::robot::Robot;
-use crate::settings::Settings;
+use crate::robot::SimulatedRobot;
+use crate::settings::SimulationSettings;
 use crate::simulator::{BusCounts, BusSimulator, Simulator};
-use crate::truth::{PlannedPush, Simulation, Touch};
+use crate::truth::{PlannedPush, Simulation, TouchEvent};
 use anyhow::Context as _;
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::config::FrameSource;
@@ -38,7 +38,7 @@ const SEND_WITHIN: Nanos = Nanos::from_millis(20);
 
 /// The options of a run.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Options {
+pub struct RunOptions {
     /// The buses, in the order of gateway.toml: `can0` or `virtual:NAME` ([`parse_bus`]). Empty:
     /// the sources that gateway.toml gives.
     pub buses: Vec<FrameSource>,
@@ -48,7 +48,7 @@ pub struct Options {
     pub seconds: Option<f64>,
     /// The settings of the simulation. The hand is pushed once in `seconds` if given, else once in
     /// every `settings.cycle`.
-    pub settings: Settings,
+    pub settings: SimulationSettings,
     /// The file for the truth, written at the end.
     pub truth: Option<PathBuf>,
 }
@@ -56,7 +56,7 @@ pub struct Options {
 /// Invalid options: exit code 2.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
-pub enum OptionsError {
+pub enum RunOptionsError {
     /// A bus that is neither an interface nor a virtual bus.
     #[error(
         "bus {0:?}: it must be a CAN interface such as \"can0\", or a virtual bus such as \
@@ -88,8 +88,8 @@ pub enum OptionsError {
 /// Reads `can0` or `virtual:NAME`.
 ///
 /// # Errors
-/// [`OptionsError::Bus`].
-pub fn parse_bus(text: &str) -> Result<FrameSource, OptionsError> {
+/// [`RunOptionsError::Bus`].
+pub fn parse_bus(text: &str) -> Result<FrameSource, RunOptionsError> {
     match text.split_once(':') {
         Some(("virtual", name)) if !name.is_empty() => Ok(FrameSource::Virtual {
             name: name.to_owned(),
@@ -97,13 +97,13 @@ pub fn parse_bus(text: &str) -> Result<FrameSource, OptionsError> {
         None if !text.is_empty() && text.len() <= 15 && text != "virtual" => {
             Ok(FrameSource::SocketCan(Adapter::Interface(text.to_owned())))
         }
-        _ => Err(OptionsError::Bus(text.to_owned())),
+        _ => Err(RunOptionsError::Bus(text.to_owned())),
     }
 }
 
 /// The result of a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Summary {
+pub struct RunSummary {
     /// The robot's name.
     pub robot: String,
     /// The seed.
@@ -148,27 +148,31 @@ pub struct BusSummary {
 /// Runs `robot` for `options.seconds` or until `stop` is set.
 ///
 /// # Errors
-/// An error chain with cause, place and remedy. [`OptionsError`] and [`crate::SimulatorError`] at
-/// its root are wrong configurations ([`is_configuration`]); other causes are a bus that cannot be
+/// An error chain with cause, place and remedy. [`RunOptionsError`] and [`crate::SimulatorError`] at
+/// its root are wrong configurations; other causes are a bus that cannot be
 /// opened or a file that cannot be written.
-pub fn run(robot: &Robot, options: &Options, stop: &AtomicBool) -> anyhow::Result<Summary> {
+pub fn run(
+    robot: &SimulatedRobot,
+    options: &RunOptions,
+    stop: &AtomicBool,
+) -> anyhow::Result<RunSummary> {
     run_with_skin(robot, options, None, stop)
 }
 
 /// A receiver of touches, as from a skin: the contact's name, the instant of the change, and
 /// whether it is touched from then on.
-pub type Skin<'a> = &'a mut dyn FnMut(&str, Nanos, bool);
+pub type TouchListener<'a> = &'a mut dyn FnMut(&str, Nanos, bool);
 
 /// As [`run`]; also calls `skin` for every touch, in this thread, 0.1 s ahead.
 ///
 /// # Errors
 /// As [`run`].
 pub fn run_with_skin(
-    robot: &Robot,
-    options: &Options,
-    skin: Option<Skin<'_>>,
+    robot: &SimulatedRobot,
+    options: &RunOptions,
+    skin: Option<TouchListener<'_>>,
     stop: &AtomicBool,
-) -> anyhow::Result<Summary> {
+) -> anyhow::Result<RunSummary> {
     let buses = sources(robot, options)?;
     let mut settings = options.settings.clone();
     if let Some(seconds) = options.seconds {
@@ -176,19 +180,11 @@ pub fn run_with_skin(
     }
     // All errors are found before anything is sent.
     let mut simulation = Simulation::new(robot, &settings).map_err(crate::SimulatorError::from)?;
-    let truth = options
-        .truth
-        .as_deref()
-        .map(|path| Ok::<_, anyhow::Error>((path, create(path)?)))
-        .transpose()?;
-    let mut links = Vec::new();
-    for (plan, source) in robot.plan.buses.iter().zip(&buses) {
-        let mut plan = plan.clone();
-        plan.source = source.clone();
-        // No claims: boards receive all frames, as on a real bus.
-        let link = open_link(&plan, &options.domain, &[]);
-        links.push(link.with_context(|| format!("bus {:?} ({})", plan.name, source_text(source)))?);
-    }
+    let truth = match options.truth.as_deref() {
+        Some(path) => Some((path, create(path)?)),
+        None => None,
+    };
+    let links = open_links(robot, options, &buses)?;
     let clock = Monotonic;
     let t0 = clock.now();
     let end = options
@@ -202,13 +198,10 @@ pub fn run_with_skin(
         "the simulated robot is powered on"
     );
     if let Some(push) = simulation.push() {
-        tracing::info!(
-            "{}",
-            push_text(robot, &push, options.seconds.is_some(), skin.is_some())
-        );
+        let (is_once, is_declared) = (options.seconds.is_some(), skin.is_some());
+        tracing::info!("{}", push_text(robot, &push, is_once, is_declared));
     }
-    let mut summaries = Vec::new();
-    thread::scope(|scope| {
+    let runs = thread::scope(|scope| {
         let threads: Vec<_> = simulator
             .into_buses()
             .into_iter()
@@ -223,15 +216,15 @@ pub fn run_with_skin(
         if let (Some(skin), true) = (skin, threads.iter().all(Result::is_ok)) {
             feel(&simulation, t0, skin, &clock, end, stop);
         }
-        for thread in threads {
+        let runs = threads.into_iter().map(|thread| {
             let thread = thread
                 .context("cannot start a thread")
                 .inspect_err(|_| stop.store(true, Relaxed))?;
-            summaries.push(thread.join().map_err(|_| {
-                anyhow::anyhow!("a bus thread panicked: this is a bug in the program")
-            })?);
-        }
-        Ok::<_, anyhow::Error>(())
+            thread
+                .join()
+                .map_err(|_| anyhow::anyhow!("a bus thread panicked: this is a bug in the program"))
+        });
+        runs.collect::<anyhow::Result<Vec<BusRun>>>()
     })?;
     let ended = clock.now().min(end);
     let truth_rows = match truth {
@@ -239,27 +232,11 @@ pub fn run_with_skin(
         Some((path, file)) => write_truth(&mut simulation, t0, ended, TRUTH_PERIOD, file)
             .with_context(|| format!("cannot write {}", path.display()))?,
     };
-    let buses: Vec<BusSummary> = robot
-        .plan
-        .buses
-        .iter()
-        .zip(&buses)
-        .zip(summaries)
-        .map(
-            |((plan, source), (counts, link, send_failures))| BusSummary {
-                name: plan.name.clone(),
-                source: source_text(source),
-                sent: link.sent,
-                send_failures,
-                received: link.received,
-                lost_on_request: counts.lost_on_request,
-                skipped: counts.skipped,
-                refused: counts.refused,
-                latest: counts.latest.seconds(),
-            },
-        )
+    let named = robot.plan.buses.iter().zip(&buses).zip(runs);
+    let buses: Vec<BusSummary> = named
+        .map(|((plan, source), run)| run.summary(&plan.name, source))
         .collect();
-    Ok(Summary {
+    Ok(RunSummary {
         robot: robot.plan.robot.clone(),
         seed: settings.seed,
         t0: t0.0,
@@ -271,19 +248,53 @@ pub fn run_with_skin(
     })
 }
 
-/// Whether an error of [`run`] or [`Robot::open`] is a wrong configuration (exit code 2).
-#[must_use]
-pub fn is_configuration(error: &anyhow::Error) -> bool {
-    error.chain().any(|cause| {
-        cause.is::<OptionsError>()
-            || cause.is::<crate::SimulatorError>()
-            || cause.is::<crate::RobotError>()
-            || cause.is::<crate::FaultError>()
-    })
+/// Opens the robot's buses on these sources.
+fn open_links(
+    robot: &SimulatedRobot,
+    options: &RunOptions,
+    sources: &[FrameSource],
+) -> anyhow::Result<Vec<Box<dyn Link>>> {
+    let links = robot.plan.buses.iter().zip(sources).map(|(plan, source)| {
+        let mut plan = plan.clone();
+        plan.source = source.clone();
+        // No claims: boards receive all frames, as on a real bus.
+        let link = open_link(&plan, &options.domain, &[]);
+        link.with_context(|| format!("bus {:?} ({})", plan.name, source_text(source)))
+    });
+    links.collect()
+}
+
+/// What happened on one bus.
+struct BusRun {
+    boards: BusCounts,
+    link: LinkCounters,
+    /// Frames that could not be sent.
+    send_failures: u64,
+}
+
+impl BusRun {
+    fn summary(&self, name: &str, source: &FrameSource) -> BusSummary {
+        BusSummary {
+            name: name.to_owned(),
+            source: source_text(source),
+            sent: self.link.sent,
+            send_failures: self.send_failures,
+            received: self.link.received,
+            lost_on_request: self.boards.lost_on_request,
+            skipped: self.boards.skipped,
+            refused: self.boards.refused,
+            latest: self.boards.latest.seconds(),
+        }
+    }
 }
 
 /// What is pushed, when and how hard, for a person who wonders what the sensors read.
-fn push_text(robot: &Robot, push: &PlannedPush, is_once: bool, is_declared: bool) -> String {
+fn push_text(
+    robot: &SimulatedRobot,
+    push: &PlannedPush,
+    is_once: bool,
+    is_declared: bool,
+) -> String {
     let contact = robot.config.contact.get(push.contact);
     let (name, link) = contact.map_or(("", ""), |c| (c.name(), c.link.as_str()));
     let every = if is_once {
@@ -312,14 +323,14 @@ fn rounded(number: f64) -> f64 {
 }
 
 /// The loop of one bus: send the frames that are due, then wait for a frame or for the next due
-/// time. Returns the counters of boards and link and the number of frames not sent.
+/// time.
 fn turn_until(
     mut bus: BusSimulator,
     mut link: Box<dyn Link>,
     clock: &impl Clock,
     end: Nanos,
     stop: &AtomicBool,
-) -> (BusCounts, LinkCounters, u64) {
+) -> BusRun {
     let mut send_failures = 0;
     loop {
         let now = clock.now();
@@ -342,20 +353,24 @@ fn turn_until(
             Received::Ended => break,
         }
     }
-    (bus.counts(), link.counters(), send_failures)
+    BusRun {
+        boards: bus.counts(),
+        link: link.counters(),
+        send_failures,
+    }
 }
 
 /// The loop of the skin, until no more touch follows.
 fn feel(
     simulation: &Simulation,
     t0: Nanos,
-    skin: Skin<'_>,
+    skin: TouchListener<'_>,
     clock: &impl Clock,
     end: Nanos,
     stop: &AtomicBool,
 ) {
     let mut next = simulation.next_touch(0.0);
-    while let Some(Touch { t, contact, begins }) = next {
+    while let Some(TouchEvent { t, contact, begins }) = next {
         let at = t0 + Nanos::from_seconds(t);
         if at >= end {
             break;
@@ -376,11 +391,14 @@ fn feel(
     }
 }
 
-fn sources(robot: &Robot, options: &Options) -> Result<Vec<FrameSource>, OptionsError> {
+fn sources(
+    robot: &SimulatedRobot,
+    options: &RunOptions,
+) -> Result<Vec<FrameSource>, RunOptionsError> {
     if let Some(seconds) = options.seconds
         && !(seconds > 0.0 && seconds.is_finite())
     {
-        return Err(OptionsError::Seconds(seconds));
+        return Err(RunOptionsError::Seconds(seconds));
     }
     let plans = &robot.plan.buses;
     let own: Vec<FrameSource> = plans.iter().map(|b| b.source.clone()).collect();
@@ -391,17 +409,17 @@ fn sources(robot: &Robot, options: &Options) -> Result<Vec<FrameSource>, Options
     };
     if sources.len() != plans.len() {
         let names = plans.iter().map(|b| b.name.clone()).collect();
-        return Err(OptionsError::BusCount {
+        return Err(RunOptionsError::BusCount {
             given: sources.len(),
             names,
         });
     }
     for (number, (source, plan)) in sources.iter().zip(plans).enumerate() {
         if matches!(source, FrameSource::Replay { .. }) {
-            return Err(OptionsError::Replay(plan.name.clone()));
+            return Err(RunOptionsError::Replay(plan.name.clone()));
         }
         if sources.iter().take(number).any(|other| other == source) {
-            return Err(OptionsError::SameBus);
+            return Err(RunOptionsError::SameBus);
         }
     }
     Ok(sources)
@@ -491,8 +509,8 @@ mod tests {
 
     #[test]
     fn an_overloaded_bus_is_still_listened_to() {
-        let robot = Robot::open("icub_left_arm").unwrap();
-        let settings = Settings::default();
+        let robot = SimulatedRobot::open("icub_left_arm").unwrap();
+        let settings = SimulationSettings::default();
         let clock = Slow::default();
         let simulator = Simulator::new(&robot, &settings, clock.now()).unwrap();
         for (bus, (plan, number)) in simulator

@@ -1,10 +1,10 @@
 //! What the simulated robot does.
 
-use crate::fault::Fault;
+use crate::fault::InjectedFault;
 
 /// What the simulated robot does.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Settings {
+pub struct SimulationSettings {
     /// The seed of motion, noise and faults.
     pub seed: u64,
     /// Duration without motion at the start \[s\].
@@ -16,10 +16,10 @@ pub struct Settings {
     /// Whether sensors have noise. Without noise only the boards' quantisation remains.
     pub noise: bool,
     /// The faults.
-    pub faults: Vec<Fault>,
+    pub faults: Vec<InjectedFault>,
 }
 
-impl Default for Settings {
+impl Default for SimulationSettings {
     fn default() -> Self {
         Self {
             seed: 1,

@@ -13,10 +13,10 @@
 //! board had skipped them, but none is old.
 
 use crate::drive::DriveTruth;
-use crate::fault::{Fault, FaultError, Window};
+use crate::fault::{FaultError, InjectedFault, TimeWindow};
 use crate::noise::Random;
-use crate::robot::{Robot, RobotError};
-use crate::settings::Settings;
+use crate::robot::{SimulatedRobot, SimulatedRobotError};
+use crate::settings::SimulationSettings;
 use crate::truth::Simulation;
 use proprio_drivers::{Board, Frame, Frames, Options, Spec};
 use proprio_gateway::joints::{Inverse, JointsPlan};
@@ -58,7 +58,7 @@ const JITTER: (f64, f64) = (0.02, 100_000.0);
 pub enum SimulatorError {
     /// Its files are wrong or do not match each other.
     #[error(transparent)]
-    Robot(#[from] RobotError),
+    Robot(#[from] SimulatedRobotError),
     /// A fault is not possible for it.
     #[error(transparent)]
     Fault(#[from] FaultError),
@@ -90,7 +90,11 @@ impl Simulator {
     /// # Errors
     /// [`SimulatorError`]: files that do not match each other, or a fault that is not possible for
     /// this robot.
-    pub fn new(robot: &Robot, settings: &Settings, t0: Nanos) -> Result<Self, SimulatorError> {
+    pub fn new(
+        robot: &SimulatedRobot,
+        settings: &SimulationSettings,
+        t0: Nanos,
+    ) -> Result<Self, SimulatorError> {
         let simulation = Simulation::new(robot, settings)?;
         let mut buses = Vec::new();
         for (number, bus) in robot.plan.buses.iter().enumerate() {
@@ -98,7 +102,9 @@ impl Simulator {
             for device in &bus.devices {
                 let stream = nodes.len() + 1000 * number;
                 let sources = sources(robot, &simulation, device, &bus.joints)?;
-                nodes.push(Node::new(robot, device, sources, settings, stream, t0)?);
+                nodes.push(SimulatedBoard::new(
+                    robot, device, sources, settings, stream, t0,
+                )?);
             }
             buses.push(BusSimulator {
                 name: bus.name.clone(),
@@ -151,9 +157,9 @@ impl Simulator {
         self.buses.iter().filter_map(BusSimulator::next_wake).min()
     }
 
-    fn arrange(&mut self, robot: &Robot, fault: &Fault) -> Result<(), FaultError> {
+    fn arrange(&mut self, robot: &SimulatedRobot, fault: &InjectedFault) -> Result<(), FaultError> {
         let Some(name) = fault.device() else {
-            if let Fault::Lost {
+            if let InjectedFault::Lost {
                 probability,
                 window,
             } = fault
@@ -199,26 +205,28 @@ impl Simulator {
             })
         };
         match fault {
-            Fault::Lost { .. } | Fault::Push { .. } | Fault::Still { .. } => {}
-            Fault::Silent { window, .. } => node.silences.push(*window),
-            Fault::Reboot { at, .. } => {
-                node.silences.push(Window {
+            InjectedFault::Lost { .. }
+            | InjectedFault::Push { .. }
+            | InjectedFault::Still { .. } => {}
+            InjectedFault::Silent { window, .. } => node.silences.push(*window),
+            InjectedFault::Reboot { at, .. } => {
+                node.silences.push(TimeWindow {
                     from: *at,
                     until: at + REBOOT,
                 });
                 node.reboots.push(Nanos::from_seconds(*at));
             }
-            Fault::Saturate { window, .. } => {
+            InjectedFault::Saturate { window, .. } => {
                 possible(node.measures(Kind::Wrench), "an F/T sensor")?;
                 node.saturations.push(*window);
             }
-            Fault::Freeze { window, .. } => node.freezes.push(*window),
-            Fault::Spike { at, .. } => {
+            InjectedFault::Freeze { window, .. } => node.freezes.push(*window),
+            InjectedFault::Spike { at, .. } => {
                 possible(node.measures(Kind::Wrench), "an F/T sensor")?;
                 node.spikes.push(*at);
             }
-            Fault::Late { age, window, .. } => node.ages.push((*window, *age)),
-            Fault::LateHalf { window, once, .. } => {
+            InjectedFault::Late { age, window, .. } => node.ages.push((*window, *age)),
+            InjectedFault::LateHalf { window, once, .. } => {
                 possible(
                     node.measures(Kind::Wrench) || node.measures(Kind::Imu),
                     "a board that sends a reading in several frames",
@@ -236,10 +244,10 @@ pub struct BusSimulator {
     name: String,
     simulation: Simulation,
     t0: Nanos,
-    nodes: Vec<Node>,
+    nodes: Vec<SimulatedBoard>,
     /// Frames that are due.
     outbox: VecDeque<Frame>,
-    losses: Vec<(f64, Window)>,
+    losses: Vec<(f64, TimeWindow)>,
     random: Random,
     counts: BusCounts,
 }
@@ -296,7 +304,9 @@ impl BusSimulator {
             for node in &mut self.nodes {
                 node.reboot_if_due(now - t0, now);
             }
-            let due = |node: &Node| node.slots.as_ref().map(|s| s.due).filter(|due| *due <= now);
+            let due = |node: &SimulatedBoard| {
+                node.slots.as_ref().map(|s| s.due).filter(|due| *due <= now)
+            };
             let (index, _) = self
                 .nodes
                 .iter()
@@ -363,7 +373,7 @@ impl BusSimulator {
 
 /// The quantity that an output of a board measures.
 #[derive(Debug, Clone)]
-enum Source {
+enum Measurand {
     /// A shaft, which the joints of these numbers in the simulation turn, and its drives.
     Shaft(Inverse, Vec<(usize, DriveTruth)>),
     /// F/T sensor of this number, with its noise.
@@ -375,12 +385,12 @@ enum Source {
 }
 
 /// One board with its measured quantities and its faults.
-struct Node {
+struct SimulatedBoard {
     kinds: Vec<Kind>,
     options: Options,
     spec: Spec,
     board: Box<dyn Board>,
-    outputs: Vec<(u8, Source)>,
+    outputs: Vec<(u8, Measurand)>,
     noise: bool,
     random: Random,
     /// The noise of presented readings, so that requests do not change what it streams later.
@@ -393,38 +403,38 @@ struct Node {
     slots: Option<Slots>,
     /// Time of a motor board's next status.
     status: Option<Nanos>,
-    silences: Vec<Window>,
-    saturations: Vec<Window>,
-    freezes: Vec<Window>,
+    silences: Vec<TimeWindow>,
+    saturations: Vec<TimeWindow>,
+    freezes: Vec<TimeWindow>,
     /// The readings that it repeats while it is frozen.
     frozen: Option<Vec<(u8, Reading)>>,
     spikes: Vec<f64>,
     reboots: Vec<Nanos>,
     /// When it sends old readings, and how old they are \[s\].
-    ages: Vec<(Window, f64)>,
-    late: Vec<(Window, bool)>,
+    ages: Vec<(TimeWindow, f64)>,
+    late: Vec<(TimeWindow, bool)>,
     /// The half that is held back.
     held: Frames,
 }
 
-impl std::fmt::Debug for Node {
+impl std::fmt::Debug for SimulatedBoard {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Node")
+        f.debug_struct("SimulatedBoard")
             .field("kinds", &self.kinds)
             .field("spec", &self.spec)
             .finish_non_exhaustive()
     }
 }
 
-impl Node {
+impl SimulatedBoard {
     fn new(
-        robot: &Robot,
+        robot: &SimulatedRobot,
         device: &DevicePlan,
-        outputs: Vec<(u8, Source)>,
-        settings: &Settings,
+        outputs: Vec<(u8, Measurand)>,
+        settings: &SimulationSettings,
         stream: usize,
         t0: Nanos,
-    ) -> Result<Self, RobotError> {
+    ) -> Result<Self, SimulatedRobotError> {
         let mut random = Random::new(settings.seed, "board", stream);
         let mut node = Self {
             kinds: device.outputs.iter().map(|output| output.kind).collect(),
@@ -582,18 +592,18 @@ impl Node {
 
 /// What each output of a board measures.
 fn sources(
-    robot: &Robot,
+    robot: &SimulatedRobot,
     simulation: &Simulation,
     device: &DevicePlan,
     joints: &JointsPlan,
-) -> Result<Vec<(u8, Source)>, RobotError> {
+) -> Result<Vec<(u8, Measurand)>, SimulatedRobotError> {
     let mut outputs = Vec::new();
     for output in &device.outputs {
         let name = |channel: u32| {
             let channel = robot.plan.channels.get(channel as usize);
             channel.map_or("", |channel| channel.name.as_str())
         };
-        let sensor = name(output.channel);
+        let channel_name = name(output.channel);
         let missing = |name: &str, problem: &str| {
             robot.mismatch(format!("gateway.toml has {name:?}: {problem}"))
         };
@@ -611,31 +621,31 @@ fn sources(
                     Ok((joint, DriveTruth::new(&robot.model, name(*channel))))
                 };
                 let joints = inverse.channels.iter().map(number);
-                let joints = joints.collect::<Result<_, RobotError>>()?;
-                Source::Shaft(inverse, joints)
+                let joints = joints.collect::<Result<_, SimulatedRobotError>>()?;
+                Measurand::Shaft(inverse, joints)
             }
             Kind::Wrench => {
-                let number = simulation.wrench(sensor);
+                let number = simulation.wrench(channel_name);
                 let number = number.ok_or_else(|| {
                     missing(
-                        sensor,
+                        channel_name,
                         "estimator.toml has no [[force_torque]] with that sensor",
                     )
                 })?;
                 let ft = robot.config.force_torque.get(number);
-                let ft = ft.ok_or_else(|| missing(sensor, "it is not configured"))?;
-                Source::Wrench(number, ft.noise_n, ft.noise_nm)
+                let ft = ft.ok_or_else(|| missing(channel_name, "it is not configured"))?;
+                Measurand::Wrench(number, ft.noise_n, ft.noise_nm)
             }
-            Kind::Imu => Source::Imu(simulation.imu(sensor).ok_or_else(|| {
+            Kind::Imu => Measurand::Imu(simulation.imu(channel_name).ok_or_else(|| {
                 missing(
-                    sensor,
+                    channel_name,
                     "its place is not known: it is not the [base] of estimator.toml, and no link \
                      of the URDF has its name",
                 )
             })?),
             // A skin that estimator.toml does not place feels nothing.
-            Kind::Skin => match simulation.skin(sensor) {
-                Some(skin) => Source::Skin(skin),
+            Kind::Skin => match simulation.skin(channel_name) {
+                Some(skin) => Measurand::Skin(skin),
                 None => continue,
             },
             // What is not simulated is silent.
@@ -648,26 +658,41 @@ fn sources(
 
 /// The readings of a board's outputs at `t`, with noise if there is a source of it.
 fn measure(
-    outputs: &[(u8, Source)],
+    outputs: &[(u8, Measurand)],
     simulation: &mut Simulation,
     t: f64,
     spike: bool,
     mut random: Option<&mut Random>,
 ) -> Vec<(u8, Reading)> {
     let mut readings = Vec::with_capacity(outputs.len());
-    for (output, source) in outputs {
-        let reading = match *source {
-            Source::Skin(number) => {
-                for mut skin in simulation.taxels(number, t) {
-                    if let Some(random) = &mut random {
-                        random.disturb(&mut skin.taxels, [TAXEL_NOISE; 12]);
-                    }
-                    readings.push((*output, Reading::Skin(skin)));
+    for (output, measurand) in outputs {
+        if let Measurand::Skin(number) = *measurand {
+            for mut skin in simulation.taxels(number, t) {
+                if let Some(random) = &mut random {
+                    random.disturb(&mut skin.taxels, [TAXEL_NOISE; 12]);
                 }
-                continue;
+                readings.push((*output, Reading::Skin(skin)));
             }
-            Source::Shaft(ref inverse, ref joints) => {
-                let states = joints.iter().filter_map(|(joint, drive)| {
+        }
+        let reading = measurand.reading(simulation, t, spike, random.as_deref_mut());
+        readings.extend(reading.map(|reading| (*output, reading)));
+    }
+    readings
+}
+
+impl Measurand {
+    /// Its reading at `t`; `None` of what is not there, and of a skin, which has several.
+    fn reading(
+        &self,
+        simulation: &mut Simulation,
+        t: f64,
+        spike: bool,
+        mut random: Option<&mut Random>,
+    ) -> Option<Reading> {
+        match *self {
+            Self::Skin(_) => None,
+            Self::Shaft(ref inverse, ref joints) => {
+                let states = joints.iter().map(|(joint, drive)| {
                     let truth = simulation.at(t).joints.get(*joint)?;
                     let torque = drive.torque(truth);
                     Some(JointState {
@@ -678,20 +703,13 @@ fn measure(
                         current: torque / drive.per_ampere,
                     })
                 });
-                let states: Vec<JointState> = states.collect();
-                if states.len() < joints.len() {
-                    continue;
-                }
+                let states: Vec<JointState> = states.collect::<Option<_>>()?;
                 let mut shaft = inverse.shaft(&states);
-                shaft.position += random
-                    .as_mut()
-                    .map_or(0.0, |random| JOINT_NOISE * random.normal());
-                Reading::Joint(inverse.device(shaft))
+                shaft.position += random.map_or(0.0, |random| JOINT_NOISE * random.normal());
+                Some(Reading::Joint(inverse.device(shaft)))
             }
-            Source::Wrench(number, noise_n, noise_nm) => {
-                let Some(&[fx, fy, fz, tx, ty, tz]) = simulation.at(t).wrenches.get(number) else {
-                    continue;
-                };
+            Self::Wrench(number, noise_n, noise_nm) => {
+                let &[fx, fy, fz, tx, ty, tz] = simulation.at(t).wrenches.get(number)?;
                 let mut wrench = Wrench {
                     force: [fx, fy, fz],
                     torque: [tx, ty, tz],
@@ -704,12 +722,10 @@ fn measure(
                     wrench.force = wrench.force.map(|f| f + SPIKE.0);
                     wrench.torque = wrench.torque.map(|n| n + SPIKE.1);
                 }
-                Reading::Wrench(wrench)
+                Some(Reading::Wrench(wrench))
             }
-            Source::Imu(number) => {
-                let Some(truth) = simulation.at(t).imus.get(number) else {
-                    continue;
-                };
+            Self::Imu(number) => {
+                let truth = simulation.at(t).imus.get(number)?;
                 let mut imu = Imu {
                     proper_acceleration: truth.proper_acceleration,
                     angular_velocity: truth.angular_velocity,
@@ -722,12 +738,10 @@ fn measure(
                     random.disturb(&mut imu.proper_acceleration, [ACCELERATION_NOISE; 3]);
                     random.disturb(&mut imu.angular_velocity, [ANGULAR_VELOCITY_NOISE; 3]);
                 }
-                Reading::Imu(imu)
+                Some(Reading::Imu(imu))
             }
-        };
-        readings.push((*output, reading));
+        }
     }
-    readings
 }
 
 /// The sending times of a board.
@@ -783,7 +797,10 @@ fn scaled(duration: Nanos, factor: f64) -> Nanos {
 }
 
 /// A board after power-on.
-fn power_on(robot: &Robot, device: &DevicePlan) -> Result<Box<dyn Board>, RobotError> {
+fn power_on(
+    robot: &SimulatedRobot,
+    device: &DevicePlan,
+) -> Result<Box<dyn Board>, SimulatedRobotError> {
     device
         .options
         .board(&device.spec)
@@ -830,10 +847,10 @@ mod tests {
 
     #[test]
     fn a_polled_board_answers_with_the_reading_of_the_request() {
-        let robot = Robot::open("icub_left_arm").unwrap();
-        let settings = Settings {
+        let robot = SimulatedRobot::open("icub_left_arm").unwrap();
+        let settings = SimulationSettings {
             noise: false,
-            ..Settings::default()
+            ..SimulationSettings::default()
         };
         let t0 = Nanos::from_millis(5);
         let mut simulator = Simulator::new(&robot, &settings, t0).unwrap();

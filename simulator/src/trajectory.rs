@@ -13,12 +13,12 @@ use std::f64::consts::TAU;
 /// [`Trajectory::MOST_SPEED`].
 #[derive(Debug, Clone)]
 pub struct Trajectory {
-    joints: Vec<Motion>,
+    joints: Vec<JointSines>,
     still: f64,
 }
 
 #[derive(Debug, Clone)]
-struct Motion {
+struct JointSines {
     rest: f64,
     sines: [Sine; 3],
 }
@@ -84,7 +84,7 @@ impl Trajectory {
             for sine in &mut sines {
                 sine.amplitude *= scale;
             }
-            Motion { rest, sines }
+            JointSines { rest, sines }
         });
         Self {
             joints: joints.collect(),
@@ -106,7 +106,7 @@ impl Trajectory {
     /// Joint `joint` at `t` seconds; `None` if there is no such joint.
     #[must_use]
     pub fn at(&self, joint: usize, t: f64) -> Option<Point> {
-        let Motion { rest, sines } = self.joints.get(joint)?;
+        let JointSines { rest, sines } = self.joints.get(joint)?;
         let (w, dw, ddw) = window((t - self.still) / Self::BLEND);
         let (dw, ddw) = (dw / Self::BLEND, ddw / (Self::BLEND * Self::BLEND));
         let (mut s, mut ds, mut dds) = (0.0, 0.0, 0.0);

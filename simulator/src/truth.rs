@@ -5,12 +5,13 @@
 //! link of the first contact on the IMU's link (else of the first contact that is not pushed).
 //! Gravity points along its frame's negative z axis, unless `gravity_mps2` is set. Other wrenches
 //! on the robot are a push on its hand (the contact named `hand`, else the last one that does not
-//! carry it) and the pushes of faults ([`Fault::Push`]), which the skins of estimator.toml feel.
+//! carry it) and the pushes of faults ([`InjectedFault::Push`]), which the skins of estimator.toml
+//! feel.
 
-use crate::fault::{Fault, Window};
+use crate::fault::{InjectedFault, TimeWindow};
 use crate::noise::Random;
-use crate::robot::{Robot, RobotError};
-use crate::settings::Settings;
+use crate::robot::{SimulatedRobot, SimulatedRobotError};
+use crate::settings::SimulationSettings;
 use crate::trajectory::{Point, Trajectory, window};
 use proprio_dynamics::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
 use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
@@ -36,7 +37,7 @@ const WIDTH: f64 = 0.006;
 
 /// The beginning or end of a touch.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Touch {
+pub struct TouchEvent {
     /// Time: seconds since the start of the simulation.
     pub t: f64,
     /// The contact's number in estimator.toml.
@@ -117,7 +118,7 @@ pub struct Simulation {
     dynamics: InverseDynamics,
     /// The motion of the link that stands still.
     base: FrameMotion,
-    sensors: Vec<Sensor>,
+    sensors: Vec<ForceTorqueSensor>,
     imus: Vec<(String, Frame)>,
     contacts: Vec<(String, Frame)>,
     /// The contact that carries the robot.
@@ -136,7 +137,7 @@ struct Poke {
     external: ExternalWrench,
     /// Where it acts, in its link's axes.
     point: Vec3,
-    window: Window,
+    window: TimeWindow,
 }
 
 /// A skin: its taxels, in its link's axes.
@@ -148,7 +149,7 @@ struct SkinTruth {
 }
 
 #[derive(Debug, Clone)]
-struct Sensor {
+struct ForceTorqueSensor {
     name: String,
     cut: SensorCut,
     offset: [f64; 6],
@@ -164,6 +165,22 @@ struct Push {
 }
 
 impl Push {
+    /// The push on contact number `contact`.
+    fn new(
+        robot: &SimulatedRobot,
+        contacts: &[(String, Frame)],
+        contact: usize,
+        settings: &SimulationSettings,
+    ) -> Option<Self> {
+        let (_, frame) = contacts.get(contact)?;
+        Some(Self {
+            contact,
+            frame: *frame,
+            wrench: push_wrench(robot.config.contact.get(contact)?, settings.seed),
+            cycle: settings.cycle,
+        })
+    }
+
     /// Its wrench at `t`; zero at the beginning and end of each cycle.
     fn at(&self, t: f64) -> Wrench {
         let (from, until, flank) = PUSH_TIME;
@@ -172,7 +189,7 @@ impl Push {
     }
 
     /// The first beginning or end later than `t`.
-    fn next_touch(&self, t: f64) -> Touch {
+    fn next_touch(&self, t: f64) -> TouchEvent {
         let (from, until, _) = PUSH_TIME;
         let cycle = (t / self.cycle).floor();
         // The margin keeps rounding from finding the same one twice.
@@ -187,7 +204,7 @@ impl Push {
             .into_iter()
             .find(|(x, _)| later(x))
             .unwrap_or((f64::INFINITY, false));
-        Touch {
+        TouchEvent {
             t,
             contact: self.contact,
             begins,
@@ -199,74 +216,18 @@ impl Simulation {
     /// The mechanics of `robot`.
     ///
     /// # Errors
-    /// [`RobotError::Mismatch`]: estimator.toml names a joint or link that is not in the URDF, or
-    /// has inconsistent values.
-    pub fn new(robot: &Robot, settings: &Settings) -> Result<Self, RobotError> {
+    /// [`SimulatedRobotError::Mismatch`]: estimator.toml names a joint or link that is not in the
+    /// URDF, or has inconsistent values.
+    pub fn new(
+        robot: &SimulatedRobot,
+        settings: &SimulationSettings,
+    ) -> Result<Self, SimulatedRobotError> {
         let model = robot.model.clone();
-        let wrong = |problem: String| robot.mismatch(format!("estimator.toml, {problem}"));
-        let frame = |place: &str, link: &str| {
-            model.frame(link).ok_or_else(|| {
-                wrong(format!(
-                    "{place}: link = {link:?} is not a link of the URDF"
-                ))
-            })
-        };
-        let mut contacts = Vec::new();
-        for contact in &robot.config.contact {
-            let name = contact.name().to_owned();
-            contacts.push((
-                name.clone(),
-                frame(&format!("contact {name:?}"), &contact.link)?,
-            ));
-        }
-        let mut sensors = Vec::new();
-        for ft in &robot.config.force_torque {
-            let cut = sensor_cut(&model, ft)
-                .map_err(|e| wrong(format!("force_torque {:?}: {e}", ft.sensor)))?;
-            sensors.push(Sensor {
-                name: ft.sensor.clone(),
-                cut,
-                offset: ft.offset().0.force_first(),
-            });
-        }
-
+        let contacts = contacts(robot)?;
+        let sensors = sensors(robot)?;
         let hand = contacts.iter().position(|(name, _)| name == "hand");
-        let mut imus = Vec::new();
-        let (carrier, carries, gravity) = match &robot.config.base {
-            Base::Fixed { link, gravity_mps2 } => {
-                let base = frame("base", link)?;
-                let carries = contacts.iter().position(|(_, f)| f.link == base.link);
-                (base, carries, Vec3::from(*gravity_mps2))
-            }
-            // The simulated robot does not walk: it stands on its first foot.
-            Base::Stance { foot } => {
-                let foot = foot
-                    .first()
-                    .ok_or_else(|| wrong("base.foot is empty".into()))?;
-                let carries = contacts.iter().position(|(name, _)| *name == foot.contact);
-                (
-                    frame("base.foot", &foot.link)?,
-                    carries,
-                    Vec3::from(foot.gravity_mps2),
-                )
-            }
-            Base::Imu {
-                sensor,
-                link,
-                xyz_m,
-                rpy_rad,
-            } => {
-                let mut imu = frame("base", link)?;
-                let beside = contacts.iter().position(|(_, f)| f.link == imu.link);
-                let carries = beside.or_else(|| (0..contacts.len()).find(|c| Some(*c) != hand));
-                let carrier = carries
-                    .and_then(|c| contacts.get(c))
-                    .map_or(imu, |(_, f)| *f);
-                imu.pose = imu.pose * Pose::from_xyz_rpy(*xyz_m, *rpy_rad);
-                imus.push((sensor.clone(), imu));
-                (carrier, carries, Vec3::new(0.0, 0.0, -GRAVITY))
-            }
-        };
+        let carrier = Carrier::new(robot, &contacts, hand)?;
+        let mut imus: Vec<(String, Frame)> = carrier.imu.into_iter().collect();
         // Other IMUs must be on a link of the same name.
         for channel in robot.plan.channels.iter().filter(|c| c.kind == Kind::Imu) {
             if let Some(frame) = model.frame(&channel.name)
@@ -275,123 +236,28 @@ impl Simulation {
                 imus.push((channel.name.clone(), frame));
             }
         }
+        let carries = carrier.contact;
         let on_hand = hand.or_else(|| (0..contacts.len()).rev().find(|c| Some(*c) != carries));
         let push = on_hand
             .filter(|c| settings.push && Some(*c) != carries)
-            .and_then(|contact| {
-                let (frame, config) =
-                    (contacts.get(contact)?.1, robot.config.contact.get(contact)?);
-                Some(Push {
-                    contact,
-                    frame,
-                    wrench: push_wrench(config, settings.seed),
-                    cycle: settings.cycle,
-                })
-            });
-
-        let mut pokes = Vec::new();
-        for fault in &settings.faults {
-            if let Fault::Push {
-                link,
-                force,
-                at,
-                along,
-                window,
-            } = fault
-            {
-                let Some(frame) = model.frame(link) else {
-                    return Err(robot
-                        .mismatch(format!("fault {fault}: {link:?} is not a link of the URDF")));
-                };
-                let point = Vec3::from(at.unwrap_or_default());
-                let along = Vec3::from(along.unwrap_or([1.0, 0.0, 0.0]));
-                let force = along.try_normalize(1e-9).unwrap_or_else(Vec3::x) * *force;
-                let torque = point.cross(&force);
-                pokes.push(Poke {
-                    external: ExternalWrench {
-                        frame,
-                        wrench: Wrench { torque, force },
-                    },
-                    point: frame.pose.point(&point),
-                    window: *window,
-                });
-            }
-        }
-
-        let mut skins = Vec::new();
-        for skin in &robot.config.skin {
-            let place = format!("skin {:?}", skin.channel);
-            let frame = frame(&place, &skin.link)?;
-            let map = TaxelMap::load(&skin.taxels).map_err(|e| wrong(format!("{place}: {e}")))?;
-            let taxels = map
-                .0
-                .iter()
-                .skip(skin.first_taxel)
-                .take(TRIANGLE * TRIANGLES);
-            let point = |taxel: &Taxel| frame.pose.point(&taxel.position);
-            skins.push(SkinTruth {
-                name: skin.channel.clone(),
-                link: frame.link,
-                taxels: taxels.map(|taxel| taxel.as_ref().map(point)).collect(),
-            });
-        }
-
+            .and_then(|contact| Push::new(robot, &contacts, contact, settings));
+        let pokes = pokes(robot, &settings.faults)?;
+        let skins = skins(robot)?;
         let dofs = model.dof_count();
         let joint_names: Vec<String> = (0..dofs)
             .map(|dof| model.dof_name(dof).to_owned())
             .collect();
-        let ranges: Vec<_> = (0..dofs)
-            .map(|dof| model.limits(model.dof_joint(dof)?))
-            .collect();
-        let mut trajectory = Trajectory::new(&ranges, settings.seed, settings.still);
-        for fault in &settings.faults {
-            if let Fault::Still { joint, at } = fault {
-                let number = joint_names.iter().position(|name| name == joint);
-                let number = number.ok_or_else(|| {
-                    robot.mismatch(format!(
-                        "fault {fault}: the URDF has no moving joint {joint:?}"
-                    ))
-                })?;
-                if let (Some(Some(limits)), Some(at)) = (ranges.get(number), at)
-                    && !(limits.lower..=limits.upper).contains(at)
-                {
-                    let (lower, upper) = (limits.lower, limits.upper);
-                    return Err(robot.mismatch(format!(
-                        "fault {fault}: the limits in the URDF are {lower} and {upper}"
-                    )));
-                }
-                trajectory.rest(number, *at);
-            }
-        }
-        let standing =
-            joint_names
-                .iter()
-                .enumerate()
-                .map(|(dof, name)| match robot.config.locked.get(name) {
-                    Some(position) => Some(*position),
-                    // The position of a moving joint without a channel would be unknown.
-                    None if robot.plan.channel(name).is_none() => {
-                        trajectory.at(dof, 0.0).map(|rest| rest.position)
-                    }
-                    None => None,
-                });
-        let standing = standing.collect();
-        let kinematics =
-            Kinematics::new(&model, carrier.link).map_err(|e| wrong(format!("base: {e}")))?;
+        let trajectory = trajectory(robot, settings, &joint_names)?;
+        let standing = standing(robot, &joint_names, &trajectory);
+        let kinematics = Kinematics::new(&model, carrier.frame.link)
+            .map_err(|e| wrong(robot, format!("base: {e}")))?;
+        let at_rest = FrameMotion::standing(&carrier.gravity);
         let mut this = Self {
-            base: FrameMotion::of_link_from_imu(&FrameMotion::standing(&gravity), &carrier.pose),
+            base: FrameMotion::of_link_from_imu(&at_rest, &carrier.frame.pose),
             dynamics: InverseDynamics::new(&model),
             truth: Truth {
                 t: f64::NAN,
-                joints: vec![
-                    JointTruth {
-                        position: f64::NAN,
-                        velocity: f64::NAN,
-                        acceleration: f64::NAN,
-                        torque: f64::NAN
-                    };
-                    dofs
-                ],
+                joints: vec![JointTruth::UNKNOWN; dofs],
                 wrenches: vec![[f64::NAN; 6]; sensors.len()],
                 imus: vec![ImuTruth::UNKNOWN; imus.len()],
                 contacts: vec![[0.0; 6]; contacts.len()],
@@ -411,7 +277,8 @@ impl Simulation {
             skins,
         };
         // Inconsistencies are reported here, not as absent readings later.
-        this.evaluate(0.0).map_err(|e| wrong(e.to_string()))?;
+        this.evaluate(0.0)
+            .map_err(|e| wrong(robot, e.to_string()))?;
         Ok(this)
     }
 
@@ -504,7 +371,7 @@ impl Simulation {
 
     /// The next beginning or end of a touch after `t` seconds; `None` if there is none.
     #[must_use]
-    pub fn next_touch(&self, t: f64) -> Option<Touch> {
+    pub fn next_touch(&self, t: f64) -> Option<TouchEvent> {
         self.push.map(|push| push.next_touch(t))
     }
 
@@ -545,11 +412,12 @@ impl Simulation {
                 continue;
             };
             let [position, velocity, acceleration] = &mut self.state;
-            let slots = [position, velocity, acceleration]
-                .into_iter()
-                .map(|v| v.get_mut(dof));
-            for (slot, value) in slots.zip([point.position, point.velocity, point.acceleration]) {
-                if let Some(slot) = slot {
+            for (values, value) in [
+                (position, point.position),
+                (velocity, point.velocity),
+                (acceleration, point.acceleration),
+            ] {
+                if let Some(slot) = values.get_mut(dof) {
                     *slot = value;
                 }
             }
@@ -586,19 +454,14 @@ impl Simulation {
             pushed.into_iter().chain(poked.iter().copied()).collect();
         self.dynamics
             .update(&self.model, &self.kinematics, &external)?;
-        let state = position
-            .iter()
-            .zip(velocity)
-            .zip(acceleration)
-            .zip(self.dynamics.torque());
-        for (joint, (((position, velocity), acceleration), torque)) in
-            self.truth.joints.iter_mut().zip(state)
-        {
+        let torque = self.dynamics.torque();
+        for (dof, joint) in self.truth.joints.iter_mut().enumerate() {
+            let value = |values: &[f64]| values.get(dof).copied().unwrap_or(f64::NAN);
             *joint = JointTruth {
-                position: *position,
-                velocity: *velocity,
-                acceleration: *acceleration,
-                torque: *torque,
+                position: value(position),
+                velocity: value(velocity),
+                acceleration: value(acceleration),
+                torque: value(torque),
             };
         }
         for (reading, sensor) in self.truth.wrenches.iter_mut().zip(&self.sensors) {
@@ -619,36 +482,48 @@ impl Simulation {
                 angular_acceleration: motion.angular_acceleration.into(),
             };
         }
-        for (number, (truth, (_, frame))) in self
-            .truth
-            .contacts
-            .iter_mut()
-            .zip(&self.contacts)
-            .enumerate()
-        {
-            *truth = match push {
-                // The base of the kinematics is the body that carries the robot.
-                _ if self.carries == Some(number) => frame
-                    .pose
-                    .wrench_back(&self.dynamics.base_wrench())
-                    .force_first(),
-                _ => {
-                    let own = push.filter(|(push, _)| push.contact == number);
-                    let of_push = own.map_or(Wrench::zero(), |(_, wrench)| wrench);
-                    // Other pushes on the same link.
-                    let others = poked.iter().filter(|other| other.frame.link == frame.link);
-                    others
-                        .fold(of_push, |sum, other| {
-                            sum + frame
-                                .pose
-                                .wrench_back(&other.frame.pose.wrench(&other.wrench))
-                        })
-                        .force_first()
-                }
-            };
+        for number in 0..self.contacts.len() {
+            let wrench = self.contact_wrench(number, push, poked);
+            if let Some(truth) = self.truth.contacts.get_mut(number) {
+                *truth = wrench.force_first();
+            }
         }
         Ok(())
     }
+
+    /// The wrench on contact number `number`, in its frame.
+    fn contact_wrench(
+        &self,
+        number: usize,
+        push: Option<(Push, Wrench)>,
+        poked: &[ExternalWrench],
+    ) -> Wrench {
+        let Some((_, frame)) = self.contacts.get(number) else {
+            return Wrench::zero();
+        };
+        // The base of the kinematics is the body that carries the robot.
+        if self.carries == Some(number) {
+            return frame.pose.wrench_back(&self.dynamics.base_wrench());
+        }
+        let pushed = push.filter(|(push, _)| push.contact == number);
+        let pushed = pushed.map_or(Wrench::zero(), |(_, wrench)| wrench);
+        // Other pushes on the same link.
+        let others = poked.iter().filter(|poke| poke.frame.link == frame.link);
+        others.fold(pushed, |sum, poke| {
+            sum + frame
+                .pose
+                .wrench_back(&poke.frame.pose.wrench(&poke.wrench))
+        })
+    }
+}
+
+impl JointTruth {
+    const UNKNOWN: Self = Self {
+        position: f64::NAN,
+        velocity: f64::NAN,
+        acceleration: f64::NAN,
+        torque: f64::NAN,
+    };
 }
 
 impl ImuTruth {
@@ -657,6 +532,210 @@ impl ImuTruth {
         angular_velocity: [f64::NAN; 3],
         angular_acceleration: [f64::NAN; 3],
     };
+}
+
+/// What the robot stands on.
+struct Carrier {
+    /// The frame that stands still.
+    frame: Frame,
+    /// The contact that carries the robot.
+    contact: Option<usize>,
+    gravity: Vec3,
+    /// The IMU of the base, if it has one.
+    imu: Option<(String, Frame)>,
+}
+
+impl Carrier {
+    /// As the base of estimator.toml says; `hand` is the contact that does not carry it.
+    fn new(
+        robot: &SimulatedRobot,
+        contacts: &[(String, Frame)],
+        hand: Option<usize>,
+    ) -> Result<Self, SimulatedRobotError> {
+        Ok(match &robot.config.base {
+            Base::Fixed { link, gravity_mps2 } => {
+                let frame = frame_of(robot, "base", link)?;
+                Self {
+                    frame,
+                    contact: contacts.iter().position(|(_, f)| f.link == frame.link),
+                    gravity: Vec3::from(*gravity_mps2),
+                    imu: None,
+                }
+            }
+            // The simulated robot does not walk: it stands on its first foot.
+            Base::Stance { foot } => {
+                let foot = foot.first();
+                let foot = foot.ok_or_else(|| wrong(robot, "base.foot is empty".into()))?;
+                Self {
+                    frame: frame_of(robot, "base.foot", &foot.link)?,
+                    contact: contacts.iter().position(|(name, _)| *name == foot.contact),
+                    gravity: Vec3::from(foot.gravity_mps2),
+                    imu: None,
+                }
+            }
+            Base::Imu {
+                sensor,
+                link,
+                xyz_m,
+                rpy_rad,
+            } => {
+                let mut imu = frame_of(robot, "base", link)?;
+                let beside = contacts.iter().position(|(_, f)| f.link == imu.link);
+                let contact = beside.or_else(|| (0..contacts.len()).find(|c| Some(*c) != hand));
+                let frame = contact.and_then(|c| contacts.get(c));
+                let frame = frame.map_or(imu, |(_, f)| *f);
+                imu.pose = imu.pose * Pose::from_xyz_rpy(*xyz_m, *rpy_rad);
+                Self {
+                    frame,
+                    contact,
+                    gravity: Vec3::new(0.0, 0.0, -GRAVITY),
+                    imu: Some((sensor.clone(), imu)),
+                }
+            }
+        })
+    }
+}
+
+/// The error that something in estimator.toml is wrong.
+fn wrong(robot: &SimulatedRobot, problem: String) -> SimulatedRobotError {
+    robot.mismatch(format!("estimator.toml, {problem}"))
+}
+
+/// The frame of a link that estimator.toml names at `place`.
+fn frame_of(robot: &SimulatedRobot, place: &str, link: &str) -> Result<Frame, SimulatedRobotError> {
+    let missing = || format!("{place}: link = {link:?} is not a link of the URDF");
+    let frame = robot.model.frame(link);
+    frame.ok_or_else(|| wrong(robot, missing()))
+}
+
+/// The contacts: names and frames.
+fn contacts(robot: &SimulatedRobot) -> Result<Vec<(String, Frame)>, SimulatedRobotError> {
+    let contacts = robot.config.contact.iter().map(|contact| {
+        let name = contact.name().to_owned();
+        let frame = frame_of(robot, &format!("contact {name:?}"), &contact.link)?;
+        Ok((name, frame))
+    });
+    contacts.collect()
+}
+
+fn sensors(robot: &SimulatedRobot) -> Result<Vec<ForceTorqueSensor>, SimulatedRobotError> {
+    let sensors = robot.config.force_torque.iter().map(|ft| {
+        let cut = sensor_cut(&robot.model, ft)
+            .map_err(|e| wrong(robot, format!("force_torque {:?}: {e}", ft.sensor)))?;
+        Ok(ForceTorqueSensor {
+            name: ft.sensor.clone(),
+            cut,
+            offset: ft.offset().0.force_first(),
+        })
+    });
+    sensors.collect()
+}
+
+/// The pushes of faults.
+fn pokes(
+    robot: &SimulatedRobot,
+    faults: &[InjectedFault],
+) -> Result<Vec<Poke>, SimulatedRobotError> {
+    let mut pokes = Vec::new();
+    for fault in faults {
+        let InjectedFault::Push {
+            link,
+            force,
+            at,
+            along,
+            window,
+        } = fault
+        else {
+            continue;
+        };
+        let frame = robot.model.frame(link);
+        let frame = frame.ok_or_else(|| {
+            robot.mismatch(format!("fault {fault}: {link:?} is not a link of the URDF"))
+        })?;
+        let point = Vec3::from(at.unwrap_or_default());
+        let along = Vec3::from(along.unwrap_or([1.0, 0.0, 0.0]));
+        let force = along.try_normalize(1e-9).unwrap_or_else(Vec3::x) * *force;
+        let torque = point.cross(&force);
+        pokes.push(Poke {
+            external: ExternalWrench {
+                frame,
+                wrench: Wrench { torque, force },
+            },
+            point: frame.pose.point(&point),
+            window: *window,
+        });
+    }
+    Ok(pokes)
+}
+
+fn skins(robot: &SimulatedRobot) -> Result<Vec<SkinTruth>, SimulatedRobotError> {
+    let skins = robot.config.skin.iter().map(|skin| {
+        let place = format!("skin {:?}", skin.channel);
+        let frame = frame_of(robot, &place, &skin.link)?;
+        let map =
+            TaxelMap::load(&skin.taxels).map_err(|e| wrong(robot, format!("{place}: {e}")))?;
+        let taxels = map.0.iter().skip(skin.first_taxel);
+        let point = |taxel: &Taxel| frame.pose.point(&taxel.position);
+        Ok(SkinTruth {
+            name: skin.channel.clone(),
+            link: frame.link,
+            taxels: (taxels.take(TRIANGLE * TRIANGLES))
+                .map(|taxel| taxel.as_ref().map(point))
+                .collect(),
+        })
+    });
+    skins.collect()
+}
+
+/// The motion of the joints, of which faults may hold some.
+fn trajectory(
+    robot: &SimulatedRobot,
+    settings: &SimulationSettings,
+    joint_names: &[String],
+) -> Result<Trajectory, SimulatedRobotError> {
+    let model = &robot.model;
+    let ranges: Vec<_> = (0..model.dof_count())
+        .map(|dof| model.limits(model.dof_joint(dof)?))
+        .collect();
+    let mut trajectory = Trajectory::new(&ranges, settings.seed, settings.still);
+    for fault in &settings.faults {
+        let InjectedFault::Still { joint, at } = fault else {
+            continue;
+        };
+        let number = joint_names.iter().position(|name| name == joint);
+        let number = number.ok_or_else(|| {
+            robot.mismatch(format!(
+                "fault {fault}: the URDF has no moving joint {joint:?}"
+            ))
+        })?;
+        if let (Some(Some(limits)), Some(at)) = (ranges.get(number), at)
+            && !(limits.lower..=limits.upper).contains(at)
+        {
+            let (lower, upper) = (limits.lower, limits.upper);
+            return Err(robot.mismatch(format!(
+                "fault {fault}: the limits in the URDF are {lower} and {upper}"
+            )));
+        }
+        trajectory.rest(number, *at);
+    }
+    Ok(trajectory)
+}
+
+/// The positions of the joints that do not move.
+fn standing(
+    robot: &SimulatedRobot,
+    joint_names: &[String],
+    trajectory: &Trajectory,
+) -> Vec<Option<f64>> {
+    let position = |(dof, name): (usize, &String)| match robot.config.locked.get(name) {
+        Some(position) => Some(*position),
+        // The position of a moving joint without a channel would be unknown.
+        None if robot.plan.channel(name).is_none() => {
+            trajectory.at(dof, 0.0).map(|rest| rest.position)
+        }
+        None => None,
+    };
+    joint_names.iter().enumerate().map(position).collect()
 }
 
 /// The cut at an F/T sensor: from estimator.toml, else from the URDF's sensor element, else the
@@ -724,8 +803,8 @@ mod tests {
     use std::collections::HashMap;
     use std::path::Path;
 
-    fn robot() -> Robot {
-        Robot::open("icub_left_arm").unwrap()
+    fn robot() -> SimulatedRobot {
+        SimulatedRobot::open("icub_left_arm").unwrap()
     }
 
     /// The columns of a golden table by name.
@@ -754,7 +833,7 @@ mod tests {
         let offsets = robot.config.force_torque[0].clone();
         robot.config.force_torque[0].offset_n = None;
         robot.config.force_torque[0].offset_nm = None;
-        let mut simulation = Simulation::new(&robot, &Settings::default()).unwrap();
+        let mut simulation = Simulation::new(&robot, &SimulationSettings::default()).unwrap();
         let push = simulation.push.unwrap();
         let table = golden(file);
         assert_eq!(table.len(), rows);
@@ -807,7 +886,7 @@ mod tests {
         // The offset of estimator.toml is added.
         let bare = simulation.at(3.0).wrenches[0];
         robot.config.force_torque[0] = offsets.clone();
-        let mut simulation = Simulation::new(&robot, &Settings::default()).unwrap();
+        let mut simulation = Simulation::new(&robot, &SimulationSettings::default()).unwrap();
         let offset = offsets.offset().0.force_first();
         assert!(
             offset.iter().all(|o| *o != 0.0),
@@ -837,9 +916,9 @@ mod tests {
         let robot = robot();
         let mut simulation = Simulation::new(
             &robot,
-            &Settings {
+            &SimulationSettings {
                 push: false,
-                ..Settings::default()
+                ..SimulationSettings::default()
             },
         )
         .unwrap();
@@ -855,9 +934,9 @@ mod tests {
     fn the_hand_is_pushed_in_the_middle_of_a_cycle_and_only_then() {
         let mut simulation = Simulation::new(
             &robot(),
-            &Settings {
+            &SimulationSettings {
                 cycle: 10.0,
-                ..Settings::default()
+                ..SimulationSettings::default()
             },
         )
         .unwrap();
@@ -878,9 +957,9 @@ mod tests {
         // The declared touch covers exactly the time with a force.
         let simulation = Simulation::new(
             &robot(),
-            &Settings {
+            &SimulationSettings {
                 cycle: 10.0,
-                ..Settings::default()
+                ..SimulationSettings::default()
             },
         )
         .unwrap();
@@ -909,9 +988,9 @@ mod tests {
         ] {
             assert!((told - expected).abs() < 1e-9, "{push:?}");
         }
-        let calm = Settings {
+        let calm = SimulationSettings {
             push: false,
-            ..Settings::default()
+            ..SimulationSettings::default()
         };
         let mut calm = Simulation::new(&robot(), &calm).unwrap();
         assert_eq!((calm.push(), calm.next_touch(0.0)), (None, None));
@@ -932,7 +1011,7 @@ mod tests {
         let mut robot = robot();
         let mut locked = robot.clone();
         locked.config.locked.insert("l_elbow".into(), 1.0);
-        let simulation = Simulation::new(&locked, &Settings::default()).unwrap();
+        let simulation = Simulation::new(&locked, &SimulationSettings::default()).unwrap();
         let elbow = simulation.joint("l_elbow").unwrap();
         assert_eq!(
             simulation.motion(elbow, 7.0),
@@ -943,7 +1022,7 @@ mod tests {
             })
         );
         robot.plan.channels.retain(|c| c.name != "l_elbow");
-        let simulation = Simulation::new(&robot, &Settings::default()).unwrap();
+        let simulation = Simulation::new(&robot, &SimulationSettings::default()).unwrap();
         assert_eq!(simulation.motion(elbow, 7.0), simulation.motion(elbow, 0.0));
         assert_ne!(
             simulation.motion(elbow + 1, 7.0),
@@ -957,9 +1036,9 @@ mod tests {
             let faults = vec![fault.parse().unwrap()];
             let simulation = Simulation::new(
                 &robot(),
-                &Settings {
+                &SimulationSettings {
                     faults,
-                    ..Settings::default()
+                    ..SimulationSettings::default()
                 },
             );
             simulation.map(|simulation| {
@@ -976,7 +1055,7 @@ mod tests {
     fn a_link_that_the_urdf_lacks_is_named() {
         let mut robot = robot();
         robot.config.contact[1].link = "left_hand".into();
-        let message = Simulation::new(&robot, &Settings::default())
+        let message = Simulation::new(&robot, &SimulationSettings::default())
             .unwrap_err()
             .to_string();
         assert!(
@@ -991,10 +1070,10 @@ mod tests {
     fn a_push_by_a_fault_acts_where_it_is_typed() {
         let robot = robot();
         let at = |faults: &[&str], t: f64| {
-            let settings = Settings {
+            let settings = SimulationSettings {
                 push: false,
                 faults: faults.iter().map(|fault| fault.parse().unwrap()).collect(),
-                ..Settings::default()
+                ..SimulationSettings::default()
             };
             Simulation::new(&robot, &settings).map(|mut simulation| simulation.at(t).clone())
         };

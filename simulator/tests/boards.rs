@@ -8,7 +8,7 @@ use proprio_gateway::status::BusStatus;
 use proprio_simulator::simulator::{
     ACCELERATION_NOISE, ANGULAR_VELOCITY_NOISE, BusCounts, BusSimulator, JOINT_NOISE,
 };
-use proprio_simulator::{Robot, Settings, Simulation, Simulator};
+use proprio_simulator::{SimulatedRobot, Simulation, SimulationSettings, Simulator};
 use proprio_topics::{Counter, Nanos, Quality, Reading, Sample, StampKind};
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -24,12 +24,12 @@ const TORQUE_LSB: f64 = 31.0 / 32768.0;
 const ACCELERATION_LSB: f64 = 0.01;
 const RATE_LSB: f64 = std::f64::consts::PI / 180.0 / 16.0;
 
-fn robot() -> Robot {
-    Robot::open("icub_left_arm").expect("the robot of the source tree")
+fn robot() -> SimulatedRobot {
+    SimulatedRobot::open("icub_left_arm").expect("the robot of the source tree")
 }
 
 /// The robot with its gateway.toml changed.
-fn robot_with(change: impl Fn(&str) -> String) -> Robot {
+fn robot_with(change: impl Fn(&str) -> String) -> SimulatedRobot {
     let mut robot = robot();
     let text = std::fs::read_to_string(robot.folder.join("gateway.toml")).expect("gateway.toml");
     let changed = change(&text);
@@ -38,13 +38,13 @@ fn robot_with(change: impl Fn(&str) -> String) -> Robot {
     robot
 }
 
-fn settings(faults: &[&str]) -> Settings {
+fn settings(faults: &[&str]) -> SimulationSettings {
     let faults = faults.iter().map(|f| f.parse().expect("a fault")).collect();
-    Settings {
+    SimulationSettings {
         seed: 11,
         cycle: 10.0,
         faults,
-        ..Settings::default()
+        ..SimulationSettings::default()
     }
 }
 
@@ -82,7 +82,12 @@ impl Session {
 }
 
 /// Runs boards and host for `seconds`; the host begins at `start`.
-fn session_from(robot: &Robot, settings: &Settings, seconds: f64, start: Nanos) -> Session {
+fn session_from(
+    robot: &SimulatedRobot,
+    settings: &SimulationSettings,
+    seconds: f64,
+    start: Nanos,
+) -> Session {
     let mut simulator = Simulator::new(robot, settings, T0).expect("a simulator");
     let mut hosts: Vec<(Decoder, Arc<BusStatus>)> = Vec::new();
     for (plan, number) in robot.plan.buses.iter().zip(0..) {
@@ -191,7 +196,7 @@ fn what_is_decoded_is_the_truth_within_half_a_step_and_noise() {
     let robot = robot();
     let ft = &robot.config.force_torque[0];
     for noise in [false, true] {
-        let settings = Settings {
+        let settings = SimulationSettings {
             noise,
             ..settings(&[])
         };
@@ -317,7 +322,7 @@ fn the_same_seed_gives_the_same_frames_and_another_seed_others() {
     let frames = |seed| {
         session_from(
             &robot(),
-            &Settings {
+            &SimulationSettings {
                 seed,
                 ..settings(&["lost:0.01"])
             },
@@ -564,7 +569,7 @@ fn a_late_half_comes_behind_the_next_first_half_and_is_never_paired_wrongly() {
         1
     );
 
-    let quiet = Settings {
+    let quiet = SimulationSettings {
         noise: false,
         ..settings(&["late_half:l_arm_ft_sensor@1..5"])
     };
@@ -628,7 +633,7 @@ fn a_fault_that_can_not_happen_is_refused() {
 #[test]
 fn a_stalled_machine_skips_readings_and_sends_no_old_ones() {
     let robot = robot();
-    let quiet = Settings {
+    let quiet = SimulationSettings {
         noise: false,
         ..settings(&[])
     };

@@ -1,6 +1,6 @@
 //! Every configuration of the project can be loaded, matches its URDF and can be simulated.
 
-use proprio_simulator::{Robot, Settings, Simulator};
+use proprio_simulator::{SimulatedRobot, SimulationSettings, Simulator};
 use proprio_topics::Nanos;
 use std::path::Path;
 
@@ -14,14 +14,15 @@ fn every_robot_under_config_can_be_loaded_and_simulated() {
             continue;
         }
         robots += 1;
-        let robot = Robot::load(&folder).unwrap_or_else(|e| panic!("{e}"));
+        let robot = SimulatedRobot::load(&folder).unwrap_or_else(|e| panic!("{e}"));
         assert!(
             robot.model.warnings().is_empty(),
             "{}: {:?}",
             folder.display(),
             robot.model.warnings()
         );
-        Simulator::new(&robot, &Settings::default(), Nanos::ZERO).unwrap_or_else(|e| panic!("{e}"));
+        Simulator::new(&robot, &SimulationSettings::default(), Nanos::ZERO)
+            .unwrap_or_else(|e| panic!("{e}"));
         // The gateway publishes everything that the estimator needs.
         for ft in &robot.config.force_torque {
             assert!(
@@ -38,10 +39,16 @@ fn every_robot_under_config_can_be_loaded_and_simulated() {
 /// The worst-case load of both buses of icub_left_arm, as stated in its gateway.toml.
 #[test]
 fn no_bus_carries_more_than_sixty_percent() {
-    let robot = Robot::open("icub_left_arm").unwrap();
+    let robot = SimulatedRobot::open("icub_left_arm").unwrap();
     let mut log = Vec::new();
-    proprio_simulator::record::record(&robot, &Settings::default(), 2.0, Nanos::ZERO, &mut log)
-        .unwrap();
+    proprio_simulator::record::record(
+        &robot,
+        &SimulationSettings::default(),
+        2.0,
+        Nanos::ZERO,
+        &mut log,
+    )
+    .unwrap();
     for bus in &robot.plan.buses {
         // Bits in the second second, when the boards stream.
         let bits: usize = std::str::from_utf8(&log)

@@ -10,8 +10,8 @@ use proprio_gateway::offline::decode;
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::record::{record, write_truth};
 use proprio_simulator::{
-    Options, OptionsError, Robot, Settings, Simulation, is_configuration, parse_bus, run,
-    run_with_skin,
+    RunOptions, RunOptionsError, SimulatedRobot, Simulation, SimulationSettings, SimulatorError,
+    parse_bus, run, run_with_skin,
 };
 use proprio_topics::csv::{Columns, Row, TableReader, Value};
 use proprio_topics::{Counter, Nanos, Reading};
@@ -21,16 +21,16 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
 const T0: Nanos = Nanos::from_millis(100_000);
 
-fn robot() -> Robot {
-    Robot::open("icub_left_arm").expect("the robot of the source tree")
+fn robot() -> SimulatedRobot {
+    SimulatedRobot::open("icub_left_arm").expect("the robot of the source tree")
 }
 
 #[test]
 fn a_recorded_session_decodes_to_what_was_sent() {
     let robot = robot();
-    let settings = Settings {
+    let settings = SimulationSettings {
         seed: 3,
-        ..Settings::default()
+        ..SimulationSettings::default()
     };
     let (mut log, mut table) = (Vec::new(), Vec::new());
     let recorded = record(&robot, &settings, 3.0, T0, &mut log).unwrap();
@@ -93,9 +93,9 @@ fn the_truth_is_a_sample_log() {
     let robot = robot();
     let mut simulation = Simulation::new(
         &robot,
-        &Settings {
+        &SimulationSettings {
             cycle: 4.0,
-            ..Settings::default()
+            ..SimulationSettings::default()
         },
     )
     .unwrap();
@@ -156,7 +156,7 @@ fn the_truth_is_a_sample_log() {
 /// The gateway's side of one virtual bus until `stop`: returns the frames received and each
 /// device's counters.
 fn listen(
-    robot: &Robot,
+    robot: &SimulatedRobot,
     bus: usize,
     domain: &str,
     name: &str,
@@ -202,16 +202,16 @@ fn live_on_virtual_buses_boards_are_started_and_every_frame_sent_arrives() {
     let truth = folder.path().join("truth.csv");
     // A separate domain, because tests run in parallel.
     let domain = format!("simulator-{}", std::process::id());
-    let options = Options {
+    let options = RunOptions {
         buses: vec![
             parse_bus("virtual:one").unwrap(),
             parse_bus("virtual:two").unwrap(),
         ],
         domain: domain.clone(),
         seconds: Some(1.5),
-        settings: Settings {
+        settings: SimulationSettings {
             faults: vec!["lost:0.01".parse().unwrap()],
-            ..Settings::default()
+            ..SimulationSettings::default()
         },
         truth: Some(truth.clone()),
     };
@@ -268,9 +268,9 @@ fn live_on_virtual_buses_boards_are_started_and_every_frame_sent_arrives() {
 
 #[test]
 fn it_ends_when_it_is_told_to() {
-    let options = Options {
+    let options = RunOptions {
         domain: format!("stop-{}", std::process::id()),
-        ..Options::default()
+        ..RunOptions::default()
     };
     let summary = run(&robot(), &options, &AtomicBool::new(true)).unwrap();
     assert_eq!((summary.sent, summary.truth_rows), (0, 0));
@@ -278,10 +278,10 @@ fn it_ends_when_it_is_told_to() {
 
 #[test]
 fn the_skin_tells_of_each_touch_ahead_of_it() {
-    let options = Options {
+    let options = RunOptions {
         domain: format!("skin-{}", std::process::id()),
         seconds: Some(2.0),
-        ..Options::default()
+        ..RunOptions::default()
     };
     let mut told = Vec::new();
     let mut skin = |contact: &str, at: Nanos, touches: bool| {
@@ -319,7 +319,7 @@ fn the_skin_tells_of_each_touch_ahead_of_it() {
         "{told:?}"
     );
     // A stop request in the meantime is obeyed.
-    let options = Options {
+    let options = RunOptions {
         seconds: Some(60.0),
         ..options
     };
@@ -331,48 +331,48 @@ fn the_skin_tells_of_each_touch_ahead_of_it() {
 
 #[test]
 fn options_that_can_not_be_followed_are_told() {
-    let run = |options: Options| run(&robot(), &options, &AtomicBool::new(true)).unwrap_err();
+    let run = |options: RunOptions| run(&robot(), &options, &AtomicBool::new(true)).unwrap_err();
     let virtual_bus = |name: &str| FrameSource::Virtual { name: name.into() };
     for (options, expected) in [
         (
-            Options {
+            RunOptions {
                 buses: vec![virtual_bus("a")],
-                ..Options::default()
+                ..RunOptions::default()
             },
             "1 buses are given; the robot has 2: left_arm, left_arm_motors",
         ),
         (
-            Options {
+            RunOptions {
                 buses: vec![virtual_bus("a"), virtual_bus("a")],
-                ..Options::default()
+                ..RunOptions::default()
             },
             "the same source",
         ),
         (
-            Options {
+            RunOptions {
                 seconds: Some(0.0),
-                ..Options::default()
+                ..RunOptions::default()
             },
             "seconds = 0 must be above 0",
         ),
         (
-            Options {
-                settings: Settings {
+            RunOptions {
+                settings: SimulationSettings {
                     faults: vec!["spike:nose@1".parse().unwrap()],
-                    ..Settings::default()
+                    ..SimulationSettings::default()
                 },
-                ..Options::default()
+                ..RunOptions::default()
             },
             "no board or channel \"nose\"",
         ),
     ] {
         let error = run(options);
         assert!(format!("{error:#}").contains(expected), "{error:#}");
-        assert!(is_configuration(&error));
+        assert!(error.is::<RunOptionsError>() || error.is::<SimulatorError>());
     }
-    let missing = Options {
+    let missing = RunOptions {
         buses: vec![parse_bus("nocan0").unwrap(), parse_bus("nocan1").unwrap()],
-        ..Options::default()
+        ..RunOptions::default()
     };
     let error = run(missing);
     assert!(
@@ -380,7 +380,7 @@ fn options_that_can_not_be_followed_are_told() {
         "{error:#}"
     );
     assert!(
-        !is_configuration(&error),
+        !error.is::<RunOptionsError>() && !error.is::<SimulatorError>(),
         "missing CAN support is not a wrong configuration"
     );
     assert_eq!(parse_bus("virtual:left_arm"), Ok(virtual_bus("left_arm")));
@@ -389,6 +389,6 @@ fn options_that_can_not_be_followed_are_told() {
         Ok(FrameSource::SocketCan(Adapter::Interface("vcan0".into())))
     );
     for wrong in ["", "virtual", "virtual:", "udp:x", "an_interface_too_long"] {
-        assert_eq!(parse_bus(wrong), Err(OptionsError::Bus(wrong.into())));
+        assert_eq!(parse_bus(wrong), Err(RunOptionsError::Bus(wrong.into())));
     }
 }

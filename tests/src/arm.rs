@@ -1,6 +1,6 @@
 //! Variants of `config/icub_left_arm` with other buses, periods and time-outs.
 
-use proprio_simulator::Robot;
+use proprio_simulator::SimulatedRobot;
 use std::fs;
 use std::path::Path;
 use toml::{Table, Value};
@@ -27,7 +27,7 @@ impl Arm {
     /// If it cannot be read.
     #[must_use]
     pub fn new() -> Self {
-        let folder = Robot::find("icub_left_arm").expect("the robot of this repository");
+        let folder = SimulatedRobot::find("icub_left_arm").expect("the robot of this repository");
         let read = |name: &str| -> Table {
             fs::read_to_string(folder.join(name))
                 .expect(name)
@@ -179,7 +179,7 @@ impl Arm {
                 .to_owned()
         };
         Written {
-            robot: Robot::load(folder).unwrap_or_else(|error| panic!("{error}")),
+            robot: SimulatedRobot::load(folder).unwrap_or_else(|error| panic!("{error}")),
             folder: text(""),
             gateway: text("gateway.toml"),
             estimator: text("estimator.toml"),
@@ -191,7 +191,7 @@ impl Arm {
 #[derive(Debug, Clone)]
 pub struct Written {
     /// The loaded robot.
-    pub robot: Robot,
+    pub robot: SimulatedRobot,
     /// The path of its folder.
     pub folder: String,
     /// The path of gateway.toml.

@@ -31,8 +31,8 @@ use proprio_gateway::decoder::{Decoder, build};
 use proprio_gateway::plan::{ChannelPlan, DevicePlan, Plan};
 use proprio_gateway::publish::SharedMemory;
 use proprio_gateway::status::BusStatus;
-use proprio_simulator::fault::{Fault as BoardFault, Window};
-use proprio_simulator::{Settings, Simulation};
+use proprio_simulator::fault::{InjectedFault, TimeWindow};
+use proprio_simulator::{Simulation, SimulationSettings};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Renewal, Writer};
 use proprio_topics::{
     Counter, DeviceHealth, DeviceState, Kind, NO_CAUSE, Nanos, Quality, Reading, Sample,
@@ -174,14 +174,14 @@ fn device_of(plan: &Plan, kind: Kind, random: &mut Random) -> Option<(usize, usi
 }
 
 /// The fault that the board itself has.
-fn board_fault(trouble: &Trouble, device: String) -> Option<BoardFault> {
+fn board_fault(trouble: &Trouble, device: String) -> Option<InjectedFault> {
     let (from, until) = (trouble.from, trouble.until);
     match trouble.fault {
-        Fault::Stuck => Some(BoardFault::Freeze {
+        Fault::Stuck => Some(InjectedFault::Freeze {
             device,
-            window: Window { from, until },
+            window: TimeWindow { from, until },
         }),
-        Fault::Reboot => Some(BoardFault::Reboot { device, at: from }),
+        Fault::Reboot => Some(InjectedFault::Reboot { device, at: from }),
         _ => None,
     }
 }
@@ -251,7 +251,7 @@ impl Chain {
                 let own = |trouble| board_fault(trouble, device.clone());
                 troubles.iter().filter_map(own).collect::<Vec<_>>()
             });
-            Settings {
+            SimulationSettings {
                 seed,
                 still: REST,
                 push: seed.is_multiple_of(2),

@@ -10,7 +10,7 @@ use proprio_estimator::setup::Setup;
 use proprio_estimator::skin::TaxelMap;
 use proprio_gateway::log;
 use proprio_gateway::plan::Plan;
-use proprio_simulator::Robot;
+use proprio_simulator::SimulatedRobot;
 use proprio_topics::{Imu, JointState, Kind, Nanos, Quality, Reading, Wrench, csv};
 use std::cell::RefCell;
 use std::fs;
@@ -146,7 +146,7 @@ fn text(bytes: &[u8]) -> String {
 
 /// The setup of the arm of this repository.
 fn arm(change: impl FnOnce(&mut Config)) -> Setup {
-    let folder = Robot::find("icub_left_arm").expect("the robot of this repository");
+    let folder = SimulatedRobot::find("icub_left_arm").expect("the robot of this repository");
     let mut config = Config::load(&folder.join("estimator.toml")).expect("its configuration");
     change(&mut config);
     Setup::new(&config).expect("its setup")

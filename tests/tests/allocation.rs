@@ -31,7 +31,7 @@ use proprio_gateway::plan::Plan;
 use proprio_gateway::publish::{Memory, SharedMemory, Sink};
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::record::record;
-use proprio_simulator::{Robot, Settings, Simulator};
+use proprio_simulator::{SimulatedRobot, SimulationSettings, Simulator};
 use proprio_topics::ipc::{Domain, DomainConfig, Reader, Writer};
 use proprio_topics::{
     ContactState, Counter, DeviceHealth, Kind, Nanos, Reading, Sample, Skin, StampKind, Wrench,
@@ -112,8 +112,8 @@ fn the_counter_counts() {
     );
 }
 
-fn robot() -> Robot {
-    Robot::open("icub_left_arm").expect("the robot of the source tree")
+fn robot() -> SimulatedRobot {
+    SimulatedRobot::open("icub_left_arm").expect("the robot of the source tree")
 }
 
 /// Bad frames: right identifiers with wrong lengths and contents, extended and remote frames, and
@@ -124,7 +124,7 @@ struct BadFrames {
 }
 
 impl BadFrames {
-    fn new(robot: &Robot, bus: usize) -> Self {
+    fn new(robot: &SimulatedRobot, bus: usize) -> Self {
         let plan = &robot.plan.buses[bus];
         let decoder = Decoder::new(
             0,
@@ -164,7 +164,7 @@ impl BadFrames {
 /// The far end of one of the robot's buses, until `stop`: its boards and, once `nonsense` is set,
 /// three bad frames per millisecond.
 fn far_end(
-    robot: &Robot,
+    robot: &SimulatedRobot,
     number: usize,
     domain: &str,
     name: &str,
@@ -175,7 +175,7 @@ fn far_end(
     let mut link = VirtualBus::open(domain, name, &[]).expect("a virtual bus");
     let mut bad = BadFrames::new(robot, number);
     let mut simulator =
-        Simulator::new(robot, &Settings::default(), clock.now()).expect("a simulator");
+        Simulator::new(robot, &SimulationSettings::default(), clock.now()).expect("a simulator");
     let patience = Nanos::from_millis(10);
     while !stop.load(Relaxed) {
         let now = clock.now();
@@ -380,11 +380,11 @@ fn a_bus_that_publishes_allocates_the_transports_loan_alone() {
 }
 
 /// A recorded session: the frames in order, with their bus numbers.
-fn session(robot: &Robot, seconds: f64) -> Vec<(usize, Frame)> {
+fn session(robot: &SimulatedRobot, seconds: f64) -> Vec<(usize, Frame)> {
     let mut log = Vec::new();
     record(
         robot,
-        &Settings::default(),
+        &SimulationSettings::default(),
         seconds,
         Nanos::from_millis(50_000),
         &mut log,
@@ -408,7 +408,7 @@ fn session(robot: &Robot, seconds: f64) -> Vec<(usize, Frame)> {
     frames
 }
 
-fn decoders(robot: &Robot) -> Vec<Decoder> {
+fn decoders(robot: &SimulatedRobot) -> Vec<Decoder> {
     let status = |(bus, number)| Arc::new(BusStatus::new(number, bus));
     let buses = robot.plan.buses.iter().zip(0..);
     buses

@@ -5,7 +5,7 @@ use nix::sys::statfs::{TMPFS_MAGIC, statfs};
 use proprio_dynamics::model::Model;
 use proprio_gateway::offline;
 use proprio_simulator::record::record;
-use proprio_simulator::{Robot, Settings, Simulation};
+use proprio_simulator::{SimulatedRobot, Simulation, SimulationSettings};
 use proprio_tests::{PATIENCE, Process, Rig, browse, until};
 use proprio_topics::{Nanos, Quality};
 use serde_json::Value as Json;
@@ -98,7 +98,7 @@ struct Place {
 impl Place {
     fn new() -> Self {
         let this = Self { rig: Rig::new() };
-        let robot = Robot::find("icub_left_arm").expect("the robot of this repository");
+        let robot = SimulatedRobot::find("icub_left_arm").expect("the robot of this repository");
         for name in ["gateway.toml", "estimator.toml", "model.urdf"] {
             this.write(name, &fs::read_to_string(robot.join(name)).unwrap());
         }
@@ -258,8 +258,8 @@ fn oracle(name: &str) -> String {
 const T0: Nanos = Nanos::from_millis(100_000);
 
 /// A recorded session of the simulated robot in candump's log format.
-fn session(seconds: f64, settings: &Settings) -> String {
-    let robot = Robot::open("icub_left_arm").unwrap();
+fn session(seconds: f64, settings: &SimulationSettings) -> String {
+    let robot = SimulatedRobot::open("icub_left_arm").unwrap();
     let mut log = Vec::new();
     record(&robot, settings, seconds, T0, &mut log).unwrap();
     String::from_utf8(log).unwrap()
@@ -950,7 +950,7 @@ fn what_may_not_be_done_is_told() {
     place.write("closed/secret.toml", "schema = 1");
     everybody(&place.path("closed/secret.toml"), 0o000);
     everybody(&place.path("open"), 0o777);
-    place.write("log.log", &session(0.1, &Settings::default()));
+    place.write("log.log", &session(0.1, &SimulationSettings::default()));
     everybody(&place.path("log.log"), 0o644);
     for folder in ["closed/domain", "closed"] {
         everybody(&place.path(folder), 0o555);
@@ -1212,7 +1212,7 @@ fn faults_and_gaps_of_a_log_are_in_its_table_of_samples() {
     };
     let (mut faults, mut gaps) = (0, 0);
     let mut lines: Vec<String> = Vec::new();
-    for line in session(4.0, &Settings::default()).lines() {
+    for line in session(4.0, &SimulationSettings::default()).lines() {
         // STATUS of the board of the elbow; its second byte is the state of the encoder: stuck.
         if let Some((front, data)) = line.split_once(" 143#")
             && during(line, 2.0, 2.5)
@@ -1345,7 +1345,7 @@ fn stamps_that_go_backwards_are_counted_and_take_nothing_else_with_them() {
         dirty.err
     );
     // In a CAN log: the same frame with an earlier stamp.
-    let log = session(0.5, &Settings::default());
+    let log = session(0.5, &SimulationSettings::default());
     let mut lines: Vec<&str> = log.lines().collect();
     let motor = lines
         .iter()
@@ -1387,7 +1387,7 @@ fn stamps_that_go_backwards_are_counted_and_take_nothing_else_with_them() {
 #[test]
 fn a_log_cut_off_anywhere_gives_everything_before_the_cut() {
     let place = Place::new();
-    let log = session(0.3, &Settings::default());
+    let log = session(0.3, &SimulationSettings::default());
     let whole = log.len();
     let args = [
         "decode",
@@ -1585,7 +1585,7 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
     // An output without free space.
     if Path::new("/dev/full").exists() {
         place.write("good.csv", &oracle("icub_left_arm_mujoco.csv"));
-        place.write("good.log", &session(0.2, &Settings::default()));
+        place.write("good.log", &session(0.2, &SimulationSettings::default()));
         for input in [
             [
                 "estimate",
@@ -1862,10 +1862,10 @@ fn standard_input_and_output_serve_as_files() {
 #[test]
 fn a_decoded_session_is_the_simulators_truth() {
     let place = Place::new();
-    let settings = Settings {
+    let settings = SimulationSettings {
         noise: false,
         seed: 5,
-        ..Settings::default()
+        ..SimulationSettings::default()
     };
     place.write("session.log", &session(4.0, &settings));
     let told = place
@@ -1888,7 +1888,7 @@ fn a_decoded_session_is_the_simulators_truth() {
         );
     }
     let mut simulation =
-        Simulation::new(&Robot::open("icub_left_arm").unwrap(), &settings).unwrap();
+        Simulation::new(&SimulatedRobot::open("icub_left_arm").unwrap(), &settings).unwrap();
     let samples = table(&place.read("s.csv"));
     let (mut compared, mut moving) = (0_u32, 0_u32);
     for (row, t) in samples["t"].iter().enumerate() {
@@ -2172,7 +2172,7 @@ fn date(stamp: &str) -> String {
 #[test]
 fn every_candump_format_gives_the_same_samples() {
     let place = Place::new();
-    let log = session(1.0, &Settings::default());
+    let log = session(1.0, &SimulationSettings::default());
     let decode = |text: &str| {
         place
             .run_with(
@@ -2322,7 +2322,7 @@ fn parameters_file() -> String {
     use proprio_dynamics::spatial;
     use proprio_estimator::parameters::{Offset, Parameters, Provenance};
     use proprio_estimator::setup::Setup;
-    let robot = Robot::open("icub_left_arm").expect("the robot of the source tree");
+    let robot = SimulatedRobot::open("icub_left_arm").expect("the robot of the source tree");
     let setup = Setup::new(&robot.config).expect("its model");
     let (link, mut inertia) = (
         setup.robot.model.inertias().len() - 1,
@@ -2790,10 +2790,10 @@ fn a_demonstration_of_other_boards_ends_well() {
 #[test]
 fn an_arm_that_stands_still_learns_nothing_of_its_masses() {
     let place = Place::new();
-    let settings = Settings {
+    let settings = SimulationSettings {
         still: 20.0,
         push: false,
-        ..Settings::default()
+        ..SimulationSettings::default()
     };
     place.write("still.log", &session(10.0, &settings));
     place
@@ -3063,7 +3063,7 @@ fn the_machine_readable_summaries_of_files_are_json() {
         }
     }
     // The library gives the same numbers.
-    let robot = Robot::open("icub_left_arm").unwrap();
+    let robot = SimulatedRobot::open("icub_left_arm").unwrap();
     let report =
         offline::encode(&robot.plan, place.read("s.csv").as_bytes(), std::io::sink()).unwrap();
     assert_eq!((report.samples, report.table.rows), (201 * 9, 201));

@@ -5,7 +5,7 @@ use proprio_dynamics::model::Model;
 use proprio_estimator::config::Config;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::plan::Plan;
-use proprio_simulator::Robot;
+use proprio_simulator::SimulatedRobot;
 use proprio_topics::Kind;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -105,7 +105,7 @@ fn every_robot_loads_and_its_files_fit_each_other() {
         let setup = Setup::new(&config).unwrap_or_else(|e| panic!("{}: {e}", estimator.display()));
         assert!(setup.warnings().is_empty(), "{at}: {:?}", setup.warnings());
         let Some(plan) = plan else { continue };
-        Robot::load(&folder).unwrap_or_else(|e| panic!("{e}"));
+        SimulatedRobot::load(&folder).unwrap_or_else(|e| panic!("{e}"));
         assert_eq!(plan.robot, setup.robot.name, "{at}");
         for kind in [Kind::Joint, Kind::Wrench, Kind::Imu] {
             let measured = names(

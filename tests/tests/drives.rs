@@ -11,7 +11,7 @@ use proprio_estimator::setup::Setup;
 use proprio_gateway::offline;
 use proprio_simulator::drive::DriveTruth;
 use proprio_simulator::record::record;
-use proprio_simulator::{Robot, Settings, Simulation};
+use proprio_simulator::{SimulatedRobot, Simulation, SimulationSettings};
 use proprio_tests::watch::open;
 use proprio_tests::{PATIENCE, Rig, until};
 use proprio_topics::csv::Columns;
@@ -27,13 +27,13 @@ const T0: Nanos = Nanos::from_millis(100_000);
 /// An arm whose motor boards report currents, and its logs.
 struct Arm {
     rig: Rig,
-    robot: Robot,
+    robot: SimulatedRobot,
 }
 
 impl Arm {
     fn new() -> Self {
         let rig = Rig::new();
-        let robot = Robot::open("icub_left_arm").unwrap();
+        let robot = SimulatedRobot::open("icub_left_arm").unwrap();
         let folder = &robot.folder;
         for file in ["model.urdf", "gateway.toml"] {
             fs::copy(folder.join(file), rig.path(file)).unwrap();
@@ -91,12 +91,12 @@ impl Arm {
     }
 }
 
-fn settings(seed: u64, faults: &[&str]) -> Settings {
-    Settings {
+fn settings(seed: u64, faults: &[&str]) -> SimulationSettings {
+    SimulationSettings {
         seed,
         push: false,
         faults: faults.iter().map(|fault| fault.parse().unwrap()).collect(),
-        ..Settings::default()
+        ..SimulationSettings::default()
     }
 }
 
@@ -379,7 +379,7 @@ fn live(arm: &Arm) {
     );
 }
 
-/// A leg of the Open Dynamic Robot Initiative on a force/torque sensor in the ground, real: squats
+/// A leg of the Open Dynamic SimulatedRobot Initiative on a force/torque sensor in the ground, real: squats
 /// of 23 s (`tests/data/hopper`). Its drives report torques.
 #[test]
 fn the_drive_of_a_real_leg_is_found() {

@@ -5,7 +5,7 @@
 use proprio_drivers::{Format, Frame, Id};
 use proprio_gateway::log::LogReader;
 use proprio_simulator::record::record;
-use proprio_simulator::{Robot, Settings};
+use proprio_simulator::{SimulatedRobot, SimulationSettings};
 use proprio_tests::watch::Recorder;
 use proprio_tests::{Arm, PATIENCE, Rig, until};
 use proprio_topics::Nanos;
@@ -19,9 +19,10 @@ const T0: Nanos = Nanos::from_millis(100_000);
 const BUSES: [&str; 2] = ["can0", "can1"];
 
 /// A session of the simulated robot: its frames with their times and channels, from 0 on.
-fn session(robot: &Robot, seconds: f64) -> (Vec<(Nanos, usize, Frame)>, Vec<u8>) {
+fn session(robot: &SimulatedRobot, seconds: f64) -> (Vec<(Nanos, usize, Frame)>, Vec<u8>) {
     let mut log = Vec::new();
-    record(robot, &Settings::default(), seconds, T0, &mut log).expect("memory can be written");
+    record(robot, &SimulationSettings::default(), seconds, T0, &mut log)
+        .expect("memory can be written");
     let mut reader = LogReader::new(&log[..]);
     let mut frames = Vec::new();
     while let Some(record) = reader.next_record().expect("memory can be read") {

@@ -5,7 +5,7 @@
 use proprio_gateway::offline;
 use proprio_gateway::plan::Plan;
 use proprio_simulator::record::record;
-use proprio_simulator::{Robot, Settings};
+use proprio_simulator::{SimulatedRobot, SimulationSettings};
 use proprio_tests::{Rig, browse};
 use proprio_topics::Nanos;
 use proprio_topics::csv::Columns;
@@ -31,7 +31,7 @@ impl Place {
     /// the truth: the hand is touched only if declared.
     fn arm() -> Self {
         let this = Self(Rig::new());
-        let robot = Robot::find("icub_left_arm").expect("the robot of this repository");
+        let robot = SimulatedRobot::find("icub_left_arm").expect("the robot of this repository");
         fs::copy(robot.join("model.urdf"), this.path("model.urdf")).unwrap();
         let config = fs::read_to_string(robot.join("estimator.toml")).unwrap();
         let hand = "link = \"l_hand\"";
@@ -92,8 +92,8 @@ impl Place {
     }
 
     /// A recorded session of the simulated arm as a table of samples.
-    fn session(&self, name: &str, seconds: f64, settings: &Settings) {
-        let robot = Robot::open("icub_left_arm").unwrap();
+    fn session(&self, name: &str, seconds: f64, settings: &SimulationSettings) {
+        let robot = SimulatedRobot::open("icub_left_arm").unwrap();
         let mut log = Vec::new();
         record(
             &robot,
@@ -103,18 +103,23 @@ impl Place {
             &mut log,
         )
         .unwrap();
-        let plan = Plan::load(&Robot::find("icub_left_arm").unwrap().join("gateway.toml")).unwrap();
+        let plan = Plan::load(
+            &SimulatedRobot::find("icub_left_arm")
+                .unwrap()
+                .join("gateway.toml"),
+        )
+        .unwrap();
         let mut table = Vec::new();
         offline::decode(&plan, &log[..], &mut table, Columns::Main).unwrap();
         self.write(name, &String::from_utf8(table).unwrap());
     }
 }
 
-fn free(seed: u64) -> Settings {
-    Settings {
+fn free(seed: u64) -> SimulationSettings {
+    SimulationSettings {
         seed,
         push: false,
-        ..Settings::default()
+        ..SimulationSettings::default()
     }
 }
 
@@ -355,7 +360,7 @@ fn nothing_to_identify_is_a_verdict_and_leaves_no_parameters() {
     place.session(
         "still.csv",
         4.0,
-        &Settings {
+        &SimulationSettings {
             still: 100.0,
             ..free(2)
         },

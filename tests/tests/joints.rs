@@ -7,7 +7,7 @@ use proprio_drivers::State;
 use proprio_gateway::decoder::Decoder;
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::simulator::JOINT_NOISE;
-use proprio_simulator::{Robot, Settings, Simulation, Simulator};
+use proprio_simulator::{SimulatedRobot, Simulation, SimulationSettings, Simulator};
 use proprio_tests::watch::{Newest, Recorder};
 use proprio_tests::{Arm, PATIENCE, Rig, now, until};
 use proprio_topics::{DeviceState, GatewayHealth, Nanos, Quality, Reading, Sample, StampKind};
@@ -70,7 +70,7 @@ fn motors(bus: &str, turns: &str) -> String {
 }
 
 /// Writes the arm with these motors into `folder`, its buses named after `bus`.
-fn write(folder: &Path, bus: &str, turns: &str) -> Robot {
+fn write(folder: &Path, bus: &str, turns: &str) -> SimulatedRobot {
     let names = [&format!("{bus}a"), "none"];
     let arm = Arm::new()
         .patience(1000.0, 100.0)
@@ -82,11 +82,11 @@ fn write(folder: &Path, bus: &str, turns: &str) -> Robot {
     buses.expect("a list of buses").truncate(1);
     let text = format!("{gateway}\n{}", motors(&format!("{bus}b"), turns));
     std::fs::write(file, text).expect("a configuration can be written");
-    Robot::load(folder).unwrap_or_else(|error| panic!("{error}"))
+    SimulatedRobot::load(folder).unwrap_or_else(|error| panic!("{error}"))
 }
 
 /// The joint's name and state, of a sample that is a joint's.
-fn state<'r>(robot: &'r Robot, sample: &Sample) -> Option<(&'r str, [f64; 2])> {
+fn state<'r>(robot: &'r SimulatedRobot, sample: &Sample) -> Option<(&'r str, [f64; 2])> {
     match sample.reading()? {
         Reading::Joint(joint) => {
             let name = &robot.plan.channels.get(sample.channel as usize)?.name;
@@ -99,10 +99,10 @@ fn state<'r>(robot: &'r Robot, sample: &Sample) -> Option<(&'r str, [f64; 2])> {
 #[test]
 fn coupled_wrapped_and_merged_joints_are_the_truth() {
     let folder = tempfile::tempdir().expect("a folder");
-    let plain = Robot::open(ROBOT).expect("the robot of this repository");
-    let settings = Settings {
+    let plain = SimulatedRobot::open(ROBOT).expect("the robot of this repository");
+    let settings = SimulationSettings {
         noise: false,
-        ..Settings::default()
+        ..SimulationSettings::default()
     };
     // Where the second motor is at start: it reports its shaft's angle within a turn.
     let simulation = Simulation::new(&plain, &settings).expect("a simulation");
@@ -256,9 +256,9 @@ fn a_gateway_publishes_one_channel_for_each_joint() {
     let summary: serde_json::Value =
         serde_json::from_str(&simulator.output()).expect("a summary as JSON");
     let t0 = Nanos(summary["t0"].as_i64().expect("an instant"));
-    let settings = Settings {
+    let settings = SimulationSettings {
         still,
-        ..Settings::default()
+        ..SimulationSettings::default()
     };
     let simulation = Simulation::new(&robot, &settings).expect("a simulation");
     let mut counts = std::collections::BTreeMap::new();

@@ -239,7 +239,8 @@ fn what_was_learnt_survives_the_process() {
 #[test]
 fn a_sensor_the_wrong_way_round_is_told_live() {
     let rig = Rig::new();
-    let robot = proprio_simulator::Robot::find(ROBOT).expect("the robot of this repository");
+    let robot =
+        proprio_simulator::SimulatedRobot::find(ROBOT).expect("the robot of this repository");
     let config = fs::read_to_string(robot.join("estimator.toml")).expect("a configuration");
     let mut turned = config.clone();
     for (from, to) in [

@@ -15,7 +15,7 @@ use proprio_planning::excite::{Planner, Task};
 use proprio_planning::knowledge::{limit, regime};
 use proprio_planning::motion::{JointLimits, Series};
 use proprio_planning::workspace::{Deviation, Puppet, RISE, Workspace, range};
-use proprio_simulator::Robot as Simulated;
+use proprio_simulator::SimulatedRobot as Simulated;
 use proprio_topics::Nanos;
 use std::f64::consts::TAU;
 use std::fmt::Write as _;

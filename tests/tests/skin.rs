@@ -3,7 +3,7 @@
 #![allow(missing_docs)]
 
 use proprio_simulator::record::record;
-use proprio_simulator::{Fault, Settings};
+use proprio_simulator::{InjectedFault, SimulationSettings};
 use proprio_tests::watch::Newest;
 use proprio_tests::{Arm, Rig, Written};
 use proprio_topics::{ContactEstimate, Nanos};
@@ -139,10 +139,10 @@ fn a_touch_on_the_bus_becomes_a_wrench_where_it_is() {
     const FROM: f64 = 4.0;
     let rig = Rig::new();
     let written = arm(Arm::new().aligned(20.0), &rig.path("robot"));
-    let settings = Settings {
+    let settings = SimulationSettings {
         push: false,
-        faults: vec![push(FROM, FROM + 2.0).parse::<Fault>().unwrap()],
-        ..Settings::default()
+        faults: vec![push(FROM, FROM + 2.0).parse::<InjectedFault>().unwrap()],
+        ..SimulationSettings::default()
     };
     let log = rig.path("session.log");
     let t0 = Nanos::from_millis(1000);

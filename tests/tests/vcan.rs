@@ -16,7 +16,7 @@ use proprio_gateway::link::socketcan::SocketCan;
 use proprio_gateway::log;
 use proprio_gateway::plan::Plan;
 use proprio_gateway::status::BusStatus;
-use proprio_simulator::{Settings, record};
+use proprio_simulator::{SimulationSettings, record};
 use proprio_tests::can::{self, Candump, vcan};
 use proprio_tests::watch::{
     Newest, Recorder, Truth, all_valid, bus, count, open, rows, table_by_channel, valid_since,
@@ -85,9 +85,9 @@ fn a_played_log_gives_what_decode_gives() {
         "saturate:l_arm_ft_sensor@1.2..1.4",
         "spike:l_arm_ft_sensor@1.7",
     ];
-    let settings = Settings {
+    let settings = SimulationSettings {
         faults: faults.map(|f| f.parse().expect("a fault")).to_vec(),
-        ..Settings::default()
+        ..SimulationSettings::default()
     };
     let out = BufWriter::new(File::create(&log).expect("a log"));
     record::record(&recorded.robot, &settings, 2.5, Nanos(1_000_000_000), out).expect("a session");
@@ -1081,7 +1081,7 @@ fn skewed_buses(
     let out = BufWriter::new(File::create(&log).expect("a log"));
     record::record(
         &arm.robot,
-        &Settings::default(),
+        &SimulationSettings::default(),
         3.0,
         Nanos(1_000_000_000),
         out,

@@ -6,13 +6,13 @@ use proprio_dynamics::spatial::RigidInertia;
 use proprio_estimator::config::{Config, ConfigError};
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
-use proprio_simulator::{PlannedPush, Robot, Settings, Simulation, wrong_urdf};
+use proprio_simulator::{PlannedPush, SimulatedRobot, Simulation, SimulationSettings, wrong_urdf};
 use std::fs::{self};
 use std::path::{Path, PathBuf};
 
 /// `proprio demo`.
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct DemoArgs {
     /// The robot: a folder in config/, or a path
     #[arg(long, value_name = "NAME", default_value = "icub_left_arm")]
     pub(crate) robot: String,
@@ -53,19 +53,19 @@ pub(crate) fn share(text: &str) -> Result<f64, String> {
     }
 }
 
-impl Args {
+impl DemoArgs {
     /// Duration without motion at the start [s].
     pub(crate) fn still(&self) -> f64 {
         (0.25 * self.seconds).min(10.0)
     }
 
     /// The simulator's settings.
-    pub(crate) fn settings(&self) -> Settings {
-        Settings {
+    pub(crate) fn settings(&self) -> SimulationSettings {
+        SimulationSettings {
             seed: self.seed,
             still: self.still(),
             cycle: self.seconds,
-            ..Settings::default()
+            ..SimulationSettings::default()
         }
     }
 }
@@ -109,7 +109,11 @@ pub(crate) struct Experiment {
 impl Experiment {
     /// Writes a configuration that stands alone to `out`: that of `robot`, the estimator's with
     /// identification on, with the CAD, and with the pushed contact as a possible one.
-    pub(crate) fn prepare(args: &Args, robot: &Robot, out: &Path) -> anyhow::Result<Self> {
+    pub(crate) fn prepare(
+        args: &DemoArgs,
+        robot: &SimulatedRobot,
+        out: &Path,
+    ) -> anyhow::Result<Self> {
         let settings = args.settings();
         let push = Simulation::new(robot, &settings)?.push();
         let gateway = out.join("gateway.toml");
@@ -183,7 +187,7 @@ impl Experiment {
     }
 
     /// A description of the experiment for the report.
-    pub(crate) fn story(&self, args: &Args) -> String {
+    pub(crate) fn story(&self, args: &DemoArgs) -> String {
         let error = 100.0 * args.cad_error;
         let mut story = format!(
             "The robot stands still for {} s, then it moves. The estimator's URDF, called the CAD, \
@@ -241,7 +245,7 @@ mod tests {
             ("icub_left_arm", (vec![3, 4, 5, 6, 0, 1, 2], 4)),
             ("six_axis_arm", (vec![0, 1, 2, 3, 4, 5], 6)),
         ] {
-            let robot = Robot::open(robot).unwrap();
+            let robot = SimulatedRobot::open(robot).unwrap();
             assert_eq!(order(&Setup::new(&robot.config).unwrap()), expected);
         }
     }

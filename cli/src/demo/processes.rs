@@ -5,6 +5,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use proprio_topics::Nanos;
 use proprio_topics::ipc::{DomainConfig, monotonic};
+use std::ffi::OsStr;
 use std::fs::{self, File};
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
@@ -28,7 +29,11 @@ pub(crate) struct Processes {
 }
 
 impl Processes {
-    pub(crate) fn start(&mut self, name: &'static str, args: &[&str]) -> anyhow::Result<()> {
+    pub(crate) fn start(
+        &mut self,
+        name: &'static str,
+        args: &[impl AsRef<OsStr>],
+    ) -> anyhow::Result<()> {
         let program = std::env::current_exe().context("cannot find the path of this program")?;
         let log = File::create(self.out.join(format!("{name}.log")))?;
         let output = if name == "simulate" {

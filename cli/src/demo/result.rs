@@ -46,10 +46,10 @@ mod page;
 mod torques;
 mod verdict;
 
-use super::experiment::{Args, Experiment};
-use super::watching::Watched;
+use super::experiment::{DemoArgs, Experiment};
+use super::watching::ReceivedRun;
 use anyhow::Context;
-use compared::Truth;
+use compared::TrueTorques;
 use evaluation::Evaluation;
 use proprio_estimator::offline::Table;
 use proprio_estimator::pipeline::Estimate;
@@ -61,13 +61,13 @@ use std::path::Path;
 /// Writes estimates.csv, summary.json and report.html to `out`, and prints the result. `truth` is
 /// the file with the simulator's truth.
 pub(super) fn finish(
-    args: &Args,
+    args: &DemoArgs,
     experiment: &Experiment,
     out: &Path,
-    watched: &Watched,
+    watched: &ReceivedRun,
     truth: &Path,
 ) -> anyhow::Result<()> {
-    let truth = Truth::read(truth, &watched.joints).context("the simulator's truth")?;
+    let truth = TrueTorques::read(truth, &watched.joints).context("the simulator's truth")?;
     write_estimates(&out.join("estimates.csv"), &experiment.setup, watched)?;
     let evaluation = Evaluation::new(args, experiment, watched, &truth)?;
     let mut summary = serde_json::to_string_pretty(&evaluation.summary())?;
@@ -79,7 +79,7 @@ pub(super) fn finish(
 }
 
 /// Writes all estimates in the form of `proprio estimate`.
-fn write_estimates(file: &Path, setup: &Setup, watched: &Watched) -> anyhow::Result<()> {
+fn write_estimates(file: &Path, setup: &Setup, watched: &ReceivedRun) -> anyhow::Result<()> {
     /// Copies values to the first places; returns their number.
     fn fill<T: Copy>(places: &mut [T], values: &[T]) -> anyhow::Result<u32> {
         places

@@ -1,11 +1,11 @@
 //! Collects and shows the outputs of the processes while the demonstration runs.
 
 use super::baseline::{Baseline, Readers};
-use super::experiment::{Args, Experiment};
+use super::experiment::{DemoArgs, Experiment};
 use super::processes::{PATIENCE, Processes};
 use anyhow::{Context, anyhow, bail};
 use indicatif::{ProgressBar, ProgressStyle};
-use proprio_simulator::Robot;
+use proprio_simulator::SimulatedRobot;
 use proprio_topics::ipc::{Domain, Reader, Topic, monotonic};
 use proprio_topics::{
     ContactEstimate, ContactWrench, EstimatorHealth, GatewayHealth, InertiaEstimate, JointTorque,
@@ -18,9 +18,9 @@ use std::path::Path;
 use std::time::Duration;
 
 /// The data received through shared memory.
-pub(crate) struct Watched {
+pub(crate) struct ReceivedRun {
     pub(crate) joints: Vec<String>,
-    pub(crate) estimates: Vec<Seen>,
+    pub(crate) estimates: Vec<ReceivedEstimate>,
     /// The torques with the CAD's parameters, from the same samples.
     pub(crate) baseline: Vec<(Nanos, Box<[f64]>)>,
     /// The identified parameters of each solution.
@@ -39,7 +39,7 @@ pub(crate) struct Learnt {
 }
 
 /// One estimate in compact form.
-pub(crate) struct Seen {
+pub(crate) struct ReceivedEstimate {
     pub(crate) t: Nanos,
     pub(crate) published: Nanos,
     pub(crate) joints: Box<[JointTorque]>,
@@ -72,76 +72,138 @@ pub(crate) fn open<T: Topic>(
     }
 }
 
+/// The topics of gateway and estimator that are watched.
+struct OutputReaders {
+    torques: Reader<TorqueEstimate>,
+    contacts: Reader<ContactEstimate>,
+    /// If nothing can be identified, the estimator does not publish the inertia.
+    inertias: Option<Reader<InertiaEstimate>>,
+    gateway: Reader<GatewayHealth>,
+    estimator: Reader<EstimatorHealth>,
+}
+
+impl OutputReaders {
+    fn open(
+        domain: &Domain,
+        robot: &str,
+        has_inertias: bool,
+        processes: &mut Processes,
+    ) -> anyhow::Result<Self> {
+        Ok(Self {
+            torques: open(domain, robot, processes)?,
+            contacts: open(domain, robot, processes)?,
+            inertias: match has_inertias {
+                true => Some(open(domain, robot, processes)?),
+                false => None,
+            },
+            gateway: open(domain, robot, processes)?,
+            estimator: open(domain, robot, processes)?,
+        })
+    }
+
+    /// Takes what has come; returns whether there was a torque.
+    fn take(&mut self, run: &mut ReceivedRun, baseline: &mut Baseline) -> anyhow::Result<bool> {
+        let before = run.estimates.len();
+        while let Some(estimate) = self.torques.try_take()? {
+            run.estimates.push(ReceivedEstimate {
+                t: estimate.header.acquired,
+                published: estimate.header.published,
+                joints: estimate.joints().into(),
+                contacts: Box::default(),
+                residuals: Box::default(),
+            });
+        }
+        while let Some(estimate) = self.contacts.try_take()? {
+            // The contacts of an instant follow its torques immediately.
+            let mut newest = run.estimates.iter_mut().rev().take(600);
+            if let Some(seen) = newest.find(|s| s.t == estimate.header.acquired) {
+                seen.contacts = estimate.contacts().into();
+                seen.residuals = estimate.residuals().into();
+            }
+        }
+        while let Some(inertia) = self.inertias.as_mut().map_or(Ok(None), Reader::try_take)? {
+            baseline.take_offsets(inertia.offsets());
+            // Before the first solution the CAD's parameters are in use.
+            if inertia.links().iter().any(|link| link.accepted == 1) {
+                run.learnt.push(Learnt {
+                    t: inertia.header.acquired,
+                    links: inertia.links().into(),
+                    offsets: inertia.offsets().into(),
+                });
+            }
+        }
+        baseline.turn()?;
+        self.take_health(run)?;
+        Ok(run.estimates.len() > before)
+    }
+
+    fn take_health(&mut self, run: &mut ReceivedRun) -> anyhow::Result<()> {
+        if let Some(health) = self.gateway.latest()? {
+            *run.gateway = health;
+        }
+        if let Some(health) = self.estimator.latest()? {
+            run.estimator = health;
+        }
+        Ok(())
+    }
+}
+
+fn utf8(path: &Path) -> anyhow::Result<&str> {
+    path.to_str()
+        .with_context(|| format!("{} is not UTF-8", path.display()))
+}
+
+/// The command line of the simulator.
+fn simulate(
+    args: &DemoArgs,
+    robot: &SimulatedRobot,
+    processes: &Processes,
+) -> anyhow::Result<Vec<String>> {
+    let truth = processes.private.join("truth.csv");
+    let options = [
+        ("--robot", utf8(&robot.folder)?.to_owned()),
+        ("--seconds", args.seconds.to_string()),
+        ("--seed", args.seed.to_string()),
+        ("--still", args.still().to_string()),
+        ("--truth", utf8(&truth)?.to_owned()),
+    ];
+    let faults = args.fault.iter().map(|fault| ("--fault", fault.clone()));
+    let options = options.into_iter().chain(faults);
+    let options = options.flat_map(|(key, value)| [key.to_owned(), value]);
+    let flags = ["--skin", "--json"].map(str::to_owned);
+    Ok(flags.into_iter().chain(options).collect())
+}
+
 /// Starts the processes and watches until the robot has stopped.
 pub(crate) fn watch(
-    args: &Args,
-    robot: &Robot,
+    args: &DemoArgs,
+    robot: &SimulatedRobot,
     experiment: &Experiment,
     processes: &mut Processes,
-) -> anyhow::Result<Watched> {
-    let text = |p: &Path| {
-        p.to_str()
-            .map(ToOwned::to_owned)
-            .with_context(|| format!("{} is not UTF-8", p.display()))
-    };
-    let truth = text(&processes.private.join("truth.csv"))?;
-    let (duration, seed, still) = (
-        args.seconds.to_string(),
-        args.seed.to_string(),
-        args.still().to_string(),
-    );
-    let folder = text(&robot.folder)?;
-    let mut simulate = vec![
-        "--robot",
-        &folder,
-        "--seconds",
-        &duration,
-        "--seed",
-        &seed,
-        "--still",
-        &still,
-        "--skin",
-        "--truth",
-        &truth,
-        "--json",
-    ];
-    args.fault
-        .iter()
-        .for_each(|f| simulate.extend(["--fault", f.as_str()]));
-    let (gateway_toml, estimator_toml) = (text(&experiment.gateway)?, text(&experiment.config)?);
-    processes.start("gateway", &["--config", &gateway_toml])?;
-    processes.start("estimator", &["--config", &estimator_toml])?;
+) -> anyhow::Result<ReceivedRun> {
+    let simulate = simulate(args, robot, processes)?;
+    let (gateway_toml, estimator_toml) = (utf8(&experiment.gateway)?, utf8(&experiment.config)?);
+    processes.start("gateway", &["--config", gateway_toml])?;
+    processes.start("estimator", &["--config", estimator_toml])?;
 
     let domain = Domain::open(&processes.domain)?;
-    let name = robot.config.robot.clone();
-    let mut torques: Reader<TorqueEstimate> = open(&domain, &name, processes)?;
-    let mut contacts: Reader<ContactEstimate> = open(&domain, &name, processes)?;
-    // If nothing can be identified, the estimator does not publish the inertia.
-    let mut inertias: Option<Reader<InertiaEstimate>> = match experiment.refused {
-        None => Some(open(&domain, &name, processes)?),
-        Some(_) => None,
-    };
-    let mut gateway_health: Reader<GatewayHealth> = open(&domain, &name, processes)?;
-    let mut estimator_health: Reader<EstimatorHealth> = open(&domain, &name, processes)?;
+    let name = &robot.config.robot;
+    let mut readers = OutputReaders::open(&domain, name, experiment.refused.is_none(), processes)?;
     // The gateway sends its first health message when all its links are open: from then on no frame
     // is lost.
-    let gateway = Box::new(wait_for(&mut gateway_health, processes)?);
-    let readers = Readers {
-        samples: open(&domain, &name, processes)?,
-        descriptions: open(&domain, &name, processes)?,
-        declarations: open(&domain, &name, processes)?,
+    let gateway = Box::new(wait_for(&mut readers.gateway, processes)?);
+    let inputs = Readers {
+        samples: open(&domain, name, processes)?,
+        descriptions: open(&domain, name, processes)?,
+        declarations: open(&domain, name, processes)?,
     };
-    let mut baseline = Baseline::new(experiment.baseline.clone(), readers);
+    let mut baseline = Baseline::new(experiment.baseline.clone(), inputs);
     processes.start("simulate", &simulate)?;
 
-    let joints: Vec<String> = experiment
-        .setup
-        .robot
-        .joint_names()
-        .map(ToOwned::to_owned)
-        .collect();
-    let mut screen = Screen::new(args, experiment, &joints);
-    let mut watched = Watched {
+    let joints = experiment.setup.robot.joint_names();
+    let joints: Vec<String> = joints.map(ToOwned::to_owned).collect();
+    let mut screen = LiveTable::new(args, experiment, &joints);
+    let mut run = ReceivedRun {
         joints,
         estimates: Vec::with_capacity((args.seconds * 1100.0) as usize),
         baseline: vec![],
@@ -154,52 +216,11 @@ pub(crate) fn watch(
     let begin = monotonic();
     let mut last_seen = begin;
     loop {
-        let mut any = false;
-        while let Some(estimate) = torques.try_take()? {
-            any = true;
-            watched.estimates.push(Seen {
-                t: estimate.header.acquired,
-                published: estimate.header.published,
-                joints: estimate.joints().into(),
-                contacts: Box::default(),
-                residuals: Box::default(),
-            });
-        }
-        while let Some(estimate) = contacts.try_take()? {
-            // The contacts of an instant follow its torques immediately.
-            let seen = watched
-                .estimates
-                .iter_mut()
-                .rev()
-                .take(600)
-                .find(|s| s.t == estimate.header.acquired);
-            if let Some(seen) = seen {
-                seen.contacts = estimate.contacts().into();
-                seen.residuals = estimate.residuals().into();
-            }
-        }
-        while let Some(inertia) = inertias.as_mut().map_or(Ok(None), Reader::try_take)? {
-            baseline.take_offsets(inertia.offsets());
-            // Before the first solution the CAD's parameters are in use.
-            if inertia.links().iter().any(|link| link.accepted == 1) {
-                watched.learnt.push(Learnt {
-                    t: inertia.header.acquired,
-                    links: inertia.links().into(),
-                    offsets: inertia.offsets().into(),
-                });
-            }
-        }
-        baseline.turn()?;
-        if let Some(health) = gateway_health.latest()? {
-            *watched.gateway = health;
-        }
-        if let Some(health) = estimator_health.latest()? {
-            watched.estimator = health;
-        }
+        let any = readers.take(&mut run, &mut baseline)?;
         let now = monotonic();
         if any {
             last_seen = now;
-            screen.show(watched.estimates.last(), now);
+            screen.show(run.estimates.last(), now);
         }
         for process in ["gateway", "estimator"] {
             if processes.ended(process)? {
@@ -216,26 +237,21 @@ pub(crate) fn watch(
         std::thread::sleep(Duration::from_millis(2));
     }
     screen.end();
-    watched.baseline = baseline.finish();
-    watched.lost_estimates = torques.lost();
+    run.baseline = baseline.finish();
+    run.lost_estimates = readers.torques.lost();
     // Wait for the final counts: two more health messages of each process.
     let end = monotonic() + Nanos::from_millis(300);
     while monotonic() < end {
-        if let Some(health) = gateway_health.latest()? {
-            *watched.gateway = health;
-        }
-        if let Some(health) = estimator_health.latest()? {
-            watched.estimator = health;
-        }
+        readers.take_health(&mut run)?;
         std::thread::sleep(Duration::from_millis(10));
     }
-    let told = fs::read_to_string(processes.private.join("simulate.json"))?;
-    watched.simulator =
-        serde_json::from_str(told.trim()).context("cannot read the simulator's summary")?;
-    if watched.estimates.is_empty() {
+    let summary = fs::read_to_string(processes.private.join("simulate.json"))?;
+    run.simulator =
+        serde_json::from_str(summary.trim()).context("cannot read the simulator's summary")?;
+    if run.estimates.is_empty() {
         bail!("no estimate was published");
     }
-    Ok(watched)
+    Ok(run)
 }
 
 pub(crate) fn wait_for<T: Topic>(
@@ -265,7 +281,7 @@ fn withheld(torque: &JointTorque) -> String {
 }
 
 /// The live table and the progress bar; one line per second if the output is not a terminal.
-pub(crate) struct Screen {
+pub(crate) struct LiveTable {
     pub(crate) terminal: bool,
     pub(crate) bar: ProgressBar,
     /// Number and name of each joint, in the order in which they are told.
@@ -280,8 +296,8 @@ pub(crate) struct Screen {
     pub(crate) lines: usize,
 }
 
-impl Screen {
-    pub(crate) fn new(args: &Args, experiment: &Experiment, joints: &[String]) -> Self {
+impl LiveTable {
+    pub(crate) fn new(args: &DemoArgs, experiment: &Experiment, joints: &[String]) -> Self {
         let named = |&joint: &usize| Some((joint, joints.get(joint)?.clone()));
         let terminal = std::io::stdout().is_terminal();
         let bar = if terminal {
@@ -306,7 +322,7 @@ impl Screen {
         }
     }
 
-    pub(crate) fn show(&mut self, last: Option<&Seen>, now: Nanos) {
+    pub(crate) fn show(&mut self, last: Option<&ReceivedEstimate>, now: Nanos) {
         let begin = *self.begin.get_or_insert(now);
         let Some(last) = last.filter(|_| now >= self.next) else {
             return;

@@ -156,69 +156,14 @@ impl Advice {
                 continue;
             }
             compared = true;
-            let is_disturbed = log
-                .findings
-                .iter()
-                .any(|f| f.code == FindingCode::Disturbance);
             // Errors where something touched the robot say little about the parameters.
-            if validated && !is_disturbed {
+            if validated && !is_disturbed(log) {
                 least = least.min(identified);
                 to_gain |= cad > NOTICEABLE;
             }
             gained |= identified < cad;
-            let how = if validated {
-                ", which was not used for training"
-            } else {
-                ""
-            };
-            self.why.push(format!(
-                "On {}{how}, the relative prediction error of {} is {} with the identified \
-                 parameters and {} with the CAD's ({}).",
-                log.file,
-                predicted(log),
-                percent(identified),
-                percent(cad),
-                if !log.joints.is_empty() {
-                    "nothing was fitted to it"
-                } else {
-                    "for both, only a constant offset of each F/T channel was fitted to it"
-                },
-            ));
-            if identified > cad * (1.0 + NOTICEABLE) {
-                if validated {
-                    if is_disturbed {
-                        self.worsen(Grade::Care);
-                        self.why.push(format!(
-                            "That is worse than the CAD, but {} contains undeclared contacts or \
-                             loads.",
-                            log.file
-                        ));
-                        self.next.push(format!(
-                            "Declare the contacts and loads of {}, or validate on a log without \
-                             them.",
-                            log.file
-                        ));
-                    } else {
-                        self.worsen(Grade::Reject);
-                        self.why.push(
-                            "That is worse than the CAD: the parameters are not valid outside the \
-                             training motion."
-                                .into(),
-                        );
-                        self.next.push(format!(
-                            "Identify from richer motion: add {} to the training logs, or record \
-                             longer and faster motion.",
-                            log.file
-                        ));
-                    }
-                } else {
-                    self.worsen(Grade::Care);
-                    self.why.push("That is worse than the CAD.".into());
-                }
-            } else if validated && identified > cad * (1.0 - NOTICEABLE) {
-                self.worsen(Grade::Care);
-                self.why.push("That is no better than the CAD.".into());
-            }
+            self.state_error(log);
+            self.compare_with_cad(log);
         }
         if !compared {
             self.worsen(Grade::Care);
@@ -244,6 +189,70 @@ impl Advice {
         if !validated {
             self.why.push("No validation log was given.".into());
         }
+    }
+
+    fn state_error(&mut self, log: &LogOutcome) {
+        let Both { cad, identified } = log.predicted.relative_error;
+        let how = match log.role {
+            Role::Validate => ", which was not used for training",
+            Role::Train => "",
+        };
+        self.why.push(format!(
+            "On {}{how}, the relative prediction error of {} is {} with the identified parameters \
+             and {} with the CAD's ({}).",
+            log.file,
+            predicted(log),
+            percent(identified),
+            percent(cad),
+            if !log.joints.is_empty() {
+                "nothing was fitted to it"
+            } else {
+                "for both, only a constant offset of each F/T channel was fitted to it"
+            },
+        ));
+    }
+
+    /// What it means if the error of a log is not below that of the CAD.
+    fn compare_with_cad(&mut self, log: &LogOutcome) {
+        let Both { cad, identified } = log.predicted.relative_error;
+        let is_worse = identified > cad * (1.0 + NOTICEABLE);
+        let is_no_better = identified > cad * (1.0 - NOTICEABLE);
+        let (grade, why, next) = match log.role {
+            Role::Train if is_worse => {
+                let why = "That is worse than the CAD.".to_owned();
+                (Grade::Care, why, None)
+            }
+            Role::Validate if is_worse && is_disturbed(log) => (
+                Grade::Care,
+                format!(
+                    "That is worse than the CAD, but {} contains undeclared contacts or loads.",
+                    log.file
+                ),
+                Some(format!(
+                    "Declare the contacts and loads of {}, or validate on a log without them.",
+                    log.file
+                )),
+            ),
+            Role::Validate if is_worse => (
+                Grade::Reject,
+                "That is worse than the CAD: the parameters are not valid outside the training \
+                 motion."
+                    .to_owned(),
+                Some(format!(
+                    "Identify from richer motion: add {} to the training logs, or record longer \
+                     and faster motion.",
+                    log.file
+                )),
+            ),
+            Role::Validate if is_no_better => {
+                let why = "That is no better than the CAD.".to_owned();
+                (Grade::Care, why, None)
+            }
+            _ => return,
+        };
+        self.worsen(grade);
+        self.why.push(why);
+        self.next.extend(next);
     }
 
     /// With a wrong sign, frame or gravity in the configuration, the parameters make up for it in
@@ -368,6 +377,12 @@ pub(crate) fn findings(outcome: &Outcome) -> impl Iterator<Item = (Option<&LogOu
         .iter()
         .flat_map(|log| log.findings.iter().map(move |f| (Some(log), f)));
     outcome.findings.iter().map(|f| (None, f)).chain(of_logs)
+}
+
+/// Whether something touched the robot, and nobody declared it.
+fn is_disturbed(log: &LogOutcome) -> bool {
+    let mut findings = log.findings.iter();
+    findings.any(|f| f.code == FindingCode::Disturbance)
 }
 
 /// What the relative prediction error of a log compares.

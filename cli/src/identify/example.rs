@@ -78,26 +78,30 @@ fn curve(name: &str, unit: &'static str, n: usize) -> Curve {
     }
 }
 
+fn excluded() -> Vec<Excluded> {
+    vec![
+        Excluded {
+            reason: "too close to the beginning, the end or a gap for accelerations".into(),
+            instants: 60,
+            first: at(0.0),
+            last: at(30.0),
+        },
+        Excluded {
+            reason: "contact declared: right_foot".into(),
+            instants: 240,
+            first: at(12.0),
+            last: at(14.4),
+        },
+    ]
+}
+
 fn log(file: &str, role: Role) -> LogOutcome {
     LogOutcome {
         file: file.into(),
         role,
         span: (at(0.0), at(30.0)),
         used: 2700,
-        excluded: vec![
-            Excluded {
-                reason: "too close to the beginning, the end or a gap for accelerations".into(),
-                instants: 60,
-                first: at(0.0),
-                last: at(30.0),
-            },
-            Excluded {
-                reason: "contact declared: right_foot".into(),
-                instants: 240,
-                first: at(12.0),
-                last: at(14.4),
-            },
-        ],
+        excluded: excluded(),
         onset: Some(at(4.0)),
         predicted: Predicted {
             relative_error: both(0.064, 0.0235),
@@ -165,53 +169,10 @@ fn log(file: &str, role: Role) -> LogOutcome {
 
 /// Everything is well, but for a disturbance of a log.
 pub(crate) fn outcome() -> Outcome {
-    let bodies = LINKS.iter().enumerate().map(|(i, name)| {
-        let size = i as f64 + 1.0;
-        let cad = [
-            1.0 / size,
-            0.01,
-            -0.02,
-            0.03,
-            0.004,
-            0.0001,
-            0.0,
-            0.005,
-            0.0002,
-            0.003,
-        ];
-        let identified = cad.map(|p| p * 1.12);
-        LinkOutcome {
-            link: i + 1,
-            name: (*name).into(),
-            cad: RigidInertia::from_parameters(&cad),
-            floored: (i == 2).then(|| RigidInertia::from_parameters(&cad)),
-            identified: RigidInertia::from_parameters(&identified),
-            deviation: cad.map(|p| p.abs() * 0.03 + 1e-4),
-            retained_fraction: 1.0,
-            significance: 4.2 / size,
-            seen: i > 0,
-        }
-    });
-    let base = (0..38).map(|i| {
-        let (unit, size) = match i {
-            0..4 => ("kg", 1.0),
-            4..16 => ("kg m", 0.05),
-            _ => ("kg m^2", 0.004),
-        };
-        BaseParameterOutcome {
-            expression: format!(
-                "r_lower_leg.I_xx + r_ankle_1.I_yy - 0.25 r_foot.h_{i} + 0.0221 r_foot.m"
-            ),
-            unit,
-            cad: size * noise(i),
-            identified: size * (noise(i) + 0.2 * noise(i + 50)),
-            deviation: size * 0.05 * (1.0 + noise(i + 7).abs()),
-        }
-    });
     Outcome {
         robot: "icub_legs".into(),
         verdict: Verdict::Identified,
-        links: bodies.collect(),
+        links: links(),
         covariance: CovarianceRoot {
             columns: vec![],
             calibrations: vec![],
@@ -246,7 +207,7 @@ pub(crate) fn outcome() -> Outcome {
              about a horizontal axis"
                 .into(),
         ],
-        base_parameters: base.collect(),
+        base_parameters: base_parameters(),
         channels: ["fx", "fy", "fz", "tx", "ty", "tz"]
             .iter()
             .map(|c| ChannelNoise {
@@ -275,6 +236,57 @@ pub(crate) fn outcome() -> Outcome {
                 .into(),
         }],
     }
+}
+
+fn links() -> Vec<LinkOutcome> {
+    let links = LINKS.iter().enumerate().map(|(i, name)| {
+        let size = i as f64 + 1.0;
+        let cad = [
+            1.0 / size,
+            0.01,
+            -0.02,
+            0.03,
+            0.004,
+            0.0001,
+            0.0,
+            0.005,
+            0.0002,
+            0.003,
+        ];
+        let identified = cad.map(|p| p * 1.12);
+        LinkOutcome {
+            link: i + 1,
+            name: (*name).into(),
+            cad: RigidInertia::from_parameters(&cad),
+            floored: (i == 2).then(|| RigidInertia::from_parameters(&cad)),
+            identified: RigidInertia::from_parameters(&identified),
+            deviation: cad.map(|p| p.abs() * 0.03 + 1e-4),
+            retained_fraction: 1.0,
+            significance: 4.2 / size,
+            seen: i > 0,
+        }
+    });
+    links.collect()
+}
+
+fn base_parameters() -> Vec<BaseParameterOutcome> {
+    let parameters = (0..38).map(|i| {
+        let (unit, size) = match i {
+            0..4 => ("kg", 1.0),
+            4..16 => ("kg m", 0.05),
+            _ => ("kg m^2", 0.004),
+        };
+        BaseParameterOutcome {
+            expression: format!(
+                "r_lower_leg.I_xx + r_ankle_1.I_yy - 0.25 r_foot.h_{i} + 0.0221 r_foot.m"
+            ),
+            unit,
+            cad: size * noise(i),
+            identified: size * (noise(i) + 0.2 * noise(i + 50)),
+            deviation: size * 0.05 * (1.0 + noise(i + 7).abs()),
+        }
+    });
+    parameters.collect()
 }
 
 /// A gain of each channel, and a change per kelvin.

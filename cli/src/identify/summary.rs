@@ -83,10 +83,7 @@
 
 use super::advice::{Advice, findings};
 use proprio_dynamics::calibration::force_first;
-use proprio_identification::{
-    Both, CalibrationOutcome, LogOutcome, ModelComparison, Outcome, Predicted, Role, Severity,
-    Verdict,
-};
+use proprio_identification::{CalibrationOutcome, LogOutcome, Outcome, Role, Severity, Verdict};
 use proprio_topics::Nanos;
 use serde_json::{Map, Value as Json, json};
 use std::ops::Range;
@@ -98,30 +95,11 @@ pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
         Verdict::NoBetterThanCad => ("no_better_than_cad", None),
         Verdict::Nothing(reason) => ("nothing", Some(reason)),
     };
-    let time_offsets: Vec<Json> = outcome
-        .time_offsets
-        .iter()
-        .map(|o| {
-            json!({
-                "channel": o.channel, "seconds": o.seconds, "std": o.deviation,
-                "significant": o.significant,
-            })
-        })
-        .collect();
     let found: Vec<Json> = findings(outcome)
         .map(|(log, f)| {
             json!({
                 "log": log.map(|l| &l.file), "severity": severity(f.severity),
                 "code": f.code.as_str(), "subject": f.subject, "text": f.text,
-            })
-        })
-        .collect();
-    let weakest: Vec<Json> = outcome
-        .weakest
-        .iter()
-        .map(|w| {
-            json!({
-                "expression": w.expression, "relative": w.relative, "prior_share": w.prior_share,
             })
         })
         .collect();
@@ -137,27 +115,7 @@ pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
             })
         })
         .collect();
-    let base: Vec<Json> = outcome
-        .base_parameters
-        .iter()
-        .map(|b| json!({
-            "expression": b.expression, "unit": b.unit, "cad": b.cad, "identified": b.identified,
-            "std": b.deviation,
-        }))
-        .collect();
-    let channels: Vec<Json> = outcome
-        .channels
-        .iter()
-        .map(|c| {
-            json!({
-                "name": c.name, "unit": c.unit, "std": c.deviation,
-                "autocorrelation_s": c.autocorrelation_seconds, "drift": c.drift,
-            })
-        })
-        .collect();
-    let rotors = object(&outcome.rotors, |r| {
-        (&r.joint, json!({ "kgm2": r.inertia, "std": r.deviation }))
-    });
+    let rotors = object(&outcome.rotors, |r| (&r.joint, json!(r)));
     let calibration = object(&outcome.calibrations, |c| (&c.sensor, calibration(c)));
     json!({
         "schema": 3, "robot": outcome.robot, "version": env!("CARGO_PKG_VERSION"),
@@ -168,9 +126,10 @@ pub(crate) fn summary(outcome: &Outcome, advice: &Advice) -> Json {
         "parameters": outcome.unknowns, "structural_rank": outcome.structural_rank,
         "rank": outcome.rank, "effective_parameters": outcome.effective,
         "condition": outcome.condition, "singular_values": outcome.singular_values,
-        "weakest": weakest, "not_separable": outcome.not_separable, "time_offsets": time_offsets,
-        "findings": found, "links": links, "base_parameters": base, "rotor_inertia": rotors,
-        "calibration": calibration, "channels": channels,
+        "weakest": outcome.weakest, "not_separable": outcome.not_separable,
+        "time_offsets": outcome.time_offsets, "findings": found, "links": links,
+        "base_parameters": outcome.base_parameters, "rotor_inertia": rotors,
+        "calibration": calibration, "channels": outcome.channels,
     })
 }
 
@@ -202,69 +161,20 @@ fn log(log: &LogOutcome) -> Json {
             })
         })
         .collect();
-    let joints = object(&log.joints, |j| {
-        let rest = json!({
-            "rms_nm": three(&j.rms_nm), "measured_rms_nm": j.measured_rms_nm,
-            "coverage": j.coverage,
-        });
-        (&j.name, rest)
-    });
-    let sensors = object(&log.sensors, |s| {
-        (
-            &s.name,
-            json!({ "rms": three(&s.rms), "coverage": s.coverage }),
-        )
-    });
-    let offsets = object(&log.offsets, |o| {
-        (
-            &o.sensor,
-            json!({
-                "start": o.start, "end": o.end, "std": o.deviation, "rate": o.rate,
-            }),
-        )
-    });
-    let friction = object(&log.friction, |f| {
-        (
-            &f.joint,
-            json!({
-                "coulomb_nm": f.coulomb_nm, "viscous": f.viscous, "offset_nm": f.offset_nm,
-                "std": f.deviation,
-            }),
-        )
-    });
     json!({
         "file": log.file,
         "role": role(log.role),
         "span_s": since(log.span.1), "observations": log.used, "excluded": excluded,
         "onset_s": log.onset.map(since),
-        "predicted": predicted(&log.predicted),
-        "joints": joints, "sensors": sensors,
-        "two_route_rms_nm": object(&log.two_route, |t| (&t.joint, three(&t.rms_nm))),
+        "predicted": log.predicted,
+        "joints": object(&log.joints, |j| (&j.name, json!(j))),
+        "sensors": object(&log.sensors, |s| (&s.name, json!(s))),
+        "two_route_rms_nm": object(&log.two_route, |t| (&t.joint, json!(t.rms_nm))),
         "two_route_rms_mean_removed_nm":
-            object(&log.two_route, |t| (&t.joint, three(&t.rms_mean_removed_nm))),
-        "offsets": offsets, "friction": friction,
+            object(&log.two_route, |t| (&t.joint, json!(t.rms_mean_removed_nm))),
+        "offsets": object(&log.offsets, |o| (&o.sensor, json!(o))),
+        "friction": object(&log.friction, |f| (&f.joint, json!(f))),
     })
-}
-
-/// How well a log is predicted.
-pub(crate) fn predicted(predicted: &Predicted) -> Json {
-    json!({
-        "relative_error": both(&predicted.relative_error),
-        "relative_error_with_drift": both(&predicted.relative_error_with_drift),
-        "joints_rms_nm": object(&predicted.joints, |(name, rms)| (name, both(rms))),
-        "sensors_rms": object(&predicted.sensors, |(name, rms)| (name, both(rms))),
-        "two_route_rms_nm": object(&predicted.two_route, |(name, rms)| (name, both(rms))),
-    })
-}
-
-/// The two sets of parameters by name.
-fn both<T: serde::Serialize>(both: &Both<T>) -> Json {
-    json!({ "cad": both.cad, "identified": both.identified })
-}
-
-/// The three sets of parameters by name.
-fn three<T: serde::Serialize>(three: &ModelComparison<T>) -> Json {
-    json!({ "cad": three.cad, "cad_fitted": three.cad_fitted, "identified": three.identified })
 }
 
 fn object<'a, T>(items: &'a [T], entry: impl Fn(&'a T) -> (&'a String, Json)) -> Map<String, Json> {

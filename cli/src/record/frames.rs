@@ -18,7 +18,7 @@ const WAITING: usize = 1 << 16;
 const TURN: Nanos = Nanos::from_millis(100);
 
 /// Hears buses, each in a thread of its own.
-pub(super) struct Frames {
+pub(super) struct RawFrames {
     /// Their names.
     pub(super) buses: Vec<String>,
     frames: Receiver<(usize, Frame)>,
@@ -26,7 +26,7 @@ pub(super) struct Frames {
     stop: Arc<AtomicBool>,
 }
 
-impl Frames {
+impl RawFrames {
     /// Of these buses: can0, or virtual:NAME.
     pub(super) fn open(buses: &[String], domain: &DomainConfig) -> anyhow::Result<Self> {
         let (sender, frames) = sync_channel(WAITING);
@@ -43,7 +43,7 @@ impl Frames {
             // A virtual bus has the name after `virtual:`.
             let name = bus.split_once(':').map_or(bus.as_str(), |(_, name)| name);
             all.buses.push(interface.unwrap_or_else(|| name.to_owned()));
-            let mut bus = Bus {
+            let mut bus = BusListener {
                 number,
                 link: ListenOnly(link),
                 sender: sender.clone(),
@@ -68,14 +68,14 @@ impl Frames {
     }
 }
 
-impl Drop for Frames {
+impl Drop for RawFrames {
     fn drop(&mut self) {
         self.stop.store(true, Relaxed);
     }
 }
 
 /// The thread of a bus.
-struct Bus {
+struct BusListener {
     number: usize,
     link: ListenOnly,
     sender: SyncSender<(usize, Frame)>,
@@ -83,7 +83,7 @@ struct Bus {
     stop: Arc<AtomicBool>,
 }
 
-impl Bus {
+impl BusListener {
     fn run(&mut self) {
         let mut dropped = 0;
         while !self.stop.load(Relaxed) {

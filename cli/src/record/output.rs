@@ -30,14 +30,14 @@ pub(super) fn create(path: &Path, force: bool) -> anyhow::Result<File> {
 }
 
 /// What is written.
-pub(super) enum Output {
-    Table(Table),
-    Recording(Box<Recording>),
+pub(super) enum Destination {
+    Table(TableFile),
+    Recording(Box<RecordingFile>),
     BlackBox(Box<BlackBox>),
 }
 
 /// A table of so many series.
-pub(super) struct Table {
+pub(super) struct TableFile {
     writer: TableWriter<BufWriter<File>>,
     series: usize,
     /// Values of other series, which are not in it.
@@ -45,7 +45,7 @@ pub(super) struct Table {
 }
 
 /// A recording, in one file or several.
-pub(super) struct Recording {
+pub(super) struct RecordingFile {
     recorder: Recorder<BufWriter<File>>,
     about: About,
     /// Where the next file is begun, and after what time.
@@ -86,9 +86,9 @@ impl Split {
     }
 }
 
-impl Output {
+impl Destination {
     pub(super) fn table(file: File, series: &[Series], columns: Columns) -> io::Result<Self> {
-        Ok(Self::Table(Table {
+        Ok(Self::Table(TableFile {
             writer: TableWriter::new(BufWriter::new(file), series, columns)?,
             series: series.len(),
             others: 0,
@@ -96,7 +96,7 @@ impl Output {
     }
 
     pub(super) fn recording(file: File, about: About, series: &[Series]) -> anyhow::Result<Self> {
-        Ok(Self::Recording(Box::new(Recording {
+        Ok(Self::Recording(Box::new(RecordingFile {
             recorder: Recorder::new(BufWriter::new(file), &about, series)?,
             about,
             split: None,
@@ -182,7 +182,7 @@ impl Output {
     }
 }
 
-impl Recording {
+impl RecordingFile {
     fn push(&mut self, t: Nanos, heard: &Heard, series: &[Series]) -> io::Result<()> {
         self.recorder.know(series).map_err(io::Error::other)?;
         self.recorder.say(t, heard).map_err(io::Error::other)?;

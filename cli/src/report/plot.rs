@@ -54,7 +54,7 @@ pub(crate) enum Shape {
 
 /// One series of a plot.
 #[derive(Debug, Clone)]
-pub(crate) struct Series {
+pub(crate) struct Trace {
     /// Its name in the legend; series without a name are not listed.
     pub(crate) name: String,
     /// Its colour.
@@ -63,7 +63,7 @@ pub(crate) struct Series {
     pub(crate) shape: Shape,
 }
 
-impl Series {
+impl Trace {
     pub(crate) fn line(name: &str, ink: Ink, points: Vec<(f64, f64)>) -> Self {
         Self {
             name: name.to_owned(),
@@ -110,7 +110,7 @@ impl Shade {
 
 /// The scale of an axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) enum Scale {
+pub(crate) enum AxisScale {
     #[default]
     Linear,
     /// Logarithmic; values that are not positive are not drawn.
@@ -119,16 +119,16 @@ pub(crate) enum Scale {
 
 /// One axis.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Axis {
+pub(crate) struct PlotAxis {
     /// Its label with the unit: `t [s]`.
     pub(crate) label: String,
     /// Its scale.
-    pub(crate) scale: Scale,
+    pub(crate) scale: AxisScale,
     /// Its range; `None`: from the data.
     pub(crate) range: Option<(f64, f64)>,
 }
 
-impl Axis {
+impl PlotAxis {
     pub(crate) fn new(label: &str) -> Self {
         Self {
             label: label.to_owned(),
@@ -138,7 +138,7 @@ impl Axis {
 
     pub(crate) fn log(label: &str) -> Self {
         Self {
-            scale: Scale::Log,
+            scale: AxisScale::Log,
             ..Self::new(label)
         }
     }
@@ -152,11 +152,11 @@ pub(crate) struct Plot {
     /// One sentence under the title; may be empty.
     pub(crate) note: String,
     /// The horizontal axis.
-    pub(crate) x: Axis,
+    pub(crate) x: PlotAxis,
     /// The vertical axis.
-    pub(crate) y: Axis,
+    pub(crate) y: PlotAxis,
     /// The series; the first is drawn at the bottom.
-    pub(crate) series: Vec<Series>,
+    pub(crate) series: Vec<Trace>,
     /// Vertical lines: position and label.
     pub(crate) marks: Vec<(f64, String)>,
     /// Stretches of x, shaded from top to bottom.
@@ -178,49 +178,61 @@ impl Plot {
             html.push_str("<p class=\"none\">No data.</p></figure>");
             return html;
         };
-        let mut listed = self.series.iter().filter(|s| !s.name.is_empty()).peekable();
-        if listed.peek().is_some() {
-            html.push_str("<ul class=\"legend\">");
-            for series in listed {
-                let _ = write!(
-                    html,
-                    "<li class=\"{}{}\">{}</li>",
-                    series.ink.class(),
-                    series.shape.class(),
-                    escape(&series.name)
-                );
-            }
-            for (shade, stretches) in &self.shades {
-                if !stretches.is_empty() {
-                    let (class, name) = shade.words();
-                    let _ = write!(html, "<li class=\"wide {class}\">{name}</li>");
-                }
-            }
-            html.push_str("</ul>");
-        }
+        html.push_str(&self.legend());
         let _ = write!(
             html,
-            "<div class=\"y-label\">{}</div><div class=\"plot\">",
-            y.label(&self.y.label)
+            "<div class=\"y-label\">{}</div><div class=\"plot\">{}{}</div><div \
+             class=\"x-label\">{}</div></figure>",
+            y.label(&self.y.label),
+            self.svg(&x, &y),
+            self.labels(&x, &y),
+            x.label(&self.x.label)
         );
-        let (x_ticks, y_ticks) = (x.ticks(TICKS), y.ticks(TICKS));
-        let _ = write!(
-            html,
+        html
+    }
+
+    /// The list of the series with a name, and of the shades; empty without a name.
+    fn legend(&self) -> String {
+        let mut html = String::new();
+        for series in self.series.iter().filter(|s| !s.name.is_empty()) {
+            let _ = write!(
+                html,
+                "<li class=\"{}{}\">{}</li>",
+                series.ink.class(),
+                series.shape.class(),
+                escape(&series.name)
+            );
+        }
+        if html.is_empty() {
+            return html;
+        }
+        for (shade, stretches) in &self.shades {
+            if !stretches.is_empty() {
+                let (class, name) = shade.words();
+                let _ = write!(html, "<li class=\"wide {class}\">{name}</li>");
+            }
+        }
+        format!("<ul class=\"legend\">{html}</ul>")
+    }
+
+    /// The drawing: grid, shades, series, marks.
+    fn svg(&self, x: &Range, y: &Range) -> String {
+        let mut svg = format!(
             "<svg viewBox=\"0 0 {WIDE} {HIGH}\" preserveAspectRatio=\"none\" role=\"img\" \
              aria-label=\"{}\">",
             escape(&self.title)
         );
         let mut grid = String::new();
-        for tick in &x_ticks {
-            let _ = write!(grid, "M{:.0} 0V{HIGH}", x.at(tick.0) * WIDE);
+        for (value, _) in x.ticks(TICKS) {
+            let _ = write!(grid, "M{:.0} 0V{HIGH}", x.at(value) * WIDE);
         }
-        for tick in &y_ticks {
-            let _ = write!(grid, "M0 {:.0}H{WIDE}", (1.0 - y.at(tick.0)) * HIGH);
+        for (value, _) in y.ticks(TICKS) {
+            let _ = write!(grid, "M0 {:.0}H{WIDE}", (1.0 - y.at(value)) * HIGH);
         }
-        let _ = write!(html, "<path class=\"grid\" d=\"{grid}\"/>");
-        if y.from < 0.0 && y.to > 0.0 && y.scale == Scale::Linear {
+        let _ = write!(svg, "<path class=\"grid\" d=\"{grid}\"/>");
+        if y.from < 0.0 && y.to > 0.0 && y.scale == AxisScale::Linear {
             let _ = write!(
-                html,
+                svg,
                 "<path class=\"axis\" d=\"M0 {:.0}H{WIDE}\"/>",
                 (1.0 - y.at(0.0)) * HIGH
             );
@@ -236,38 +248,41 @@ impl Plot {
                 );
             }
             if !path.is_empty() {
-                let _ = write!(
-                    html,
-                    "<path class=\"shade {}\" d=\"{path}\"/>",
-                    shade.words().0
-                );
+                let class = shade.words().0;
+                let _ = write!(svg, "<path class=\"shade {class}\" d=\"{path}\"/>");
             }
         }
         for series in &self.series {
-            self.draw(series, &x, &y, &mut html);
+            self.draw(series, x, y, &mut svg);
         }
         for (at, _) in &self.marks {
             if (x.from..=x.to).contains(at) {
                 let _ = write!(
-                    html,
+                    svg,
                     "<path class=\"mark\" d=\"M{:.0} 0V{HIGH}\"/>",
                     x.at(*at) * WIDE
                 );
             }
         }
-        html.push_str("</svg>");
-        for (value, text) in &y_ticks {
+        svg.push_str("</svg>");
+        svg
+    }
+
+    /// The texts over the drawing: of ticks and marks.
+    fn labels(&self, x: &Range, y: &Range) -> String {
+        let mut html = String::new();
+        for (value, text) in y.ticks(TICKS) {
             let _ = write!(
                 html,
                 "<span class=\"y\" style=\"top:{:.1}%\">{text}</span>",
-                (1.0 - y.at(*value)) * 100.0
+                (1.0 - y.at(value)) * 100.0
             );
         }
-        for (value, text) in &x_ticks {
+        for (value, text) in x.ticks(TICKS) {
             let _ = write!(
                 html,
                 "<span class=\"x\" style=\"left:{:.1}%\">{text}</span>",
-                x.at(*value) * 100.0
+                x.at(value) * 100.0
             );
         }
         for (at, text) in &self.marks {
@@ -288,11 +303,6 @@ impl Plot {
                 escape(text)
             );
         }
-        let _ = write!(
-            html,
-            "</div><div class=\"x-label\">{}</div></figure>",
-            x.label(&self.x.label)
-        );
         html
     }
 
@@ -333,15 +343,16 @@ impl Plot {
         Some((x.range(&self.x, 0.0)?, y.range(&self.y, 0.06)?))
     }
 
-    fn draw(&self, series: &Series, x: &Range, y: &Range, html: &mut String) {
+    fn draw(&self, series: &Trace, x: &Range, y: &Range, html: &mut String) {
         let class = series.ink.class();
         let place = |px: f64, py: f64| (x.at(px) * WIDE, (1.0 - y.at(py)) * HIGH);
         match &series.shape {
             Shape::Line(points) => {
                 let points = thin(points, if self.most == 0 { 1000 } else { self.most });
-                let mut path = Path::default();
+                let mut path = SvgPath::default();
                 for (px, py) in points {
-                    if py.is_finite() && px.is_finite() && !(y.scale == Scale::Log && py <= 0.0) {
+                    if py.is_finite() && px.is_finite() && !(y.scale == AxisScale::Log && py <= 0.0)
+                    {
                         path.to(place(px, py));
                     } else {
                         path.lift();
@@ -359,7 +370,7 @@ impl Plot {
                     })
                     .max(1);
                 let points: Vec<_> = points.iter().step_by(step).collect();
-                let mut path = Path::default();
+                let mut path = SvgPath::default();
                 for run in points.split(|(_, low, high)| !low.is_finite() || !high.is_finite()) {
                     path.lift();
                     run.iter()
@@ -376,7 +387,10 @@ impl Plot {
             Shape::Dots(points) => {
                 let (mut bars, mut dots) = (String::new(), String::new());
                 for &(px, py, low, high) in points {
-                    if !px.is_finite() || !py.is_finite() || (y.scale == Scale::Log && py <= 0.0) {
+                    if !px.is_finite()
+                        || !py.is_finite()
+                        || (y.scale == AxisScale::Log && py <= 0.0)
+                    {
                         continue;
                     }
                     let (cx, cy) = place(px, py);
@@ -454,12 +468,12 @@ fn thin(points: &[(f64, f64)], most: usize) -> Vec<(f64, f64)> {
 
 /// SVG path data in whole numbers: the first point of a run is absolute, the others relative.
 #[derive(Default)]
-struct Path {
+struct SvgPath {
     text: String,
     last: Option<(i64, i64)>,
 }
 
-impl Path {
+impl SvgPath {
     fn to(&mut self, (x, y): (f64, f64)) {
         // Clamp points far outside; the plot clips them.
         let next = (
@@ -489,18 +503,18 @@ impl Default for Extent {
 }
 
 impl Extent {
-    fn see(&mut self, value: f64, scale: Scale) {
-        if value.is_finite() && (scale == Scale::Linear || value > 0.0) {
+    fn see(&mut self, value: f64, scale: AxisScale) {
+        if value.is_finite() && (scale == AxisScale::Linear || value > 0.0) {
             *self = Self(self.0.min(value), self.1.max(value));
         }
     }
 
     /// The axis' range, extended by the fraction `margin` at both ends.
-    fn range(&self, axis: &Axis, margin: f64) -> Option<Range> {
+    fn range(&self, axis: &PlotAxis, margin: f64) -> Option<Range> {
         let (from, to) = match axis.range {
             Some(range) => range,
             None if self.0 > self.1 => return None,
-            None if axis.scale == Scale::Log => (
+            None if axis.scale == AxisScale::Log => (
                 (self.0.log10() - 0.1).floor(),
                 (self.1.log10() + 0.1).ceil(),
             ),
@@ -526,13 +540,13 @@ impl Extent {
 struct Range {
     from: f64,
     to: f64,
-    scale: Scale,
+    scale: AxisScale,
 }
 
 impl Range {
     /// The position of `value`: 0 at the start, 1 at the end.
     fn at(&self, value: f64) -> f64 {
-        let value = if self.scale == Scale::Log {
+        let value = if self.scale == AxisScale::Log {
             value.log10()
         } else {
             value
@@ -542,7 +556,7 @@ impl Range {
 
     /// About `count` round tick values with their texts.
     fn ticks(&self, count: usize) -> Vec<(f64, String)> {
-        if self.scale == Scale::Log {
+        if self.scale == AxisScale::Log {
             let step = ((self.to - self.from) / count as f64).ceil().max(1.0) as i64;
             let (first, last) = (self.from.ceil() as i64, self.to.floor() as i64);
             return (first..=last)
@@ -589,7 +603,7 @@ impl Range {
     /// The common power of ten of all tick texts: 0 unless the texts would be long.
     fn power(&self) -> i32 {
         let largest = self.from.abs().max(self.to.abs());
-        if self.scale == Scale::Log || (self.step(TICKS) >= 1e-3 && largest < 1e5) {
+        if self.scale == AxisScale::Log || (self.step(TICKS) >= 1e-3 && largest < 1e5) {
             0
         } else {
             largest.log10().floor() as i32
@@ -612,9 +626,9 @@ mod tests {
     fn line(points: Vec<(f64, f64)>) -> Plot {
         Plot {
             title: "a < b".into(),
-            x: Axis::new("t [s]"),
-            y: Axis::new("Nm"),
-            series: vec![Series::line("s", Ink::Cad, points)],
+            x: PlotAxis::new("t [s]"),
+            y: PlotAxis::new("Nm"),
+            series: vec![Trace::line("s", Ink::Cad, points)],
             ..Plot::default()
         }
     }
@@ -656,14 +670,14 @@ mod tests {
         let range = Range {
             from: -0.013,
             to: 0.027,
-            scale: Scale::Linear,
+            scale: AxisScale::Linear,
         };
         let texts: Vec<String> = range.ticks(5).into_iter().map(|t| t.1).collect();
         assert_eq!(texts, ["−0.01", "0", "0.01", "0.02"]);
         let range = Range {
             from: -7.0,
             to: 2.0,
-            scale: Scale::Log,
+            scale: AxisScale::Log,
         };
         let texts: Vec<String> = range.ticks(5).into_iter().map(|t| t.1).collect();
         assert_eq!(
@@ -682,7 +696,7 @@ mod tests {
                 let ticks = Range {
                     from: 0.0,
                     to,
-                    scale: Scale::Linear,
+                    scale: AxisScale::Linear,
                 }
                 .ticks(5);
                 assert!((3..=7).contains(&ticks.len()), "{to}: {ticks:?}");

@@ -1,7 +1,7 @@
 //! Reads a robot's shared memory, in a thread of its own: opening something there may take seconds,
 //! and the screen must not wait for it.
 
-use super::snapshot::Snapshot;
+use super::snapshot::RobotState;
 use proprio_bridge::{next, open};
 use proprio_topics::ipc::{Domain, DomainConfig, PortError, Reader, Topic, Watch, monotonic};
 use proprio_topics::{
@@ -20,15 +20,15 @@ const SHOW: Nanos = Nanos::from_millis(100);
 const LOOK: Nanos = Nanos::from_millis(500);
 
 /// A topic, as soon as somebody publishes it.
-struct Feed<T: Topic>(Option<Reader<T>>);
+struct TopicFeed<T: Topic>(Option<Reader<T>>);
 
-impl<T: Topic> Default for Feed<T> {
+impl<T: Topic> Default for TopicFeed<T> {
     fn default() -> Self {
         Self(None)
     }
 }
 
-impl<T: Topic> Feed<T> {
+impl<T: Topic> TopicFeed<T> {
     fn open(&mut self, domain: &Domain, robot: &str, trouble: &mut String) {
         if self.0.is_some() {
             return;
@@ -56,11 +56,11 @@ impl<T: Topic> Feed<T> {
 struct Feeds {
     gateway: Watch<GatewayHealth>,
     estimator: Watch<EstimatorHealth>,
-    names: Feed<Description>,
-    samples: Feed<Sample>,
-    torques: Feed<TorqueEstimate>,
-    contacts: Feed<ContactEstimate>,
-    inertia: Feed<InertiaEstimate>,
+    names: TopicFeed<Description>,
+    samples: TopicFeed<Sample>,
+    torques: TopicFeed<TorqueEstimate>,
+    contacts: TopicFeed<ContactEstimate>,
+    inertia: TopicFeed<InertiaEstimate>,
 }
 
 struct Follower<'a> {
@@ -68,7 +68,7 @@ struct Follower<'a> {
     wanted: Option<String>,
     domain: Option<Domain>,
     feeds: Feeds,
-    snapshot: Snapshot,
+    snapshot: RobotState,
 }
 
 impl Follower<'_> {
@@ -76,7 +76,7 @@ impl Follower<'_> {
     fn look(&mut self) {
         if self.domain.as_ref().is_some_and(|it| !it.is_intact()) {
             // Gateway and estimator make a damaged domain again.
-            (self.feeds, self.snapshot) = (Feeds::default(), Snapshot::default());
+            (self.feeds, self.snapshot) = (Feeds::default(), RobotState::default());
             self.domain = None;
         }
         if self.domain.is_none() {
@@ -89,7 +89,7 @@ impl Follower<'_> {
         let robots: Vec<String> = domain.robot_names().into_iter().collect();
         let robot = self.wanted.clone().or_else(|| robots.first().cloned());
         if robot != self.snapshot.robot {
-            (self.feeds, self.snapshot) = (Feeds::default(), Snapshot::default());
+            (self.feeds, self.snapshot) = (Feeds::default(), RobotState::default());
         }
         let trouble = &mut self.snapshot.trouble;
         trouble.clear();
@@ -130,7 +130,7 @@ impl Follower<'_> {
 
     /// How the daemons are.
     fn watch(&mut self, now: Nanos) {
-        let Snapshot {
+        let RobotState {
             robot: Some(robot),
             gateway,
             estimator,
@@ -155,14 +155,14 @@ pub(super) fn follow(
     config: &DomainConfig,
     robot: Option<String>,
     wanted: &Receiver<String>,
-    out: &SyncSender<Snapshot>,
+    out: &SyncSender<RobotState>,
 ) {
     let mut follower = Follower {
         config,
         wanted: robot,
         domain: None,
         feeds: Feeds::default(),
-        snapshot: Snapshot::default(),
+        snapshot: RobotState::default(),
     };
     let (mut look, mut show) = (Nanos::MIN, Nanos::MIN);
     loop {

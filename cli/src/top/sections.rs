@@ -1,6 +1,6 @@
 //! What `proprio top` says of each part of a robot, as tables.
 
-use super::snapshot::Snapshot;
+use super::snapshot::RobotState;
 use crate::echo::{of_contacts, of_joints};
 use crate::status::{counts, load};
 use proprio_topics::ipc::{Presence, Unavailable};
@@ -18,20 +18,20 @@ const BAR: u16 = 21;
 
 /// One thing and what is said of it. The last cell may be longer than its column, and stand in an
 /// earlier one.
-pub(super) struct Row {
+pub(super) struct SectionRow {
     pub(super) name: String,
     pub(super) cells: Vec<Span<'static>>,
 }
 
 /// A part of the robot.
 #[derive(Default)]
-pub(super) struct Section {
+pub(super) struct TableSection {
     pub(super) title: &'static str,
     /// It at a glance.
     pub(super) summary: Span<'static>,
     /// The columns' names, between bars; `>`: on the right.
     pub(super) head: &'static str,
-    pub(super) rows: Vec<Row>,
+    pub(super) rows: Vec<SectionRow>,
 }
 
 pub(super) fn good() -> Style {
@@ -64,7 +64,7 @@ pub(super) fn duration(t: Nanos) -> String {
 }
 
 /// The parts of the robot, as they are at `now`.
-pub(super) fn of(snapshot: &Snapshot, now: Nanos) -> [Section; 6] {
+pub(super) fn of(snapshot: &RobotState, now: Nanos) -> [TableSection; 6] {
     [
         torques(snapshot, now),
         contacts(snapshot, now),
@@ -107,7 +107,7 @@ fn old(what: &str, presence: Presence, t: Nanos, now: Nanos) -> Option<Span<'sta
 }
 
 /// The same of an estimate.
-fn old_estimate(snapshot: &Snapshot, t: Nanos, now: Nanos) -> Option<Span<'static>> {
+fn old_estimate(snapshot: &RobotState, t: Nanos, now: Nanos) -> Option<Span<'static>> {
     old("the last estimate was", snapshot.estimator.0, t, now)
 }
 
@@ -127,8 +127,9 @@ fn bar(value: f64, deviation: f64, scale: f64) -> Span<'static> {
     Span::raw(cells.collect::<String>())
 }
 
-fn torques(snapshot: &Snapshot, now: Nanos) -> Section {
-    let mut section = Section::new("TORQUES", "joint|>torque [Nm]|>± 2σ|-peak     0     +peak");
+fn torques(snapshot: &RobotState, now: Nanos) -> TableSection {
+    let mut section =
+        TableSection::new("TORQUES", "joint|>torque [Nm]|>± 2σ|-peak     0     +peak");
     section.summary = Span::styled("no estimate yet", doubtful());
     let Some((torques, names)) = snapshot.torques() else {
         return section;
@@ -168,8 +169,8 @@ fn vector(values: [f64; 3], deviations: &[f64], digits: usize) -> [Span<'static>
     [values, format!("± {:.digits$}", 2.0 * largest)].map(Span::raw)
 }
 
-fn contacts(snapshot: &Snapshot, now: Nanos) -> Section {
-    let mut section = Section::new(
+fn contacts(snapshot: &RobotState, now: Nanos) -> TableSection {
+    let mut section = TableSection::new(
         "CONTACTS",
         "contact|is|>force x, y, z [N]|>± 2σ|>torque x, y, z [Nm]|>± 2σ|at [m]",
     );
@@ -211,8 +212,8 @@ fn contacts(snapshot: &Snapshot, now: Nanos) -> Section {
     section
 }
 
-fn channels(snapshot: &Snapshot, now: Nanos) -> Section {
-    let mut section = Section::new("CHANNELS", "channel|kind|>rate [Hz]|>age|quality");
+fn channels(snapshot: &RobotState, now: Nanos) -> TableSection {
+    let mut section = TableSection::new("CHANNELS", "channel|kind|>rate [Hz]|>age|quality");
     let names = snapshot.channel_names.as_deref();
     let newest = snapshot.gateway.1.as_deref();
     let mut alive = 0;
@@ -257,7 +258,7 @@ fn channels(snapshot: &Snapshot, now: Nanos) -> Section {
     section
 }
 
-impl Section {
+impl TableSection {
     fn new(title: &'static str, head: &'static str) -> Self {
         Self {
             title,
@@ -268,11 +269,11 @@ impl Section {
 
     fn push(&mut self, name: impl ToString, cells: Vec<Span<'static>>) {
         let name = name.to_string();
-        self.rows.push(Row { name, cells });
+        self.rows.push(SectionRow { name, cells });
     }
 
     /// With `summary`, unless what the gateway said last is old.
-    fn of_gateway(mut self, snapshot: &Snapshot, now: Nanos, summary: Span<'static>) -> Self {
+    fn of_gateway(mut self, snapshot: &RobotState, now: Nanos, summary: Span<'static>) -> Self {
         let said = snapshot.gateway.1.as_deref().map(|it| it.header.published);
         let old = said.and_then(|said| old("as of", snapshot.gateway.0, said, now));
         if old.is_some() {
@@ -284,8 +285,8 @@ impl Section {
     }
 }
 
-fn devices(snapshot: &Snapshot, now: Nanos) -> Section {
-    let mut section = Section::new("DEVICES", "device|bus|state|>rate [Hz]|notes, counters");
+fn devices(snapshot: &RobotState, now: Nanos) -> TableSection {
+    let mut section = TableSection::new("DEVICES", "device|bus|state|>rate [Hz]|notes, counters");
     let Some(health) = snapshot.gateway.1.as_deref() else {
         return section;
     };
@@ -326,8 +327,8 @@ fn devices(snapshot: &Snapshot, now: Nanos) -> Section {
     section.of_gateway(snapshot, now, summary)
 }
 
-fn buses(snapshot: &Snapshot, now: Nanos) -> Section {
-    let mut section = Section::new(
+fn buses(snapshot: &RobotState, now: Nanos) -> TableSection {
+    let mut section = TableSection::new(
         "BUSES",
         "bus|link|controller|load|>dropped|>error frames|>not sent",
     );
@@ -375,8 +376,8 @@ fn buses(snapshot: &Snapshot, now: Nanos) -> Section {
     section.of_gateway(snapshot, now, summary)
 }
 
-fn identification(snapshot: &Snapshot, now: Nanos) -> Section {
-    let mut section = Section::new(
+fn identification(snapshot: &RobotState, now: Nanos) -> TableSection {
+    let mut section = TableSection::new(
         "IDENTIFICATION",
         "link, sensor|mass, or offset known to|from motion of|",
     );

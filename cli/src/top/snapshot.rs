@@ -14,7 +14,7 @@ const FADE: f64 = 0.999;
 
 /// What a channel sent.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Channel {
+pub(super) struct ChannelRate {
     /// When the last sample was acquired.
     pub(super) last: Option<Nanos>,
     /// Samples per second, in the last complete window; and the flags of all of them.
@@ -27,7 +27,7 @@ pub(super) struct Channel {
 
 /// What is known of a robot.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Snapshot {
+pub(super) struct RobotState {
     /// When.
     pub(super) now: Nanos,
     /// All robots of the domain.
@@ -43,7 +43,7 @@ pub(super) struct Snapshot {
     pub(super) channel_names: Option<Arc<Description>>,
     pub(super) names: Option<Arc<Description>>,
     /// The channels, by their numbers.
-    pub(super) channels: Vec<Channel>,
+    pub(super) channels: Vec<ChannelRate>,
     /// Readings per second of each device.
     pub(super) readings: Vec<f64>,
     /// Estimates per second.
@@ -67,7 +67,7 @@ fn rate((a, before): (&Header, u64), (b, after): (&Header, u64)) -> f64 {
     }
 }
 
-impl Snapshot {
+impl RobotState {
     /// Names of a gateway or an estimator. After a restart they may be others: what was said with
     /// the old ones is forgotten.
     pub(super) fn describe(&mut self, names: Description) {
@@ -81,7 +81,7 @@ impl Snapshot {
         }
         *place = Some(Arc::new(names));
         match names.publisher == Publisher::Gateway {
-            true => self.channels = vec![Channel::default(); MAX_CHANNELS],
+            true => self.channels = vec![ChannelRate::default(); MAX_CHANNELS],
             false => self.scales.clear(),
         }
     }

@@ -1,7 +1,7 @@
 //! Tests of what is shown, with a screen in memory.
 
-use super::snapshot::Snapshot;
-use super::view::{View, Wish};
+use super::snapshot::RobotState;
+use super::view::{Screen, Wish};
 use proprio_topics::ipc::Presence;
 use proprio_topics::{
     ContactEstimate, ContactWrench, Controller, Counter, Description, DeviceState, Entry,
@@ -124,8 +124,8 @@ fn gateway(t: Nanos, readings: u64) -> GatewayHealth {
 }
 
 /// A robot after `ms` of motion, all of which works.
-fn robot(ms: i64) -> Snapshot {
-    let mut snapshot = Snapshot::default();
+fn robot(ms: i64) -> RobotState {
+    let mut snapshot = RobotState::default();
     snapshot.robots = vec!["left".into(), "right".into()];
     snapshot.robot = Some("left".into());
     snapshot.describe(names(
@@ -189,7 +189,7 @@ fn robot(ms: i64) -> Snapshot {
 }
 
 /// The lines on a screen.
-fn screen(view: &mut View, (width, height): (u16, u16), now: Nanos) -> Vec<String> {
+fn screen(view: &mut Screen, (width, height): (u16, u16), now: Nanos) -> Vec<String> {
     let mut terminal = Terminal::new(TestBackend::new(width, height)).expect("memory");
     terminal
         .draw(|frame| view.draw(frame, now))
@@ -201,13 +201,13 @@ fn screen(view: &mut View, (width, height): (u16, u16), now: Nanos) -> Vec<Strin
         .collect()
 }
 
-fn view_of(snapshot: Snapshot) -> View {
-    let mut view = View::new("test", snapshot.now);
+fn view_of(snapshot: RobotState) -> Screen {
+    let mut view = Screen::new("test", snapshot.now);
     view.show(snapshot);
     view
 }
 
-fn press(view: &mut View, codes: &[KeyCode]) -> Wish {
+fn press(view: &mut Screen, codes: &[KeyCode]) -> Wish {
     let mut last = Wish::Nothing;
     for code in codes {
         last = view.press((*code).into());
@@ -293,7 +293,7 @@ fn each_part_shows_its_values_or_why_not() {
 /// No value is shown that may no longer be true.
 #[test]
 fn what_is_gone_is_not_shown_as_if_it_were_there() {
-    let now = |snapshot: &mut Snapshot, ms| {
+    let now = |snapshot: &mut RobotState, ms| {
         snapshot.tick(after(ms));
         screen(&mut view_of(snapshot.clone()), WIDE, after(ms))
     };
@@ -345,7 +345,7 @@ fn what_is_gone_is_not_shown_as_if_it_were_there() {
 
 #[test]
 fn it_says_what_it_waits_for_and_that_shared_memory_does_not_answer() {
-    let mut snapshot = Snapshot::default();
+    let mut snapshot = RobotState::default();
     "waiting: nobody is there".clone_into(&mut snapshot.trouble);
     snapshot.tick(START);
     let mut view = view_of(snapshot);
@@ -369,7 +369,7 @@ fn it_says_what_it_waits_for_and_that_shared_memory_does_not_answer() {
 fn a_filter_shows_only_names_that_contain_it() {
     use KeyCode::{Backspace, Char, Enter, Esc};
     let mut view = view_of(robot(3000));
-    let shown = |view: &mut View| screen(view, WIDE, after(3000)).join("\n");
+    let shown = |view: &mut Screen| screen(view, WIDE, after(3000)).join("\n");
     assert_eq!(
         press(&mut view, &[Char('/'), Char('E'), Char('L'), Char('q')]),
         Wish::Nothing
@@ -429,7 +429,7 @@ fn a_pause_keeps_the_picture() {
 #[test]
 fn sections_are_reached_by_keys_and_robots_in_turn() {
     let mut view = view_of(robot(3000));
-    let top = |view: &mut View, codes: &[KeyCode]| {
+    let top = |view: &mut Screen, codes: &[KeyCode]| {
         press(view, codes);
         screen(view, (80, 12), after(3000))[3].clone()
     };
@@ -453,7 +453,7 @@ fn sections_are_reached_by_keys_and_robots_in_turn() {
 
 #[test]
 fn any_size_is_drawn() {
-    for snapshot in [Snapshot::default(), robot(3000)] {
+    for snapshot in [RobotState::default(), robot(3000)] {
         let mut view = view_of(snapshot);
         for (width, height) in (0..70).flat_map(|w| (0..25).map(move |h| (2 * w, 2 * h))) {
             let scroll = KeyCode::PageDown;

@@ -1,7 +1,7 @@
-//! The screen of `proprio top`: what is shown of a [`Snapshot`], and what keys do.
+//! The screen of `proprio top`: what is shown of a [`RobotState`], and what keys do.
 
-use super::sections::{self, Row, SILENCE, Section, doubtful, duration, presence};
-use super::snapshot::Snapshot;
+use super::sections::{self, SILENCE, SectionRow, TableSection, doubtful, duration, presence};
+use super::snapshot::RobotState;
 use proprio_topics::Nanos;
 use proprio_topics::ipc::Presence;
 use ratatui::Frame;
@@ -24,9 +24,9 @@ pub(super) enum Wish {
 
 /// The screen.
 #[derive(Default)]
-pub(super) struct View {
+pub(super) struct Screen {
     domain: String,
-    snapshot: Snapshot,
+    snapshot: RobotState,
     is_paused: bool,
     filter: String,
     is_typing: bool,
@@ -38,7 +38,7 @@ pub(super) struct View {
     starts: Vec<usize>,
 }
 
-impl View {
+impl Screen {
     /// Of what is in this domain; at first it knows nothing.
     pub(super) fn new(domain: &str, now: Nanos) -> Self {
         let mut view = Self::default();
@@ -48,7 +48,7 @@ impl View {
     }
 
     /// Shows this, unless paused.
-    pub(super) fn show(&mut self, snapshot: Snapshot) {
+    pub(super) fn show(&mut self, snapshot: RobotState) {
         if !self.is_paused {
             self.snapshot = snapshot;
         }
@@ -224,7 +224,7 @@ impl View {
 }
 
 /// A section's lines: its title, the columns' names, its rows.
-fn table(section: Section, width: usize) -> Vec<Line<'static>> {
+fn table(section: TableSection, width: usize) -> Vec<Line<'static>> {
     let title = vec![section.title.bold(), "  ".into(), section.summary];
     let mut lines = vec![Line::from(title)];
     if section.rows.is_empty() {
@@ -239,7 +239,7 @@ fn table(section: Section, width: usize) -> Vec<Line<'static>> {
     let head: Vec<&str> = section.head.split('|').collect();
     let names = head.iter().map(|name| name.trim_start_matches('>').dim());
     let mut all: Vec<Vec<Span<'_>>> = vec![names.collect()];
-    for Row { name, cells } in section.rows {
+    for SectionRow { name, cells } in section.rows {
         let name = Span::raw(shorten(name));
         all.push(std::iter::once(name).chain(cells).collect());
     }

@@ -1,10 +1,10 @@
 //! What a running system says of a torque: its budget, and the state of boards and buses.
 
-use super::story::{Channel, Known, Part, System, opinion};
+use super::story::{ChannelState, HardwareState, System, TorqueCase, opinion};
+use crate::names::find;
 use crate::status::newest;
-use anyhow::{anyhow, bail};
+use anyhow::anyhow;
 use proprio_bridge::{DescriptionReader, Level, bus_state, device_state, next, one_robot, open};
-use proprio_estimator::setup::nearest;
 use proprio_topics::ipc::{Domain, DomainConfig, PortError, Presence, Reader, monotonic};
 use proprio_topics::{
     Description, DriveEstimate, EstimatorHealth, GatewayHealth, Nanos, Publisher, Reason, Role,
@@ -23,7 +23,7 @@ pub(super) fn know(
     config: &DomainConfig,
     robot: Option<&str>,
     joint: &str,
-) -> anyhow::Result<Known> {
+) -> anyhow::Result<TorqueCase> {
     let domain = open(config)?;
     let robot = one_robot(&domain, robot)?;
     // The estimator computes budgets while somebody reads them: from now on.
@@ -39,7 +39,12 @@ pub(super) fn know(
     let names = DescriptionReader::by(&domain, &robot, Publisher::Estimator)?;
     let names = names.map(|described| *described.newest());
     let number = match &names {
-        Some(names) => Some(number(names, joint)?),
+        Some(names) => {
+            let entries = || names.entries().iter().filter(|own| own.role == Role::Joint);
+            let joints = || entries().map(|own| (own.name.as_str(), own.index));
+            let number = find(joint, joints);
+            Some(number.map_err(|hint| anyhow!("the estimator has no joint {joint:?}{hint}"))?)
+        }
         None => None,
     };
     let trouble = [
@@ -73,7 +78,7 @@ pub(super) fn know(
     let opinion = budget
         .as_ref()
         .and_then(|budget| opinion(opinions.as_ref()?, budget.joint, budget.unit()));
-    Ok(Known {
+    Ok(TorqueCase {
         joint: joint.to_owned(),
         opinion: opinion.unwrap_or_default(),
         budget,
@@ -84,18 +89,6 @@ pub(super) fn know(
             ..system(&domain, &robot, names.as_ref())?
         },
     })
-}
-
-/// The number of a joint.
-fn number(names: &Description, joint: &str) -> anyhow::Result<u32> {
-    names.index(Role::Joint, joint).map_or_else(
-        || {
-            let joints = names.entries().iter().filter(|own| own.role == Role::Joint);
-            let hint = nearest(joint, joints.map(|own| own.name.as_str()));
-            bail!("the estimator has no joint {joint:?}{hint}")
-        },
-        Ok,
-    )
 }
 
 /// The budget of a joint: the last one that tells of a withheld torque, else the last one; and what
@@ -164,7 +157,7 @@ fn system(domain: &Domain, robot: &str, read: Option<&Description>) -> anyhow::R
         bus.map_or("", |bus| bus.name.as_str()).to_owned()
     };
     let entries = names.newest().entries().iter();
-    let mut channels: Vec<Channel> = entries
+    let mut channels: Vec<ChannelState> = entries
         .filter(|entry| entry.role == Role::Channel)
         .map(|entry| {
             let newest = health.newest.get(entry.index as usize);
@@ -174,7 +167,7 @@ fn system(domain: &Domain, robot: &str, read: Option<&Description>) -> anyhow::R
                 age.seconds().max(0.0)
             });
             let most = entry.max_silence.seconds();
-            Channel {
+            ChannelState {
                 name: entry.name.as_str().to_owned(),
                 device: entry.origin.as_str().to_owned(),
                 bus: bus(entry.bus),
@@ -183,11 +176,11 @@ fn system(domain: &Domain, robot: &str, read: Option<&Description>) -> anyhow::R
             }
         })
         .collect();
-    let is_read = |channel: &Channel| {
+    let is_read = |channel: &ChannelState| {
         read.is_none_or(|read| read.index(Role::Channel, &channel.name).is_some())
     };
     channels.sort_by_key(|channel| !is_read(channel));
-    let part = |name: &str, bus: String, (level, state): (Level, String)| Part {
+    let part = |name: &str, bus: String, (level, state): (Level, String)| HardwareState {
         name: name.to_owned(),
         bus,
         state,

@@ -1,16 +1,17 @@
 //! What a log says of a torque: the estimator runs on it, up to the instant in question.
 
-use super::story::{Channel, Known, System, opinion};
+use super::story::{ChannelState, System, TorqueCase, opinion};
 use crate::convert::{Configured, input, unfit};
+use crate::names::find;
 use crate::samples;
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
 use proprio_estimator::offline::{OfflineError, follow};
 use proprio_estimator::pipeline::Pipeline;
-use proprio_estimator::setup::{Setup, nearest};
+use proprio_estimator::setup::Setup;
 use proprio_gateway::plan::Plan;
 use proprio_topics::{NO_CAUSE, Nanos, Reason};
 use std::ops::ControlFlow;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// A time for which a torque was valid, or was withheld for one reason.
 #[derive(Debug, Clone, PartialEq)]
@@ -41,116 +42,166 @@ impl Spell {
 }
 
 /// What is known of a log.
-pub(super) struct Found {
-    pub(super) known: Known,
+pub(super) struct LogCase {
+    pub(super) known: TorqueCase,
     /// The instant in question; none in a log without stamps.
     pub(super) t: Option<Nanos>,
     /// All times of the log, up to that instant if it was given.
     pub(super) spells: Vec<Spell>,
 }
 
+/// A log, and the estimator's configuration for it.
+struct Log<'a> {
+    file: &'a Path,
+    config: PathBuf,
+    joint: usize,
+}
+
+/// The estimator when it has followed a log.
+struct Followed {
+    pipeline: Pipeline,
+    /// The instant of the last estimate.
+    t: Nanos,
+    is_stamped: bool,
+    spells: Vec<Spell>,
+}
+
+impl Log<'_> {
+    /// Runs the estimator on the log, up to an instant if there is one.
+    fn follow(&self, setup: Setup, until: Option<Nanos>) -> anyhow::Result<Followed> {
+        let (mut spells, mut t, mut is_stamped) = (Vec::new(), Nanos::MIN, true);
+        let table = samples::table(input(self.file)?, self.file)?;
+        let followed = follow(setup, table, |pipeline, has_stamps| {
+            (t, is_stamped) = (pipeline.last_estimate().t, has_stamps);
+            tell(pipeline, self.joint, is_stamped, &mut spells);
+            Ok(match until.is_some_and(|until| t >= until) {
+                true => ControlFlow::Break(()),
+                false => ControlFlow::Continue(()),
+            })
+        });
+        match followed {
+            Ok((_, pipeline)) => Ok(Followed {
+                pipeline,
+                t,
+                is_stamped,
+                spells,
+            }),
+            Err(error @ OfflineError::MissingChannels(_)) => {
+                Err(unfit(&self.config, self.file, &error).into())
+            }
+            Err(error) => Err(error).with_context(|| self.file.display().to_string()),
+        }
+    }
+
+    /// Checks that the log is of the instant in question; it ends at `end`.
+    fn check(&self, at: Option<Nanos>, end: Nanos, followed: &Followed) -> anyhow::Result<()> {
+        let (Some(at), Some(first)) = (at, followed.spells.first()) else {
+            return Ok(());
+        };
+        let log = self.file.display();
+        if !followed.is_stamped {
+            bail!("{log}: it has no stamps, so --at says nothing");
+        }
+        let begin = first.begin;
+        if at > end || begin - at > followed.pipeline.setup().robot.max_silence {
+            bail!("--at {at}: {log} is from {begin} s to {end} s");
+        }
+        Ok(())
+    }
+}
+
+impl Followed {
+    /// Adds the time after the last estimate; returns the end of the log, if it has samples.
+    fn add_end(&mut self) -> Option<Nanos> {
+        let channels = 0..self.pipeline.setup().channels().count();
+        let newest = channels.filter_map(|channel| self.pipeline.newest(channel));
+        let end = newest.max()?;
+        let robot = &self.pipeline.setup().robot;
+        let begin = self.t.max(Nanos::ZERO);
+        if self.is_stamped && (self.t == Nanos::MIN || end - begin > robot.max_silence) {
+            let trigger = name_of(&self.pipeline, robot.trigger);
+            (self.spells).push(Spell::without_estimates(trigger, begin, end));
+        }
+        Some(end)
+    }
+}
+
 /// What is known of a joint's torque at an instant of a log; without one, late in the time that
 /// [`in_question`] chooses.
 pub(super) fn know(
     configured: Configured,
-    log: &Path,
+    file: &Path,
     joint: &str,
     at: Option<Nanos>,
-) -> anyhow::Result<Found> {
+) -> anyhow::Result<LogCase> {
     let Configured {
         config,
         setup,
         folder,
     } = configured;
-    let Some(number) = setup.robot.joint_names().position(|own| own == joint) else {
-        let hint = nearest(joint, setup.robot.joint_names());
-        bail!("{}: there is no joint {joint:?}{hint}", config.display());
+    let number = find(joint, || setup.robot.joint_names().zip(0..));
+    let number = number
+        .map_err(|hint| anyhow!("{}: there is no joint {joint:?}{hint}", config.display()))?;
+    let log = Log {
+        file,
+        config,
+        joint: number,
     };
-    let identifies = setup.identifies;
-    let run = |setup: Setup, until: Option<Nanos>| {
-        let (mut spells, mut last, mut has_stamps) = (Vec::new(), Nanos::MIN, true);
-        let followed = follow(
-            setup,
-            samples::table(input(log)?, log)?,
-            |pipeline, is_stamped| {
-                (last, has_stamps) = (pipeline.last_estimate().t, is_stamped);
-                tell(pipeline, number, is_stamped, &mut spells);
-                Ok(match until.is_some_and(|until| last >= until) {
-                    true => ControlFlow::Break(()),
-                    false => ControlFlow::Continue(()),
-                })
-            },
-        );
-        match followed {
-            Ok((_, pipeline)) => Ok((pipeline, last, has_stamps, spells)),
-            Err(error @ OfflineError::MissingChannels(_)) => {
-                Err(unfit(&config, log, &error).into())
-            }
-            Err(error) => Err(error).with_context(|| log.display().to_string()),
-        }
+    let mut followed = log.follow(setup.clone(), at)?;
+    let Some(end) = followed.add_end() else {
+        bail!("{}: there are no samples", file.display());
     };
-    let (mut pipeline, mut t, is_stamped, mut spells) = run(setup.clone(), at)?;
-    // What came after the last estimate.
-    let channels = 0..pipeline.setup().channels().count();
-    let newest = channels
-        .filter_map(|channel| pipeline.newest(channel))
-        .max();
-    let trigger = || name_of(&pipeline, pipeline.setup().robot.trigger);
-    let Some(end) = newest else {
-        bail!("{}: there are no samples", log.display());
-    };
-    let (begin, most) = (t.max(Nanos::ZERO), pipeline.setup().robot.max_silence);
-    if is_stamped && (t == Nanos::MIN || end - begin > most) {
-        spells.push(Spell::without_estimates(trigger(), begin, end));
-    }
-    if let (Some(at), Some(first)) = (at, spells.first()) {
-        if !is_stamped {
-            bail!("{}: it has no stamps, so --at says nothing", log.display());
-        }
-        if at > end || first.begin - at > most {
-            let (begin, end) = (first.begin, end);
-            bail!("--at {at}: {} is from {begin} s to {end} s", log.display());
-        }
-    }
+    log.check(at, end, &followed)?;
     let chosen = match at {
-        None => in_question(&spells),
+        None => in_question(&followed.spells),
         // Without an estimate there, the time without estimates is in question.
-        Some(at) => spells
-            .iter()
+        Some(at) => (followed.spells.iter())
             .find(|spell| spell.is_gap && spell.end >= at && spell.begin < at),
     };
-    if let Some(spell) = chosen.filter(|spell| at.is_none() && spell.looked_at() < t) {
-        (pipeline, t, ..) = run(setup, Some(spell.looked_at()))?;
+    let chosen = chosen.cloned();
+    let identifies = setup.identifies;
+    if let Some(spell) = chosen.as_ref()
+        && at.is_none()
+        && spell.looked_at() < followed.t
+    {
+        let again = log.follow(setup, Some(spell.looked_at()))?;
+        (followed.pipeline, followed.t) = (again.pipeline, again.t);
     }
+    let Followed {
+        mut pipeline,
+        t,
+        is_stamped,
+        spells,
+    } = followed;
     let gap = chosen.filter(|spell| spell.is_gap);
-    t = gap.map_or(t, Spell::looked_at);
+    let t = gap.as_ref().map_or(t, Spell::looked_at);
     let gateway = folder.as_ref();
     let gateway = gateway.map(|folder| folder.path().join("gateway.toml"));
     let plan = gateway.filter(|file| file.is_file());
     let plan = plan.map(|file| Plan::load(&file));
     let system = system(&pipeline, plan.and_then(Result::ok).as_ref(), t);
-    let (budget, cause) = match gap {
-        Some(gap) => (None, gap.cause.clone()),
-        None => {
-            let budget = pipeline.budget(number).copied();
-            let number = budget.map_or(NO_CAUSE, |budget| budget.torque.cause);
-            (budget, cause(&pipeline, number))
-        }
+    let budget = match gap {
+        Some(_) => None,
+        None => pipeline.budget(number).copied(),
     };
-    let known = Known {
+    let said = pipeline.drives().zip(budget);
+    let said = said.and_then(|(drives, budget)| opinion(drives, budget.joint, budget.unit()));
+    let cause = match gap {
+        Some(gap) => gap.cause,
+        None => cause(
+            &pipeline,
+            budget.map_or(NO_CAUSE, |budget| budget.torque.cause),
+        ),
+    };
+    let known = TorqueCase {
         joint: joint.to_owned(),
-        opinion: match (gap, pipeline.drives(), budget) {
-            (None, Some(drives), Some(budget)) => {
-                opinion(drives, budget.joint, budget.unit()).unwrap_or_default()
-            }
-            _ => String::new(),
-        },
+        opinion: said.unwrap_or_default(),
         budget,
         cause,
         system,
         identifies,
     };
-    Ok(Found {
+    Ok(LogCase {
         known,
         t: is_stamped.then_some(t),
         spells: if is_stamped { spells } else { Vec::new() },
@@ -236,7 +287,7 @@ fn system(pipeline: &Pipeline, plan: Option<&Plan>, t: Nanos) -> System {
             Some((bus.devices.get(own.device)?.name.clone(), bus.name.clone()))
         });
         let (device, bus) = planned.unwrap_or_default();
-        Channel {
+        ChannelState {
             name: name.to_owned(),
             device,
             bus,

@@ -9,7 +9,7 @@ use std::collections::BTreeSet;
 
 /// A channel of the system.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(super) struct Channel {
+pub(super) struct ChannelState {
     pub(super) name: String,
     /// Its board, and the bus of that; empty if they are not known.
     pub(super) device: String,
@@ -22,7 +22,7 @@ pub(super) struct Channel {
 
 /// A board, or a bus.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Part {
+pub(super) struct HardwareState {
     pub(super) name: String,
     /// The bus of a board.
     pub(super) bus: String,
@@ -37,14 +37,14 @@ pub(super) struct Part {
 pub(super) struct System {
     /// What is wrong with gateway or estimator.
     pub(super) trouble: Option<String>,
-    pub(super) channels: Vec<Channel>,
-    pub(super) devices: Vec<Part>,
-    pub(super) buses: Vec<Part>,
+    pub(super) channels: Vec<ChannelState>,
+    pub(super) devices: Vec<HardwareState>,
+    pub(super) buses: Vec<HardwareState>,
 }
 
 /// What is known of a torque.
 #[derive(Debug, Clone)]
-pub(super) struct Known {
+pub(super) struct TorqueCase {
     pub(super) joint: String,
     /// None if there is no estimate.
     pub(super) budget: Option<TorqueBudget>,
@@ -70,7 +70,7 @@ pub(super) struct Story {
 
 /// A part of a budget, as it is shown.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Share {
+pub(super) struct VarianceShare {
     pub(super) name: String,
     pub(super) variance: f64,
     /// What it is, or the first of several.
@@ -118,11 +118,15 @@ const RESTART: &str = "its log tells more (journalctl -u proprio-gateway -u prop
                        start it, or, if it is stopped or stuck, let it go on (kill -CONT) or \
                        restart it";
 
+/// What to do if a whole bus is silent.
+const CHECK_BUS: &str = "check its interface (ip -details link show), cable, power of the boards, \
+                         termination and bit rate";
+
 /// A joint that has moved through less of its range since the estimator's start shows little of
 /// what it moves.
 const UNMOVED: f64 = 0.05;
 
-impl Known {
+impl TorqueCase {
     pub(super) fn story(&self) -> Story {
         let Self { joint, budget, .. } = self;
         let Some(budget) = budget else {
@@ -156,7 +160,7 @@ impl Known {
         story
     }
 
-    /// Why a torque is withheld.
+    /// Why a torque is withheld: a table of what is said of each reason, long as it is.
     fn withheld(&self, budget: &TorqueBudget, reason: Reason) -> Story {
         let channel = self.cause.as_deref().unwrap_or("a channel");
         let (likelier, residual) = (budget.likelier.as_str(), budget.unexplained.as_str());
@@ -268,81 +272,48 @@ impl Known {
             .filter(|part| part.source == Source::Position && part.travel < UNMOVED)
             .map(|part| part.name.as_str())
             .collect();
-        let still = match unmoved.as_slice() {
-            [] => Vec::new(),
-            all => vec![format!(
-                "hardly moved since the estimator's start: {}",
-                list(all)
-            )],
-        };
-        let moving = |unmoved: &[&str]| match unmoved {
-            _ if !self.identifies => "identify the robot: `proprio identify` on a log of motion, \
-                                      or [identification] enabled = true"
-                .to_owned(),
-            [] => "move all joints that it rests on for some seconds, without a contact".to_owned(),
-            all => format!("move {}, without a contact", list(all)),
-        };
         if let Some(channel) = &self.cause {
             return Story {
                 head: format!("the zero of {channel} is a new one, so that its offset is unknown"),
                 because: vec!["its board was restarted or tared".to_owned()],
-                advice: moving(&unmoved),
+                advice: self.moving(&unmoved),
             };
         }
         if budget.deviation.is_infinite() {
+            let unmoved_too = match unmoved.as_slice() {
+                [] => String::new(),
+                all => format!(": {} hardly moved", list_has(all)),
+            };
             return Story {
-                head: match unmoved.as_slice() {
-                    [] => "it is not known yet whether the setup is as configured".to_owned(),
-                    all => format!(
-                        "it is not known yet whether the setup is as configured: {} hardly moved",
-                        list_has(all)
-                    ),
-                },
+                head: format!(
+                    "it is not known yet whether the setup is as configured{unmoved_too}"
+                ),
                 because: vec![
                     "identification compares the configured setup with others, such as a reversed \
                      encoder or a turned sensor; that takes some seconds of motion"
                         .to_owned(),
                 ],
-                advice: moving(&unmoved),
+                advice: self.moving(&unmoved),
             };
         }
         let largest = shares(budget).into_iter().next();
-        let advice = match largest.as_ref().map(|share| share.source) {
-            Some(Source::Offset | Source::Drift) if self.identifies => moving(&unmoved),
-            Some(Source::Offset | Source::Drift) => {
-                "let the estimator identify the offset ([identification] enabled = true) and move \
-                 the robot without a contact; or state it (offset_n, offset_nm), or tare"
-                    .to_owned()
-            }
-            Some(Source::Link | Source::Gain | Source::Alternative | Source::Step) => {
-                moving(&unmoved)
-            }
-            Some(Source::Acceleration | Source::Position | Source::Rotation) => {
-                "move more slowly; or give the channel more samples, or an encoder with finer \
-                 steps"
-                    .to_owned()
-            }
-            Some(Source::Base) => {
-                "level the base, or calibrate its IMU; or raise the bound".to_owned()
-            }
-            Some(Source::Place) => {
-                "declare the contact's place better, or give it a skin; or raise the bound"
-                    .to_owned()
-            }
-            _ => "if so large a deviation does no harm, raise the bound".to_owned(),
-        };
-        let part = largest.map_or(String::new(), |own| {
+        let advice = self.lessening(largest.as_ref().map(|share| share.source), &unmoved);
+        let mut part = largest.map_or(String::new(), |own| {
             format!(
                 "; {:.0} % of the variance is {}",
                 percent(&own, budget),
                 own.name
             )
         });
-        let part = match unmoved.as_slice() {
-            all @ [_, ..] if self.identifies => {
-                format!("{part}; {} hardly moved", list_has(all))
-            }
-            _ => part,
+        if !unmoved.is_empty() && self.identifies {
+            part += &format!("; {} hardly moved", list_has(&unmoved));
+        }
+        let still = match unmoved.is_empty() {
+            true => None,
+            false => Some(format!(
+                "hardly moved since the estimator's start: {}",
+                list(&unmoved)
+            )),
         };
         Story {
             head: format!(
@@ -352,13 +323,45 @@ impl Known {
                 digits(budget.bound),
                 unit = budget.unit()
             ),
-            because: still,
+            because: still.into_iter().collect(),
             advice,
         }
     }
-}
 
-impl Known {
+    /// What to move, so that identification learns; `unmoved` are the joints that hardly did.
+    fn moving(&self, unmoved: &[&str]) -> String {
+        match unmoved {
+            _ if !self.identifies => "identify the robot: `proprio identify` on a log of motion, \
+                                      or [identification] enabled = true"
+                .to_owned(),
+            [] => "move all joints that it rests on for some seconds, without a contact".to_owned(),
+            all => format!("move {}, without a contact", list(all)),
+        }
+    }
+
+    /// What lessens a variance of which most has this source.
+    fn lessening(&self, source: Option<Source>, unmoved: &[&str]) -> String {
+        let advice = match source {
+            Some(Source::Offset | Source::Drift) if self.identifies => return self.moving(unmoved),
+            Some(Source::Offset | Source::Drift) => {
+                "let the estimator identify the offset ([identification] enabled = true) and move \
+                 the robot without a contact; or state it (offset_n, offset_nm), or tare"
+            }
+            Some(Source::Link | Source::Gain | Source::Alternative | Source::Step) => {
+                return self.moving(unmoved);
+            }
+            Some(Source::Acceleration | Source::Position | Source::Rotation) => {
+                "move more slowly; or give the channel more samples, or an encoder with finer steps"
+            }
+            Some(Source::Base) => "level the base, or calibrate its IMU; or raise the bound",
+            Some(Source::Place) => {
+                "declare the contact's place better, or give it a skin; or raise the bound"
+            }
+            _ => "if so large a deviation does no harm, raise the bound",
+        };
+        advice.to_owned()
+    }
+
     /// Why a channel is silent.
     fn silent(&self, name: &str) -> Story {
         let system = &self.system;
@@ -386,62 +389,47 @@ impl Known {
                     .to_owned(),
             };
         }
-        let because = match own.device.is_empty() {
-            true => vec![since.clone()],
-            false => vec![since.clone(), own.comes_from()],
+        let mut because = vec![since.clone()];
+        if !own.device.is_empty() {
+            because.push(own.comes_from());
+        }
+        let story = |head: String, advice: &str| Story {
+            head,
+            because: because.clone(),
+            advice: advice.to_owned(),
         };
         if let Some(trouble) = &system.trouble {
-            return Story {
-                head: trouble.clone(),
-                because,
-                advice: RESTART.to_owned(),
-            };
+            return story(trouble.clone(), RESTART);
         }
         let bus = system.buses.iter().find(|bus| bus.name == own.bus);
         let on_bus = || system.channels.iter().filter(|other| other.bus == own.bus);
         let boards: BTreeSet<&str> = on_bus().map(|other| other.device.as_str()).collect();
         let all_silent = !own.bus.is_empty() && on_bus().all(|other| other.is_silent);
-        let bus_advice =
-            "check its interface (ip -details link show), cable, power of the boards, \
-                          termination and bit rate"
-                .to_owned();
         if let Some(bus) = bus.filter(|bus| bus.level == Level::Error) {
-            return Story {
-                head: format!("bus {} is {}", bus.name, bus.state),
-                because,
-                advice: bus_advice,
-            };
+            return story(format!("bus {} is {}", bus.name, bus.state), CHECK_BUS);
         }
         if all_silent && boards.len() > 1 {
-            return Story {
-                head: format!("all {} boards of bus {} are silent", boards.len(), own.bus),
-                because,
-                advice: bus_advice,
-            };
+            let head = format!("all {} boards of bus {} are silent", boards.len(), own.bus);
+            return story(head, CHECK_BUS);
         }
+        let advice = match boards.len() > 1 && !all_silent {
+            true => "check its power, cable and address; other boards of the bus are heard",
+            false => "check its power, cable and address",
+        };
         let device = system.device(own);
-        let (head, because) = match device.filter(|device| device.level == Level::Error) {
-            Some(device) => (
-                format!(
-                    "board {} on bus {} is {}",
-                    device.name, own.bus, device.state
-                ),
-                because,
+        match device.filter(|device| device.level == Level::Error) {
+            Some(HardwareState { name, state, .. }) => story(
+                format!("board {name} on bus {} is {state}", own.bus),
+                advice,
             ),
-            None if own.device.is_empty() => (since, because[1..].to_vec()),
-            None => (
-                format!("board {} on bus {} is silent", own.device, own.bus),
-                because,
-            ),
-        };
-        let others = match boards.len() > 1 && !all_silent {
-            true => "; other boards of the bus are heard",
-            false => "",
-        };
-        Story {
-            head,
-            because,
-            advice: format!("check its power, cable and address{others}"),
+            None if own.device.is_empty() => Story {
+                because: Vec::new(),
+                ..story(since, advice)
+            },
+            None => {
+                let head = format!("board {} on bus {} is silent", own.device, own.bus);
+                story(head, advice)
+            }
         }
     }
 
@@ -477,17 +465,17 @@ impl Known {
 }
 
 impl System {
-    fn channel(&self, name: &str) -> Option<&Channel> {
+    fn channel(&self, name: &str) -> Option<&ChannelState> {
         self.channels.iter().find(|channel| channel.name == name)
     }
 
-    fn device(&self, channel: &Channel) -> Option<&Part> {
+    fn device(&self, channel: &ChannelState) -> Option<&HardwareState> {
         let mut devices = self.devices.iter();
         devices.find(|device| device.name == channel.device && device.bus == channel.bus)
     }
 
     /// What is not as it should be with a channel's board and bus.
-    fn conspicuous(&self, channel: &Channel) -> impl Iterator<Item = String> {
+    fn conspicuous(&self, channel: &ChannelState) -> impl Iterator<Item = String> {
         let device = self.device(channel);
         let device = device.filter(|device| device.level != Level::Ok);
         let bus = self.buses.iter().find(|bus| bus.name == channel.bus);
@@ -498,7 +486,7 @@ impl System {
     }
 }
 
-impl Channel {
+impl ChannelState {
     fn comes_from(&self) -> String {
         format!(
             "{} comes from board {} on bus {}",
@@ -509,7 +497,7 @@ impl Channel {
 
 /// The parts of a budget, the largest first; without those of no or of infinite variance. Parts
 /// that were identified together, of which one cancels a part of another, are one.
-pub(super) fn shares(budget: &TorqueBudget) -> Vec<Share> {
+pub(super) fn shares(budget: &TorqueBudget) -> Vec<VarianceShare> {
     let matters = |part: &&BudgetPart| part.variance != 0.0 && part.variance.is_finite();
     let parts = budget.parts().iter().filter(matters);
     let mut all: Vec<(Vec<String>, f64, Source)> = parts
@@ -541,7 +529,7 @@ pub(super) fn shares(budget: &TorqueBudget) -> Vec<Share> {
         }
     }
     all.sort_by(|a, b| b.1.total_cmp(&a.1));
-    let together = |(names, variance, source): (Vec<String>, f64, Source)| Share {
+    let together = |(names, variance, source): (Vec<String>, f64, Source)| VarianceShare {
         name: match names.as_slice() {
             [one] => one.clone(),
             all => format!("{}, correlated", all.join(", ")),
@@ -553,7 +541,7 @@ pub(super) fn shares(budget: &TorqueBudget) -> Vec<Share> {
 }
 
 /// The share of the sum of all that are finite [%].
-pub(super) fn percent(share: &Share, budget: &TorqueBudget) -> f64 {
+pub(super) fn percent(share: &VarianceShare, budget: &TorqueBudget) -> f64 {
     let all = budget.parts().iter().map(|part| part.variance);
     let sum: f64 = all.filter(|variance| variance.is_finite()).sum();
     100.0 * share.variance / sum
@@ -623,8 +611,8 @@ mod tests {
         budget
     }
 
-    fn known(budget: Option<TorqueBudget>, cause: Option<&str>, system: System) -> Known {
-        Known {
+    fn known(budget: Option<TorqueBudget>, cause: Option<&str>, system: System) -> TorqueCase {
+        TorqueCase {
             joint: "elbow".to_owned(),
             opinion: String::new(),
             budget,
@@ -642,8 +630,8 @@ mod tests {
         budget
     }
 
-    fn channel(name: &str, device: &str, bus: &str, is_silent: bool) -> Channel {
-        Channel {
+    fn channel(name: &str, device: &str, bus: &str, is_silent: bool) -> ChannelState {
+        ChannelState {
             name: name.to_owned(),
             device: device.to_owned(),
             bus: bus.to_owned(),
@@ -680,7 +668,7 @@ mod tests {
     fn a_silent_channel_is_traced_to_what_is_silent_as_a_whole() {
         let one = channel("elbow", "motor_a", "can0", true);
         let other = |is_silent| channel("wrist", "motor_b", "can0", is_silent);
-        let part = |name: &str, bus: &str, state: &str| Part {
+        let part = |name: &str, bus: &str, state: &str| HardwareState {
             name: name.to_owned(),
             bus: bus.to_owned(),
             state: state.to_owned(),

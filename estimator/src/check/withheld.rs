@@ -163,11 +163,17 @@ fn unknown_offsets(setup: &Setup) -> String {
 
 /// A number with three digits.
 fn short(number: f64) -> String {
+    significant(number, 3)
+}
+
+/// A number with so many significant digits, at most nine of them after the point.
+#[must_use]
+pub fn significant(number: f64, digits: u8) -> String {
     if !number.is_finite() || number == 0.0 {
         return format!("{number}");
     }
-    let digits = (2.0 - number.abs().log10().floor()).clamp(0.0, 9.0);
-    format!("{number:.*}", digits as usize)
+    let decimals = f64::from(digits) - 1.0 - number.abs().log10().floor();
+    format!("{number:.*}", decimals.clamp(0.0, 9.0) as usize)
 }
 
 /// The setup with its parameters computed again.

@@ -9,7 +9,7 @@ use super::steps::StepCover;
 use super::validity::{Dependences, ValidityCheck, first_fault};
 use crate::setup::Setup;
 use crate::uncertainty::{Solution, Uncertainty};
-use proprio_dynamics::{Determinacy, ContactSet, Dependence, DofSet, SensorSet, Solver};
+use proprio_dynamics::{ContactSet, Dependence, Determinacy, DofSet, SensorSet, Solver};
 use proprio_identification::online::Doubt;
 use proprio_identification::robot::ChannelRole;
 use proprio_topics::{ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Nanos, Reason, Residual};

@@ -7,7 +7,7 @@ use proprio_dynamics::model::JointKind;
 use proprio_estimator::config::Config;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::plan::Plan;
-use proprio_simulator::{Robot as SimulatedRobot, Settings, Simulation, Simulator};
+use proprio_simulator::{SimulatedRobot, Simulation, SimulationSettings, Simulator};
 use proprio_topics::{Kind, Nanos};
 use std::fmt::Write as _;
 use std::path::Path;
@@ -232,7 +232,7 @@ impl Rig {
     pub(super) fn new(
         seed: u64,
         family: Family,
-        settings: impl Fn(&Plan) -> Settings,
+        settings: impl Fn(&Plan) -> SimulationSettings,
         t0: Nanos,
         folder: &Path,
     ) -> Option<Self> {

@@ -39,7 +39,8 @@ impl Robot {
     }
 
     fn shipped(name: &str) -> Self {
-        let folder = proprio_simulator::Robot::find(name).expect("a robot of this repository");
+        let folder =
+            proprio_simulator::SimulatedRobot::find(name).expect("a robot of this repository");
         let read = |file: &str| fs::read_to_string(folder.join(file)).expect(file);
         let mut config: Table = read("estimator.toml").parse().expect("it is TOML");
         let mut tips = Vec::new();

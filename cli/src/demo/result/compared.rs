@@ -1,7 +1,7 @@
 //! Compares every estimate with the simulator's truth and with the torque that the CAD's parameters
 //! give from the same samples, and computes the accuracy of the torques in each phase of the run.
 
-use crate::demo::watching::Watched;
+use crate::demo::watching::ReceivedRun;
 use anyhow::Context;
 use proprio_topics::JointTorque;
 use proprio_topics::csv::{self, Value};
@@ -15,13 +15,13 @@ use std::path::Path;
 const LEARNING: Nanos = Nanos::from_millis(10_000);
 
 /// The simulator's truth: joint torques over time.
-pub(super) struct Truth {
+pub(super) struct TrueTorques {
     t: Vec<Nanos>,
     /// Per joint, its torque at each of `t`.
     torques: Vec<Vec<f64>>,
 }
 
-impl Truth {
+impl TrueTorques {
     pub(super) fn read(file: &Path, joints: &[String]) -> anyhow::Result<Self> {
         let mut reader = csv::TableReader::new(BufReader::new(File::open(file)?))?;
         let series: Vec<Option<usize>> = joints
@@ -81,19 +81,19 @@ pub(super) fn ratio(part: usize, whole: usize) -> f64 {
 }
 
 /// Every estimate with the truth and the CAD's torque from the same samples.
-pub(super) struct Compared {
+pub(super) struct AlignedRun {
     /// The instant of the first estimate, the origin of the report's time.
     pub(super) first: Nanos,
     /// The start of the motion, and 10 s later.
     pub(super) moving: Nanos,
     pub(super) settled: Nanos,
     /// Per joint, per instant.
-    pub(super) joints: Vec<Vec<Instant>>,
+    pub(super) joints: Vec<Vec<AlignedTorque>>,
 }
 
 /// The torque of one joint at one instant.
 #[derive(Clone, Copy)]
-pub(super) struct Instant {
+pub(super) struct AlignedTorque {
     pub(super) t: Nanos,
     pub(super) estimate: JointTorque,
     /// With the CAD's parameters, and the truth \[Nm\]; NaN where unknown.
@@ -101,14 +101,18 @@ pub(super) struct Instant {
     pub(super) truth: f64,
 }
 
-impl Instant {
+impl AlignedTorque {
     pub(super) fn error(&self) -> f64 {
         self.estimate.torque - self.truth
     }
 }
 
-impl Compared {
-    pub(super) fn new(watched: &Watched, truth: &Truth, still: f64) -> anyhow::Result<Self> {
+impl AlignedRun {
+    pub(super) fn new(
+        watched: &ReceivedRun,
+        truth: &TrueTorques,
+        still: f64,
+    ) -> anyhow::Result<Self> {
         let first = watched.estimates.first().map_or(Nanos::ZERO, |seen| seen.t);
         let began = watched.simulator["t0"]
             .as_i64()
@@ -123,7 +127,7 @@ impl Compared {
                 .filter(|(t, _)| *t == seen.t)
                 .map(|(_, torques)| torques);
             for ((joint, instants), estimate) in joints.iter_mut().enumerate().zip(&seen.joints) {
-                instants.push(Instant {
+                instants.push(AlignedTorque {
                     t: seen.t,
                     estimate: *estimate,
                     cad: cad
@@ -150,13 +154,13 @@ impl Compared {
     /// Per joint, the number of torques that break the promise: valid, but more than four stated
     /// deviations and 1 % of the joint's range off the truth.
     pub(super) fn untrue(&self) -> Vec<usize> {
-        let untrue = |instants: &Vec<Instant>| {
+        let untrue = |instants: &Vec<AlignedTorque>| {
             let truths = || instants.iter().map(|i| i.truth).filter(|x| x.is_finite());
             let (least, most) = (
                 truths().fold(f64::INFINITY, f64::min),
                 truths().fold(f64::NEG_INFINITY, f64::max),
             );
-            let is_untrue = |i: &&Instant| {
+            let is_untrue = |i: &&AlignedTorque| {
                 let promised = (4.0 * i.estimate.standard_deviation).max(0.01 * (most - least));
                 // A torque that is no number is untrue; without a truth it is not known.
                 let is_kept = i.error().abs() <= promised || i.truth.is_nan();
@@ -169,14 +173,17 @@ impl Compared {
 
     /// The accuracy of the torques from `from` until before `until`; `None` without an estimate
     /// that has a truth.
-    pub(super) fn phase(&self, from: Nanos, until: Nanos) -> Option<Phase> {
-        let (mut phase, mut count, mut valid, mut within) = (Phase::default(), 0, 0, 0);
+    pub(super) fn phase(&self, from: Nanos, until: Nanos) -> Option<PhaseAccuracy> {
+        let (mut phase, mut count, mut valid, mut within) = (PhaseAccuracy::default(), 0, 0, 0);
         for instants in &self.joints {
             let inside = instants
                 .iter()
                 .filter(|i| i.t >= from && i.t < until && i.truth.is_finite());
-            let (mut cad, mut identified, mut size) =
-                (Mean::default(), Mean::default(), Mean::default());
+            let (mut cad, mut identified, mut size) = (
+                MeanSquare::default(),
+                MeanSquare::default(),
+                MeanSquare::default(),
+            );
             for instant in inside {
                 count += 1;
                 // Of a withheld torque there is no figure, of the CAD's at that instant neither.
@@ -206,12 +213,12 @@ impl Compared {
 
 /// The root of a mean of squares.
 #[derive(Default)]
-struct Mean {
+struct MeanSquare {
     sum: f64,
     count: usize,
 }
 
-impl Mean {
+impl MeanSquare {
     fn see(&mut self, value: f64) {
         self.sum += value * value;
         self.count += 1;
@@ -225,7 +232,7 @@ impl Mean {
 
 /// The accuracy in a part of the run.
 #[derive(Clone, Default)]
-pub(super) struct Phase {
+pub(super) struct PhaseAccuracy {
     pub(super) joints: Vec<Accuracy>,
     /// Fraction of the torques that were not withheld.
     pub(super) valid_share: f64,
@@ -245,7 +252,7 @@ pub(super) struct Accuracy {
     pub(super) valid: usize,
 }
 
-impl Phase {
+impl PhaseAccuracy {
     pub(super) fn json(phase: Option<&Self>, names: &[String]) -> Json {
         let Some(phase) = phase else {
             return Json::Null;
@@ -271,9 +278,9 @@ impl Phase {
 mod tests {
     use super::*;
 
-    fn instant(t: f64, torque: f64) -> Instant {
+    fn instant(t: f64, torque: f64) -> AlignedTorque {
         let valid = torque.is_finite();
-        Instant {
+        AlignedTorque {
             t: Nanos::from_seconds(t),
             estimate: JointTorque {
                 torque,
@@ -298,7 +305,7 @@ mod tests {
             instant(8.0, 3.0),
             instant(15.0, f64::NAN),
         ];
-        let compared = Compared {
+        let compared = AlignedRun {
             first: Nanos::ZERO,
             moving: Nanos::from_seconds(4.0),
             settled: Nanos::from_seconds(14.0),
@@ -317,7 +324,7 @@ mod tests {
         assert_eq!(learning, ([1.0, 2.0, 1.0], 4, [1.0, 0.75]));
         // Withheld throughout: no figure.
         let after = compared.phase(compared.settled, Nanos::MAX).unwrap();
-        let told = Phase::json(Some(&after), &["elbow".to_owned()]);
+        let told = PhaseAccuracy::json(Some(&after), &["elbow".to_owned()]);
         let expected = json!({
             "cad": {"elbow": null}, "identified": {"elbow": null}, "valid_estimates": {"elbow": 0},
             "valid_share": 0.0, "within_2_sigma": null,
@@ -341,6 +348,6 @@ mod tests {
         compared.joints[0][0].estimate.valid = 0;
         compared.joints[0][0].truth = 202.0;
         assert_eq!(compared.untrue(), [0]);
-        assert_eq!(Phase::json(None, &[]), Json::Null);
+        assert_eq!(PhaseAccuracy::json(None, &[]), Json::Null);
     }
 }

@@ -1,10 +1,10 @@
 //! A demonstration compared with the simulator's truth: counts, errors, latencies, parameters.
 
-use super::compared::{Accuracy, Compared, Phase, Truth, ratio};
-use super::learnt::{Course, courses};
-use super::verdict::{Findings, Verdict};
-use crate::demo::experiment::{Args, Experiment};
-use crate::demo::watching::Watched;
+use super::compared::{Accuracy, AlignedRun, PhaseAccuracy, TrueTorques, ratio};
+use super::learnt::{Convergence, courses};
+use super::verdict::{DemoVerdict, Findings};
+use crate::demo::experiment::{DemoArgs, Experiment};
+use crate::demo::watching::ReceivedRun;
 use anyhow::{Context, bail};
 use proprio_topics::Nanos;
 use serde_json::{Value as Json, json};
@@ -14,7 +14,7 @@ const START: Nanos = Nanos::from_millis(1000);
 
 /// Counts of frames, samples and estimates.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) struct Counts {
+pub(super) struct TransportCounts {
     pub(super) frames: u64,
     pub(super) samples: u64,
     /// Frames and samples lost on the way from the simulator to the estimator.
@@ -25,10 +25,10 @@ pub(super) struct Counts {
     pub(super) lost_estimates: u64,
 }
 
-impl Counts {
+impl TransportCounts {
     /// # Errors
     /// The simulator did not count a bus.
-    fn of(watched: &Watched) -> anyhow::Result<Self> {
+    fn of(watched: &ReceivedRun) -> anyhow::Result<Self> {
         let mut this = Self {
             frames: 0,
             samples: 0,
@@ -59,35 +59,35 @@ impl Counts {
 
 /// A demonstration compared with the simulator's truth.
 pub(super) struct Evaluation<'a> {
-    pub(super) args: &'a Args,
+    pub(super) args: &'a DemoArgs,
     pub(super) experiment: &'a Experiment,
-    pub(super) watched: &'a Watched,
-    pub(super) counts: Counts,
-    pub(super) compared: Compared,
-    pub(super) before: Option<Phase>,
-    pub(super) learning: Option<Phase>,
-    pub(super) after: Option<Phase>,
+    pub(super) watched: &'a ReceivedRun,
+    pub(super) counts: TransportCounts,
+    pub(super) compared: AlignedRun,
+    pub(super) before: Option<PhaseAccuracy>,
+    pub(super) learning: Option<PhaseAccuracy>,
+    pub(super) after: Option<PhaseAccuracy>,
     /// The phase after learning, or the whole run if that is too short; and its begin in words.
-    pub(super) judged: Phase,
+    pub(super) judged: PhaseAccuracy,
     pub(super) since: &'static str,
-    pub(super) verdict: Verdict,
+    pub(super) verdict: DemoVerdict,
     /// Stamp of the last estimate.
     pub(super) last: Nanos,
     pub(super) rate_hz: f64,
     /// From the stamp of the frame to the published torque \[us\], sorted.
     pub(super) latency: Vec<f64>,
-    pub(super) parameters: Vec<Course>,
-    pub(super) offsets: Vec<Course>,
+    pub(super) parameters: Vec<Convergence>,
+    pub(super) offsets: Vec<Convergence>,
 }
 
 impl<'a> Evaluation<'a> {
     pub(super) fn new(
-        args: &'a Args,
+        args: &'a DemoArgs,
         experiment: &'a Experiment,
-        watched: &'a Watched,
-        truth: &Truth,
+        watched: &'a ReceivedRun,
+        truth: &TrueTorques,
     ) -> anyhow::Result<Self> {
-        let compared = Compared::new(watched, truth, args.still())?;
+        let compared = AlignedRun::new(watched, truth, args.still())?;
         let last = watched.estimates.last().map_or(Nanos::ZERO, |seen| seen.t);
         let mut latency: Vec<f64> = watched
             .estimates
@@ -109,7 +109,7 @@ impl<'a> Evaluation<'a> {
             );
         };
         let (parameters, offsets) = courses(experiment, watched, &compared);
-        let counts = Counts::of(watched)?;
+        let counts = TransportCounts::of(watched)?;
         let (order, beyond) = (&experiment.order, experiment.beyond);
         let first = match beyond {
             0 => &order[..],
@@ -122,7 +122,7 @@ impl<'a> Evaluation<'a> {
         .map(|error| combined(first.iter().filter_map(|i| judged.joints.get(*i)), error));
         let skipped = |bus: &Json| bus["skipped"].as_u64();
         let buses = watched.simulator["buses"].as_array();
-        let verdict = Verdict::of(&Findings {
+        let verdict = DemoVerdict::of(&Findings {
             since,
             moved: compared.time(last) - compared.time(compared.moving),
             has_settled: after.is_some(),
@@ -206,9 +206,9 @@ impl<'a> Evaluation<'a> {
                 "settled_since_s": seconds(self.compared.settled),
                 "solutions": watched.learnt.len(),
                 "parameters_within_2_sigma": within_2_sigma(&self.parameters),
-                "before": Phase::json(self.before.as_ref(), &watched.joints),
-                "learning": Phase::json(self.learning.as_ref(), &watched.joints),
-                "after": Phase::json(self.after.as_ref(), &watched.joints),
+                "before": PhaseAccuracy::json(self.before.as_ref(), &watched.joints),
+                "learning": PhaseAccuracy::json(self.learning.as_ref(), &watched.joints),
+                "after": PhaseAccuracy::json(self.after.as_ref(), &watched.joints),
             },
             "simulator": watched.simulator,
         })
@@ -235,7 +235,7 @@ fn quantile(sorted: &[f64], q: f64) -> f64 {
 }
 
 /// The fraction of parameters whose last value is within two standard deviations of the truth.
-fn within_2_sigma(parameters: &[Course]) -> Option<f64> {
+fn within_2_sigma(parameters: &[Convergence]) -> Option<f64> {
     let within = parameters
         .iter()
         .filter(|course| course.is_within_2_sigma())
@@ -262,7 +262,7 @@ mod tests {
                 ..BusHealth::EMPTY
             };
         }
-        let watched = Watched {
+        let watched = ReceivedRun {
             joints: vec![],
             estimates: vec![],
             baseline: vec![],
@@ -279,7 +279,7 @@ mod tests {
                 { "name": "a", "sent": 100 },
             ] }),
         };
-        let expected = Counts {
+        let expected = TransportCounts {
             frames: 197,
             samples: 40,
             lost: 10 + 3,
@@ -288,7 +288,7 @@ mod tests {
             estimates: 0,
             lost_estimates: 5,
         };
-        assert_eq!(Counts::of(&watched).unwrap(), expected);
+        assert_eq!(TransportCounts::of(&watched).unwrap(), expected);
     }
 
     /// The last solution counts: here three of four are within twice what it states.
@@ -296,10 +296,10 @@ mod tests {
     fn parameters_are_compared_with_the_truth_in_their_last_solution() {
         assert_eq!(within_2_sigma(&[]), None);
         let courses = [
-            Course::ending(1.0, 0.1, 1.19),
-            Course::ending(-1.0, 0.1, -1.19),
-            Course::ending(1.0, 0.1, 1.21),
-            Course::ending(0.0, 1.0, 1.5),
+            Convergence::ending(1.0, 0.1, 1.19),
+            Convergence::ending(-1.0, 0.1, -1.19),
+            Convergence::ending(1.0, 0.1, 1.21),
+            Convergence::ending(0.0, 1.0, 1.5),
         ];
         assert_eq!(within_2_sigma(&courses), Some(0.75));
     }

@@ -1,11 +1,11 @@
 //! Plots the on-line identification: parameters and offsets over the solutions, with their true
 //! values.
 
-use super::compared::Compared;
+use super::compared::AlignedRun;
 use crate::demo::experiment::{Experiment, Link};
-use crate::demo::watching::Watched;
-use crate::report::plot::{Axis, Ink, Plot, Series};
-use crate::report::{self, Cell, Table as ReportTable};
+use crate::demo::watching::ReceivedRun;
+use crate::report::plot::{Ink, Plot, PlotAxis, Trace};
+use crate::report::{self, Cell, ReportTable};
 use proprio_identification::robot::AXES;
 
 /// Names and units of a link's ten parameters.
@@ -25,7 +25,7 @@ const PARAMETERS: [(&str, &str); 10] = [
 const DRAWN: usize = 8;
 
 /// One identified number over the solutions.
-pub(super) struct Course {
+pub(super) struct Convergence {
     title: String,
     unit: &'static str,
     /// Instant \[s\], value, standard deviation.
@@ -34,7 +34,7 @@ pub(super) struct Course {
     truth: f64,
 }
 
-impl Course {
+impl Convergence {
     /// The relative reduction of its standard deviation.
     fn reduction(&self) -> f64 {
         match (self.points.first(), self.points.last()) {
@@ -50,7 +50,7 @@ impl Course {
             .is_some_and(|(_, value, deviation)| (value - self.truth).abs() <= 2.0 * deviation)
     }
 
-    fn plot(&self, compared: &Compared) -> Plot {
+    fn plot(&self, compared: &AlignedRun) -> Plot {
         let ends = [self.points.first(), self.points.last()];
         let level = |value: f64| ends.iter().flatten().map(|(t, ..)| (*t, value)).collect();
         let band = self
@@ -58,16 +58,16 @@ impl Course {
             .iter()
             .map(|(t, x, s)| (*t, x - 2.0 * s, x + 2.0 * s));
         let line = self.points.iter().map(|(t, x, _)| (*t, *x));
-        let mut series = vec![Series::band("± 2σ", Ink::Identified, band.collect())];
+        let mut series = vec![Trace::band("± 2σ", Ink::Identified, band.collect())];
         if self.cad.is_finite() {
-            series.push(Series::line("CAD", Ink::Cad, level(self.cad)));
+            series.push(Trace::line("CAD", Ink::Cad, level(self.cad)));
         }
-        series.push(Series::line("truth", Ink::Measured, level(self.truth)));
-        series.push(Series::line("identified", Ink::Identified, line.collect()));
+        series.push(Trace::line("truth", Ink::Measured, level(self.truth)));
+        series.push(Trace::line("identified", Ink::Identified, line.collect()));
         Plot {
             title: self.title.clone(),
-            x: Axis::new("t [s]"),
-            y: Axis::new(&format!("[{}]", self.unit)),
+            x: PlotAxis::new("t [s]"),
+            y: PlotAxis::new(&format!("[{}]", self.unit)),
             series,
             marks: vec![(compared.time(compared.moving), "onset of motion".to_owned())],
             ..Plot::default()
@@ -78,9 +78,9 @@ impl Course {
 /// The links' parameters and the sensors' offsets over the solutions.
 pub(super) fn courses(
     experiment: &Experiment,
-    watched: &Watched,
-    compared: &Compared,
-) -> (Vec<Course>, Vec<Course>) {
+    watched: &ReceivedRun,
+    compared: &AlignedRun,
+) -> (Vec<Convergence>, Vec<Convergence>) {
     let (mut parameters, mut offsets) = (vec![], vec![]);
     let Some(last) = watched.learnt.last() else {
         return (parameters, offsets);
@@ -110,7 +110,7 @@ pub(super) fn courses(
                     *link.standard_deviation.get(i)?,
                 ))
             });
-            parameters.push(Course {
+            parameters.push(Convergence {
                 title: format!("{name}: {symbol}"),
                 unit,
                 points: points.collect(),
@@ -134,7 +134,7 @@ pub(super) fn courses(
                     *offset.standard_deviation.get(i)?,
                 ))
             });
-            offsets.push(Course {
+            offsets.push(Convergence {
                 title: format!("{name}: {part}"),
                 unit: if i < 3 { "N" } else { "Nm" },
                 points: points.collect(),
@@ -148,15 +148,15 @@ pub(super) fn courses(
 
 /// Figure 4 of the paper: the identified parameters over time.
 pub(super) fn learnt_section(
-    parameters: &[Course],
-    offsets: &[Course],
-    compared: &Compared,
+    parameters: &[Convergence],
+    offsets: &[Convergence],
+    compared: &AlignedRun,
 ) -> String {
     let Some(course) = parameters.first().or(offsets.first()) else {
         return String::new();
     };
     let updates = course.points.len();
-    let mut best: Vec<&Course> = parameters.iter().collect();
+    let mut best: Vec<&Convergence> = parameters.iter().collect();
     best.sort_by(|a, b| a.reduction().total_cmp(&b.reduction()));
     best.truncate(DRAWN);
     let mut masses = ReportTable::new(
@@ -176,7 +176,7 @@ pub(super) fn learnt_section(
             ]);
         }
     }
-    let plots = |courses: &[&Course]| -> Vec<Plot> {
+    let plots = |courses: &[&Convergence]| -> Vec<Plot> {
         courses.iter().map(|course| course.plot(compared)).collect()
     };
     report::section(
@@ -199,7 +199,7 @@ pub(super) fn learnt_section(
 }
 
 #[cfg(test)]
-impl Course {
+impl Convergence {
     /// A number whose last value and standard deviation are these.
     pub(super) fn ending(value: f64, deviation: f64, truth: f64) -> Self {
         Self {

@@ -5,7 +5,7 @@ use super::evaluation::Evaluation;
 use super::learnt::learnt_section;
 use super::torques::torque_plots;
 use crate::report::plot::{Ink, Plot};
-use crate::report::{self, Cell, Table};
+use crate::report::{self, Cell, ReportTable};
 use proprio_topics::Nanos;
 
 /// What the two columns of errors have in common.
@@ -99,7 +99,7 @@ pub(super) fn page(evaluation: &Evaluation<'_>) -> String {
     } = evaluation;
     let setup = &evaluation.experiment.setup;
     let verdict = &evaluation.verdict;
-    let mut rows = Table::new(
+    let mut rows = ReportTable::new(
         &format!(
             "RMS errors of the torques against the simulator's truth, {since} [Nm], over the \
              estimates that are valid"

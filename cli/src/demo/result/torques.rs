@@ -1,7 +1,7 @@
 //! Plots the joints' torques. Shades mark withheld torques and touches of the robot.
 
-use super::compared::{Compared, Instant};
-use crate::report::plot::{Axis, Ink, Plot, Series, Shade};
+use super::compared::{AlignedRun, AlignedTorque};
+use crate::report::plot::{Ink, Plot, PlotAxis, Shade, Trace};
 
 /// Stretches of a plot with smaller gaps are merged \[s\].
 const GAP: f64 = 0.05;
@@ -26,8 +26,8 @@ fn stretches(instants: impl Iterator<Item = (f64, bool)>) -> Vec<(f64, f64)> {
 /// and its error.
 pub(super) fn torque_plots(
     name: &str,
-    instants: &[Instant],
-    compared: &Compared,
+    instants: &[AlignedTorque],
+    compared: &AlignedRun,
     touched: &[(f64, f64)],
 ) -> [Plot; 2] {
     let withheld = stretches(
@@ -38,8 +38,8 @@ pub(super) fn torque_plots(
     let plot = |note: &str, quantity: &str, series| Plot {
         title: name.to_owned(),
         note: note.to_owned(),
-        x: Axis::new("t [s]"),
-        y: Axis::new(&format!("{quantity} [Nm]")),
+        x: PlotAxis::new("t [s]"),
+        y: PlotAxis::new(&format!("{quantity} [Nm]")),
         series,
         marks: vec![(compared.time(compared.moving), "onset of motion".to_owned())],
         shades: vec![
@@ -48,14 +48,14 @@ pub(super) fn torque_plots(
         ],
         ..Plot::default()
     };
-    let line = |of: &dyn Fn(&Instant) -> f64| -> Vec<(f64, f64)> {
+    let line = |of: &dyn Fn(&AlignedTorque) -> f64| -> Vec<(f64, f64)> {
         instants
             .iter()
             .map(|i| (compared.time(i.t), of(i)))
             .collect()
     };
     // Withheld torques are NaN: they have no line and no band.
-    let band = |of: &dyn Fn(&Instant) -> f64| -> Vec<(f64, f64, f64)> {
+    let band = |of: &dyn Fn(&AlignedTorque) -> f64| -> Vec<(f64, f64, f64)> {
         let around = instants
             .iter()
             .map(|i| (i, of(i), 2.0 * i.estimate.standard_deviation));
@@ -68,19 +68,19 @@ pub(super) fn torque_plots(
             "",
             "torque",
             vec![
-                Series::band("± 2σ", Ink::Identified, band(&|i| i.estimate.torque)),
-                Series::line("CAD", Ink::Cad, line(&|i| i.cad)),
-                Series::line("identified", Ink::Identified, line(&|i| i.estimate.torque)),
-                Series::line("truth", Ink::Measured, line(&|i| i.truth)),
+                Trace::band("± 2σ", Ink::Identified, band(&|i| i.estimate.torque)),
+                Trace::line("CAD", Ink::Cad, line(&|i| i.cad)),
+                Trace::line("identified", Ink::Identified, line(&|i| i.estimate.torque)),
+                Trace::line("truth", Ink::Measured, line(&|i| i.truth)),
             ],
         ),
         plot(
             "estimated − truth",
             "error",
             vec![
-                Series::band("± 2σ", Ink::Identified, band(&|i| 0.0 * i.estimate.torque)),
-                Series::line("CAD", Ink::Cad, line(&|i| i.cad - i.truth)),
-                Series::line("identified", Ink::Identified, line(&Instant::error)),
+                Trace::band("± 2σ", Ink::Identified, band(&|i| 0.0 * i.estimate.torque)),
+                Trace::line("CAD", Ink::Cad, line(&|i| i.cad - i.truth)),
+                Trace::line("identified", Ink::Identified, line(&AlignedTorque::error)),
             ],
         ),
     ]

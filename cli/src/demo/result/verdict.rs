@@ -10,7 +10,7 @@ const COVERED: f64 = 0.9;
 const FAILED: &str = "It did not work";
 
 /// The verdict of a demonstration.
-pub(super) struct Verdict {
+pub(super) struct DemoVerdict {
     /// True: the identified parameters are better than the CAD's, and the stated deviations hold.
     /// `None`: it cannot be told.
     pub(super) worked: Option<bool>,
@@ -47,34 +47,46 @@ pub(super) struct Findings<'a> {
     pub(super) skipped: u64,
 }
 
-impl Verdict {
+impl Findings<'_> {
+    /// The joints that are compared, in words.
+    fn place(&self) -> String {
+        let beyond = match (self.is_beyond, self.sensors) {
+            (true, 1) => " beyond the F/T sensor",
+            (true, _) => " beyond the F/T sensors",
+            (false, _) => "",
+        };
+        match self.joints {
+            1 => format!("the joint{beyond}"),
+            count => format!("the {count} joints{beyond}"),
+        }
+    }
+
+    /// How many torques were valid, and how many of these within their deviations.
+    fn validity(&self) -> String {
+        let mut validity = format!("{} of all torques were valid", percent(self.valid_share));
+        if self.valid > 0 {
+            let within = percent(self.within_2_sigma);
+            validity += &format!(", {within} of these within two standard deviations of the truth");
+        }
+        validity
+    }
+}
+
+impl DemoVerdict {
     pub(super) fn of(findings: &Findings<'_>) -> Self {
         let Findings {
             since,
             moved,
             cad,
             identified,
-            valid_share,
             within_2_sigma,
             ..
         } = findings;
-        let place = match (findings.is_beyond, findings.sensors) {
-            (true, 1) => " beyond the F/T sensor",
-            (true, _) => " beyond the F/T sensors",
-            (false, _) => "",
-        };
-        let joints = match findings.joints {
-            1 => format!("the joint{place}"),
-            count => format!("the {count} joints{place}"),
-        };
-        let mut validity = format!("{} of all torques were valid", percent(*valid_share));
-        if findings.valid > 0 {
-            let within = percent(*within_2_sigma);
-            validity += &format!(", {within} of these within two standard deviations of the truth");
-        }
+        let validity = findings.validity();
         let errors = format!(
-            "at {joints} the RMS error of the torques is {identified:.3} Nm with the identified \
-             parameters and {cad:.3} Nm with the CAD's, {since}"
+            "at {} the RMS error of the torques is {identified:.3} Nm with the identified \
+             parameters and {cad:.3} Nm with the CAD's, {since}",
+            findings.place()
         );
         let is_better = findings.cad_error == 0.0 || identified < cad;
         let (worked, headline, mut figures) = if findings.valid == 0 && findings.has_settled {
@@ -172,7 +184,7 @@ mod tests {
     #[test]
     fn a_verdict_says_what_it_rests_on() {
         assert_eq!(
-            Verdict::of(&GOOD).sentence(),
+            DemoVerdict::of(&GOOD).sentence(),
             "It worked: at the 4 joints beyond the F/T sensor the RMS error of the torques is \
              0.030 Nm with the identified parameters and 0.070 Nm with the CAD's, from 10 s of \
              motion on; 99.9 % of all torques were valid, 98.0 % of these within two \
@@ -255,7 +267,7 @@ mod tests {
                  time.",
             ),
         ] {
-            let verdict = Verdict::of(&findings);
+            let verdict = DemoVerdict::of(&findings);
             let sentence = verdict.sentence();
             assert_eq!(verdict.worked, worked, "{sentence}");
             assert!(sentence.contains(words), "{sentence}");

@@ -3,105 +3,19 @@
 
 use super::words::WRENCH;
 use crate::identify::advice::{percent, sentence};
-use crate::report::plot::{Axis, Ink, Plot, Series};
-use crate::report::{self, Cell, Table, number};
+use crate::report::plot::{Ink, Plot, PlotAxis, Trace};
+use crate::report::{self, Cell, ReportTable, number};
 use proprio_dynamics::calibration::{Unknown, swapped};
-use proprio_identification::{BaseParameterOutcome, CalibrationOutcome, Outcome};
+use proprio_dynamics::spatial::RigidInertia;
+use proprio_identification::{BaseParameterOutcome, CalibrationOutcome, LogOutcome, Outcome};
 
 /// Number of weak directions listed at once; the others can be unfolded.
 const LISTED: usize = 12;
 
 pub(super) fn parameters(outcome: &Outcome) -> Option<String> {
-    let mut body = Vec::new();
-    let units = ["kg", "kg m", "kg m^2"];
-    let of_unit = |unit: &str| -> Vec<(usize, &BaseParameterOutcome)> {
-        outcome
-            .base_parameters
-            .iter()
-            .enumerate()
-            .filter(|(_, b)| b.unit == unit)
-            .map(|(i, b)| (i + 1, b))
-            .collect()
-    };
-    let plots: Vec<Plot> = units
-        .iter()
-        .map(|unit| (unit, of_unit(unit)))
-        .filter(|(_, some)| !some.is_empty())
-        .map(|(unit, some)| base_plot(unit, &some))
-        .chain((!outcome.base_parameters.is_empty()).then(|| change_plot(&outcome.base_parameters)))
-        .collect();
-    if !plots.is_empty() {
-        body.push(report::paragraph(
-            "Base parameters: the combinations of inertial parameters that the measurements depend \
-             on, numbered as in the table below. Bars are two standard deviations; where a bar \
-             spans the CAD's value, the logs do not contradict it.",
-        ));
-        body.push(report::figures(&plots));
-        let row = |(i, b): (usize, &BaseParameterOutcome)| -> Vec<Cell> {
-            vec![
-                Cell::Text((i + 1).to_string()),
-                b.expression.as_str().into(),
-                unit_text(b.unit).into(),
-                b.cad.into(),
-                Cell::Uncertain(b.identified, b.deviation),
-                Cell::Number((b.identified - b.cad).abs() / b.deviation),
-            ]
-        };
-        let mut table = Table::new(
-            "Base parameters; last column: change from the CAD in standard deviations",
-            &[
-                "no.",
-                "combination",
-                "unit",
-                "CAD",
-                "identified",
-                "change/σ",
-            ],
-        );
-        outcome
-            .base_parameters
-            .iter()
-            .enumerate()
-            .for_each(|entry| table.row(row(entry)));
-        body.push(report::folded(
-            &format!("All {} base parameters", outcome.base_parameters.len()),
-            false,
-            &[table.html()],
-        ));
-    }
-    let mut links = Table::new(
-        "Links that the logs observe: physically consistent parameters; directions that the \
-         logs do not determine keep their CAD values. Last column: change from the CAD in standard \
-         deviations (below 2: not significant)",
-        &[
-            "link",
-            "mass CAD [kg]",
-            "mass [kg]",
-            "centre of mass CAD [mm]",
-            "centre of mass [mm]",
-            "change/σ",
-        ],
-    );
-    for link in outcome.links.iter().filter(|l| l.seen) {
-        let centre = |body: &proprio_dynamics::spatial::RigidInertia| -> Cell {
-            if body.mass > 0.0 {
-                let [x, y, z] = [0, 1, 2].map(|i| {
-                    format!("{:.1}", body.first_moment[i] / body.mass * 1e3).replace('-', "−")
-                });
-                format!("{x}, {y}, {z}").into()
-            } else {
-                "–".into()
-            }
-        };
-        links.row(vec![
-            link.name.as_str().into(),
-            link.cad.mass.into(),
-            Cell::Uncertain(link.identified.mass, link.deviation[0]),
-            centre(&link.cad),
-            centre(&link.identified),
-            link.significance.into(),
-        ]);
-    }
+    let mut body = base_parameters(&outcome.base_parameters);
+    let links = links(outcome);
+    let is_worth_a_section = !body.is_empty() || !links.is_empty();
     body.push(links.html());
     let floored: Vec<&str> = outcome
         .links
@@ -127,7 +41,97 @@ pub(super) fn parameters(outcome: &Outcome) -> Option<String> {
             }
         )));
     }
-    (!plots.is_empty() || !links.is_empty()).then(|| report::section("Parameters", &body))
+    is_worth_a_section.then(|| report::section("Parameters", &body))
+}
+
+/// Plots and a table of the base parameters; nothing without any.
+fn base_parameters(all: &[BaseParameterOutcome]) -> Vec<String> {
+    if all.is_empty() {
+        return Vec::new();
+    }
+    let of_unit = |unit: &str| -> Vec<(usize, &BaseParameterOutcome)> {
+        let numbered = (1..).zip(all);
+        numbered.filter(|(_, b)| b.unit == unit).collect()
+    };
+    let plots: Vec<Plot> = ["kg", "kg m", "kg m^2"]
+        .map(|unit| (unit, of_unit(unit)))
+        .into_iter()
+        .filter(|(_, some)| !some.is_empty())
+        .map(|(unit, some)| base_plot(unit, &some))
+        .chain([change_plot(all)])
+        .collect();
+    let mut table = ReportTable::new(
+        "Base parameters; last column: change from the CAD in standard deviations",
+        &[
+            "no.",
+            "combination",
+            "unit",
+            "CAD",
+            "identified",
+            "change/σ",
+        ],
+    );
+    for (number, b) in (1_u32..).zip(all) {
+        table.row(vec![
+            Cell::Text(number.to_string()),
+            b.expression.as_str().into(),
+            unit_text(b.unit).into(),
+            b.cad.into(),
+            Cell::Uncertain(b.identified, b.deviation),
+            Cell::Number((b.identified - b.cad).abs() / b.deviation),
+        ]);
+    }
+    vec![
+        report::paragraph(
+            "Base parameters: the combinations of inertial parameters that the measurements depend \
+             on, numbered as in the table below. Bars are two standard deviations; where a bar \
+             spans the CAD's value, the logs do not contradict it.",
+        ),
+        report::figures(&plots),
+        report::folded(
+            &format!("All {} base parameters", all.len()),
+            false,
+            &[table.html()],
+        ),
+    ]
+}
+
+/// Masses and centres of mass of the links that the logs observe.
+fn links(outcome: &Outcome) -> ReportTable {
+    let mut links = ReportTable::new(
+        "Links that the logs observe: physically consistent parameters; directions that the \
+         logs do not determine keep their CAD values. Last column: change from the CAD in standard \
+         deviations (below 2: not significant)",
+        &[
+            "link",
+            "mass CAD [kg]",
+            "mass [kg]",
+            "centre of mass CAD [mm]",
+            "centre of mass [mm]",
+            "change/σ",
+        ],
+    );
+    let centre = |body: &RigidInertia| -> Cell {
+        if body.mass > 0.0 {
+            let [x, y, z] = [0, 1, 2].map(|i| {
+                format!("{:.1}", body.first_moment[i] / body.mass * 1e3).replace('-', "−")
+            });
+            format!("{x}, {y}, {z}").into()
+        } else {
+            "–".into()
+        }
+    };
+    for link in outcome.links.iter().filter(|l| l.seen) {
+        links.row(vec![
+            link.name.as_str().into(),
+            link.cad.mass.into(),
+            Cell::Uncertain(link.identified.mass, link.deviation[0]),
+            centre(&link.cad),
+            centre(&link.identified),
+            link.significance.into(),
+        ]);
+    }
+    links
 }
 
 fn unit_text(unit: &str) -> String {
@@ -154,7 +158,7 @@ fn base_plot(unit: &str, some: &[(usize, &BaseParameterOutcome)]) -> Plot {
             )
         })
         .collect();
-    let mut x = Axis::new("number of the base parameter");
+    let mut x = PlotAxis::new("number of the base parameter");
     x.range = Some((first as f64 - 0.7, last as f64 + 0.7));
     Plot {
         title: match unit {
@@ -163,10 +167,10 @@ fn base_plot(unit: &str, some: &[(usize, &BaseParameterOutcome)]) -> Plot {
             _ => "Moments of inertia".into(),
         },
         x,
-        y: Axis::new(&format!("[{}]", unit_text(unit))),
+        y: PlotAxis::new(&format!("[{}]", unit_text(unit))),
         series: vec![
-            Series::dots("CAD", Ink::Cad, cad),
-            Series::dots("identified ± 2σ", Ink::Identified, identified),
+            Trace::dots("CAD", Ink::Cad, cad),
+            Trace::dots("identified ± 2σ", Ink::Identified, identified),
         ],
         ..Plot::default()
     }
@@ -174,7 +178,7 @@ fn base_plot(unit: &str, some: &[(usize, &BaseParameterOutcome)]) -> Plot {
 
 /// Small parameters vanish beside large ones; in standard deviations all are comparable.
 fn change_plot(all: &[BaseParameterOutcome]) -> Plot {
-    let mut x = Axis::new("number of the base parameter");
+    let mut x = PlotAxis::new("number of the base parameter");
     let (from, to) = (0.3, all.len() as f64 + 0.7);
     x.range = Some((from, to));
     let change = |b: &BaseParameterOutcome| (b.identified - b.cad) / b.deviation;
@@ -185,14 +189,14 @@ fn change_plot(all: &[BaseParameterOutcome]) -> Plot {
         title: "Change from CAD".into(),
         note: "in standard deviations".into(),
         x,
-        y: Axis::new("change / σ"),
+        y: PlotAxis::new("change / σ"),
         series: vec![
-            Series::band(
+            Trace::band(
                 "not significant",
                 Ink::Cad,
                 vec![(from, -2.0, 2.0), (to, -2.0, 2.0)],
             ),
-            Series::dots("identified", Ink::Identified, dots.collect()),
+            Trace::dots("identified", Ink::Identified, dots.collect()),
         ],
         ..Plot::default()
     }
@@ -207,7 +211,7 @@ pub(super) fn excitation(outcome: &Outcome) -> Option<String> {
             .enumerate()
             .map(|(i, v)| (i as f64 + 1.0, *v, f64::NAN, f64::NAN))
             .collect();
-        let mut x = Axis::new("number of the combination, best excited first");
+        let mut x = PlotAxis::new("number of the combination, best excited first");
         x.range = Some((0.3, values.len() as f64 + 0.7));
         body.push(report::paragraph(&format!(
             "Each dot is one combination of parameters. The logs determine those above 1; those \
@@ -221,20 +225,20 @@ pub(super) fn excitation(outcome: &Outcome) -> Option<String> {
             title: "Excitation spectrum".into(),
             note: "singular values, relative to the prior standard deviation".into(),
             x,
-            y: Axis::log("singular value"),
+            y: PlotAxis::log("singular value"),
             series: vec![
-                Series::line(
+                Trace::line(
                     "",
                     Ink::Fitted,
                     vec![(0.3, 1.0), (values.len() as f64 + 0.7, 1.0)],
                 ),
-                Series::dots("", Ink::Identified, dots),
+                Trace::dots("", Ink::Identified, dots),
             ],
             ..Plot::default()
         }]));
     }
     let weak = |range: std::ops::Range<usize>| {
-        let mut table = Table::new(
+        let mut table = ReportTable::new(
             "Least excited combinations, worst first, and the share of their variance that is the \
              prior's",
             &["combination", "relative excitation", "prior's share"],
@@ -277,11 +281,11 @@ pub(super) fn excitation(outcome: &Outcome) -> Option<String> {
 }
 
 /// The calibration of a sensor, a row for each identified number.
-fn calibration(c: &CalibrationOutcome) -> Table {
+fn calibration(c: &CalibrationOutcome) -> ReportTable {
     let since = c.identified.reference().map_or(String::new(), |celsius| {
         format!("; the change per kelvin counts from {celsius:.1} °C")
     });
-    let mut table = Table::new(
+    let mut table = ReportTable::new(
         &format!(
             "{}: calibration in the robot: the wrench is (1 + error) times the reading after the \
              factory calibration{since}",
@@ -335,8 +339,7 @@ fn calibration(c: &CalibrationOutcome) -> Table {
 /// Time offsets, rotors and calibrations, which belong to the robot; offsets and friction, which
 /// belong to a log.
 pub(super) fn sessions(outcome: &Outcome) -> Option<String> {
-    let mut body = Vec::new();
-    let mut times = Table::new(
+    let mut times = ReportTable::new(
         "Time offset of each stream against the encoders; late is positive",
         &["channel", "offset [ms]", ""],
     );
@@ -352,8 +355,7 @@ pub(super) fn sessions(outcome: &Outcome) -> Option<String> {
             .into(),
         ]);
     }
-    body.push(times.html());
-    let mut rotors = Table::new(
+    let mut rotors = ReportTable::new(
         "Rotor inertias, reflected to the joints; the same in all logs: measured torque = torque + \
          rotor inertia · acceleration + friction",
         &["joint", "rotor inertia [kg m², kg where it slides]"],
@@ -364,66 +366,64 @@ pub(super) fn sessions(outcome: &Outcome) -> Option<String> {
             Cell::Uncertain(r.inertia, r.deviation),
         ]);
     }
-    if !rotors.is_empty() {
-        body.push(rotors.html());
-    }
-    for c in &outcome.calibrations {
-        body.push(calibration(c).html());
-    }
+    let mut body = vec![times.html(), rotors.html()];
+    body.extend(outcome.calibrations.iter().map(|c| calibration(c).html()));
     for log in &outcome.logs {
-        let mut offsets = Table::new(
-            &format!(
-                "{}: offsets of the F/T sensors (their reading without load)",
-                log.file
-            ),
-            &[
-                "channel",
-                "unit",
-                "at the start",
-                "at the end",
-                "rate [unit/√s]",
-            ],
-        );
-        for o in &log.offsets {
-            for (i, (channel, unit)) in WRENCH.iter().enumerate() {
-                offsets.row(vec![
-                    format!("{} {channel}", o.sensor).into(),
-                    (*unit).into(),
-                    o.start[i].into(),
-                    Cell::Uncertain(o.end[i], o.deviation[i]),
-                    o.rate[i].into(),
-                ]);
-            }
-        }
-        let mut friction = Table::new(
-            &format!(
-                "{}: friction of the joints: coulomb · tanh(velocity / 0.02 rad/s) + viscous · \
-                 velocity + offset",
-                log.file
-            ),
-            &["joint", "Coulomb [Nm]", "viscous [Nm s/rad]", "offset [Nm]"],
-        );
-        for f in &log.friction {
-            friction.row(vec![
-                f.joint.as_str().into(),
-                Cell::Uncertain(f.coulomb_nm, f.deviation[0]),
-                Cell::Uncertain(f.viscous, f.deviation[1]),
-                Cell::Uncertain(f.offset_nm, f.deviation[2]),
-            ]);
-        }
-        let tables: Vec<String> = [offsets, friction]
-            .iter()
-            .filter(|t| !t.is_empty())
-            .map(Table::html)
-            .collect();
+        let tables = [offsets(log), friction(log)].map(|table| table.html());
+        let tables: Vec<String> = tables.into_iter().filter(|t| !t.is_empty()).collect();
         if !tables.is_empty() {
-            body.push(report::folded(
-                &format!("Offsets and friction: {}", log.file),
-                false,
-                &tables,
-            ));
+            let title = format!("Offsets and friction: {}", log.file);
+            body.push(report::folded(&title, false, &tables));
         }
     }
     body.retain(|part| !part.is_empty());
     (!body.is_empty()).then(|| report::section("Offsets, friction and time, log by log", &body))
+}
+
+fn offsets(log: &LogOutcome) -> ReportTable {
+    let mut offsets = ReportTable::new(
+        &format!(
+            "{}: offsets of the F/T sensors (their reading without load)",
+            log.file
+        ),
+        &[
+            "channel",
+            "unit",
+            "at the start",
+            "at the end",
+            "rate [unit/√s]",
+        ],
+    );
+    for o in &log.offsets {
+        for (i, (channel, unit)) in WRENCH.iter().enumerate() {
+            offsets.row(vec![
+                format!("{} {channel}", o.sensor).into(),
+                (*unit).into(),
+                o.start[i].into(),
+                Cell::Uncertain(o.end[i], o.deviation[i]),
+                o.rate[i].into(),
+            ]);
+        }
+    }
+    offsets
+}
+
+fn friction(log: &LogOutcome) -> ReportTable {
+    let mut friction = ReportTable::new(
+        &format!(
+            "{}: friction of the joints: coulomb · tanh(velocity / 0.02 rad/s) + viscous · \
+             velocity + offset",
+            log.file
+        ),
+        &["joint", "Coulomb [Nm]", "viscous [Nm s/rad]", "offset [Nm]"],
+    );
+    for f in &log.friction {
+        friction.row(vec![
+            f.joint.as_str().into(),
+            Cell::Uncertain(f.coulomb_nm, f.deviation[0]),
+            Cell::Uncertain(f.viscous, f.deviation[1]),
+            Cell::Uncertain(f.offset_nm, f.deviation[2]),
+        ]);
+    }
+    friction
 }

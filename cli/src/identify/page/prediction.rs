@@ -4,8 +4,8 @@
 use super::words::{WRENCH, counted, role_words};
 use crate::identify::advice::percent;
 use crate::identify::summary::role;
-use crate::report::plot::{Axis, Ink, Plot, Series};
-use crate::report::{self, Cell, Table, number};
+use crate::report::plot::{Ink, Plot, PlotAxis, Trace};
+use crate::report::{self, Cell, ReportTable, number};
 use proprio_identification::{Both, Curve, LogOutcome, ModelComparison, Outcome, Predicted, Role};
 use proprio_topics::Nanos;
 
@@ -21,7 +21,7 @@ pub(super) fn logs(outcome: &Outcome) -> Option<String> {
     if outcome.logs.is_empty() {
         return None;
     }
-    let mut relative = Table::new(
+    let mut relative = ReportTable::new(
         "Relative prediction error, |predicted − measured| / |measured|: of joint torques where \
          any were measured, else of F/T readings. Friction and gains are those of the training \
          logs; one constant offset of each F/T channel is fitted to the log. Last two columns: F/T \
@@ -35,7 +35,7 @@ pub(super) fn logs(outcome: &Outcome) -> Option<String> {
             "F/T, CAD, with drift",
         ],
     );
-    let mut used = Table::new(
+    let mut used = ReportTable::new(
         "Observations of each log",
         &["log", "use", "observations", "from [s]", "to [s]"],
     );
@@ -81,7 +81,7 @@ pub(super) fn logs(outcome: &Outcome) -> Option<String> {
         &[relative, used]
             .iter()
             .filter(|table| !table.is_empty())
-            .map(Table::html)
+            .map(ReportTable::html)
             .collect::<Vec<_>>(),
     ))
 }
@@ -188,7 +188,7 @@ fn is_torque(curve: &Curve, log: &LogOutcome) -> bool {
 
 fn joint_table(log: &LogOutcome) -> Vec<String> {
     let heads = columns(log.joints.iter().map(|joint| &joint.rms_nm));
-    let mut joints = Table::new(
+    let mut joints = ReportTable::new(
         "RMS of measured less predicted joint torque [Nm], and the share of measured torques \
          within the stated 95 % interval",
         &[&["joint"], heads, &["RMS torque", "within 95 %"]].concat(),
@@ -202,11 +202,11 @@ fn joint_table(log: &LogOutcome) -> Vec<String> {
         ]);
         joints.row(cells);
     }
-    let mut routes = Table::new(
+    let mut routes = ReportTable::new(
         "The same joint torque from the F/T sensor on either side [Nm]: RMS of their difference",
         &[&["joint"], &ERRORS[..]].concat(),
     );
-    let mut moving = Table::new(
+    let mut moving = ReportTable::new(
         "The same without the mean of the difference [Nm]",
         &[&["joint"], &ERRORS[..]].concat(),
     );
@@ -223,7 +223,7 @@ fn joint_table(log: &LogOutcome) -> Vec<String> {
     [joints, routes, moving]
         .iter()
         .filter(|t| !t.is_empty())
-        .map(Table::html)
+        .map(ReportTable::html)
         .collect()
 }
 
@@ -260,8 +260,8 @@ fn pair(curve: &Curve, log: &LogOutcome, most: usize) -> [Plot; 2] {
     let plot = |note: &str, y: &str, series| Plot {
         title: curve.name.clone(),
         note: note.into(),
-        x: Axis::new("t [s]"),
-        y: Axis::new(&format!("{y} [{}]", curve.unit)),
+        x: PlotAxis::new("t [s]"),
+        y: PlotAxis::new(&format!("{y} [{}]", curve.unit)),
         series,
         shades: vec![],
         marks: log
@@ -276,27 +276,27 @@ fn pair(curve: &Curve, log: &LogOutcome, most: usize) -> [Plot; 2] {
             "",
             quantity,
             vec![
-                Series::band("± 2σ", Ink::Identified, band(&centre)),
-                Series::line(measured, Ink::Measured, points(&curve.measured)),
-                Series::line(
+                Trace::band("± 2σ", Ink::Identified, band(&centre)),
+                Trace::line(measured, Ink::Measured, points(&curve.measured)),
+                Trace::line(
                     "CAD, offsets fitted",
                     Ink::Fitted,
                     points(&curve.cad_fitted),
                 ),
-                Series::line("identified", Ink::Identified, points(&curve.identified)),
+                Trace::line("identified", Ink::Identified, points(&curve.identified)),
             ],
         ),
         plot(
             "predicted − measured",
             "error",
             vec![
-                Series::band("± 2σ", Ink::Identified, band(&|_| 0.0)),
-                Series::line(
+                Trace::band("± 2σ", Ink::Identified, band(&|_| 0.0)),
+                Trace::line(
                     "CAD, offsets fitted",
                     Ink::Fitted,
                     errors(&curve.cad_fitted),
                 ),
-                Series::line("identified", Ink::Identified, errors(&curve.identified)),
+                Trace::line("identified", Ink::Identified, errors(&curve.identified)),
             ],
         ),
     ]
@@ -307,7 +307,7 @@ pub(super) fn residuals(outcome: &Outcome) -> Option<String> {
     let mut tables = Vec::new();
     for log in &outcome.logs {
         for sensor in &log.sensors {
-            let mut table = Table::new(
+            let mut table = ReportTable::new(
                 &format!(
                     "{}, {}: RMS of reading less predicted reading, and the share of readings \
                      within the stated 95 % interval",
@@ -337,7 +337,7 @@ pub(super) fn residuals(outcome: &Outcome) -> Option<String> {
     if !tables.is_empty() {
         body.push(format!("<div class=\"figures\">{}</div>", tables.concat()));
     }
-    let mut noise = Table::new(
+    let mut noise = ReportTable::new(
         "Noise of each channel, from the residuals. Observations of a channel with a long \
          autocorrelation time are not independent; they are weighted accordingly.",
         &[
@@ -384,20 +384,20 @@ mod tests {
         let [values, errors] = pair(&curve, log, 100);
         let svg = |plot: Plot| format!("{:?}", plot.series);
         let expected = [
-            Series::band(
+            Trace::band(
                 "± 2σ",
                 Ink::Identified,
                 vec![(0.0, -1.0, 1.0), (1.0, -0.5, 0.5)],
             ),
-            Series::line(
+            Trace::line(
                 "CAD, offsets fitted",
                 Ink::Fitted,
                 vec![(0.0, 2.0), (1.0, 0.5)],
             ),
-            Series::line("identified", Ink::Identified, vec![(0.0, -0.5), (1.0, 0.0)]),
+            Trace::line("identified", Ink::Identified, vec![(0.0, -0.5), (1.0, 0.0)]),
         ];
         assert_eq!(svg(errors), format!("{expected:?}"));
-        let band = Series::band(
+        let band = Trace::band(
             "± 2σ",
             Ink::Identified,
             vec![(0.0, 1.5, 3.5), (1.0, 3.5, 4.5)],

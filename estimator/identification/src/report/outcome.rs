@@ -1,7 +1,8 @@
 //! The result of identification from recorded logs: the robot's parameters with their uncertainty,
 //! figures for each log, and findings.
 //!
-//! Plain data: `parameters.toml`, `summary.json` and `report.html` are written from it. Units are
+//! Plain data: `parameters.toml`, `summary.json` and `report.html` are written from it. What can be
+//! serialised has the keys of `summary.json`, without the name that is a key there itself. Units are
 //! SI, angles in radians; a vector over channels of an F/T sensor is in the order of samples and
 //! logs, `[fx fy fz tx ty tz]` [N, Nm]; ten parameters of a link are `[m, h_x, h_y, h_z, I_xx,
 //! I_xy, I_xz, I_yy, I_yz, I_zz]` about its origin ([`proprio_dynamics::spatial`]).
@@ -14,10 +15,11 @@ use proprio_dynamics::calibration::{Calibration, Kind, Unknown};
 use proprio_dynamics::regressor::identifiable::ParameterColumn;
 use proprio_dynamics::spatial::RigidInertia;
 use proprio_topics::Nanos;
+use serde::{Serialize, Serializer};
 
 /// The same quantity for three sets of parameters. CAD contains no rotor inertias
 /// ([`RotorOutcome`]): with CAD's parameters they are fitted to the training logs.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct ModelComparison<T> {
     /// CAD, with the configured offsets and without friction.
     pub cad: T,
@@ -28,7 +30,7 @@ pub struct ModelComparison<T> {
 }
 
 /// The same quantity for CAD's parameters and the identified ones.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Both<T> {
     /// With CAD's.
     pub cad: T,
@@ -44,7 +46,7 @@ pub(crate) fn both<T: Copy>([cad, identified]: [T; 2]) -> Both<T> {
 /// are those of the training logs (for CAD, friction fitted with CAD's parameters). Only one
 /// constant offset of each F/T channel is fitted to the log. So the error depends on the log and
 /// the parameters alone. It includes all instants, also those with undeclared disturbances.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Predicted {
     /// Relative error. Of joint torques if the log has any: `|tau_hat - tau| / |tau|` over all
     /// joints and samples. Else of F/T readings: the same over all channels of all sensors, the
@@ -54,12 +56,23 @@ pub struct Predicted {
     /// The same of F/T readings with a linear drift of each channel fitted, too; NaN without any.
     pub relative_error_with_drift: Both<f64>,
     /// Per joint with a measured torque: its name, RMS of measured less predicted torque \[Nm\].
+    #[serde(rename = "joints_rms_nm", serialize_with = "by_name")]
     pub joints: Vec<(String, Both<f64>)>,
     /// Per F/T sensor: its name, RMS of read less predicted, `[fx fy fz tx ty tz]` [N, Nm].
+    #[serde(rename = "sensors_rms", serialize_with = "by_name")]
     pub sensors: Vec<(String, Both<[f64; 6]>)>,
     /// Per joint whose torque follows from two sides ([`TwoRouteOutcome`]): its name, RMS of the
     /// difference \[Nm\].
+    #[serde(rename = "two_route_rms_nm", serialize_with = "by_name")]
     pub two_route: Vec<(String, Both<f64>)>,
+}
+
+/// An object with the names as keys.
+fn by_name<T: Serialize, S: Serializer>(
+    named: &[(String, T)],
+    serializer: S,
+) -> Result<S::Ok, S::Error> {
+    serializer.collect_map(named.iter().map(|(name, value)| (name, value)))
 }
 
 /// Parameters that were in use from some instant on.
@@ -128,12 +141,13 @@ pub struct CovarianceRoot {
 }
 
 /// A combination of parameters that the motion of the logs excites least.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct WeakDirection {
     /// An expression, with factors in the parameters' units: `right_hand.m - 0.41
     /// right_forearm.h_z`. Terms that are small in units of the prior's spread are omitted.
     pub expression: String,
     /// The links of these parameters.
+    #[serde(skip)]
     pub links: Vec<usize>,
     /// Its singular value relative to the largest, columns scaled to the prior's spread.
     pub relative: f64,
@@ -143,20 +157,21 @@ pub struct WeakDirection {
 }
 
 /// Time offset of a stream's stamps relative to the encoders'.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TimeOffset {
     /// The stream: the channel of an F/T sensor, or `joint torques`.
     pub channel: String,
     /// What happens at `t` is stamped `t + seconds` \[s\].
     pub seconds: f64,
     /// Its standard deviation \[s\].
+    #[serde(rename = "std")]
     pub deviation: f64,
     /// Whether it is statistically significant and large enough to matter.
     pub significant: bool,
 }
 
 /// A base parameter (an identifiable combination): CAD's value and the identified one.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BaseParameterOutcome {
     /// An expression: `lower.h_y - 0.25 hand.m`.
     pub expression: String,
@@ -167,19 +182,22 @@ pub struct BaseParameterOutcome {
     /// The identified value.
     pub identified: f64,
     /// Its standard deviation.
+    #[serde(rename = "std")]
     pub deviation: f64,
 }
 
 /// The noise of one measured channel, from the residuals of the training logs.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ChannelNoise {
     /// `wrench/r_leg_ft_sensor/fx`, `joint/knee/torque`.
     pub name: String,
     /// `N` or `Nm`.
     pub unit: &'static str,
     /// Standard deviation of the residual at the rate of the rows [`unit`].
+    #[serde(rename = "std")]
     pub deviation: f64,
     /// Its integrated autocorrelation time \[s\].
+    #[serde(rename = "autocorrelation_s")]
     pub autocorrelation_seconds: f64,
     /// Rate of the offset's random walk [`unit` per square root of second]; 0 for a constant.
     pub drift: f64,
@@ -208,24 +226,27 @@ pub struct CalibrationOutcome {
 }
 
 /// Offset of one F/T sensor through a log.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct OffsetOutcome {
     /// The sensor's channel name.
+    #[serde(skip)]
     pub sensor: String,
     /// At the first instant used, `[fx fy fz tx ty tz]` [N, Nm]: raw reading less true wrench.
     pub start: [f64; 6],
     /// At the last instant used.
     pub end: [f64; 6],
     /// Standard deviation at the end.
+    #[serde(rename = "std")]
     pub deviation: [f64; 6],
     /// Rate of its random walk [N, Nm per square root of second].
     pub rate: [f64; 6],
 }
 
 /// Friction of one joint through a log.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct FrictionOutcome {
     /// The joint's name.
+    #[serde(skip)]
     pub joint: String,
     /// Coulomb friction, times `tanh(velocity / 0.02 rad/s)` \[Nm\].
     pub coulomb_nm: f64,
@@ -234,29 +255,34 @@ pub struct FrictionOutcome {
     /// Offset \[Nm\].
     pub offset_nm: f64,
     /// Standard deviations of the three.
+    #[serde(rename = "std")]
     pub deviation: [f64; 3],
 }
 
 /// Inertia of the rotor of a joint's motor. It belongs to the robot, not to a log; only where the
 /// measured torques are the motors' ([`crate::robot::TorqueSide`]).
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct RotorOutcome {
     /// The joint's name.
+    #[serde(skip)]
     pub joint: String,
     /// Reflected to the joint: the rotor's inertia times the square of the gear ratio \[kg m^2; kg
     /// for a prismatic joint\]. Never negative. Where its links keep their CAD parameters
     /// ([`LinkOutcome::retained_fraction`] is 0), the value that fits best together with CAD.
+    #[serde(rename = "kgm2")]
     pub inertia: f64,
     /// Its standard deviation. Where it is not separable from the inertia of links
     /// ([`Outcome::not_separable`]: for the first joint of a fixed base, which rotates all links
     /// about a single axis), it is as uncertain as that inertia is in CAD.
+    #[serde(rename = "std")]
     pub deviation: f64,
 }
 
 /// Prediction errors of the torque of one joint in a log (only where joint torque is measured).
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct JointOutcome {
     /// The joint's name.
+    #[serde(skip)]
     pub name: String,
     /// RMS of measured less predicted torque \[Nm\].
     pub rms_nm: ModelComparison<f64>,
@@ -268,9 +294,10 @@ pub struct JointOutcome {
 }
 
 /// Prediction errors of the readings of one F/T sensor in a log.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SensorOutcome {
     /// Its channel name.
+    #[serde(skip)]
     pub name: String,
     /// RMS of its readings less the prediction from the parameters of all links on its contact-free
     /// side, offsets and neighbouring sensors, `[fx fy fz tx ty tz]` [N, Nm].
