@@ -12,7 +12,7 @@ use proprio_estimator::{files, offline as estimates};
 use proprio_gateway::log::{LogFormat, Stamps};
 use proprio_gateway::offline::{self, DecodeReport};
 use proprio_gateway::plan::Plan;
-use proprio_identification::{Role, implausible};
+use proprio_identification::{LogRole, implausible};
 use proprio_topics::csv::{self, Columns, TableReport};
 use serde_json::json;
 use std::fs::File;
@@ -599,7 +599,7 @@ fn warn_of_implausible(args: &EstimateArgs, setup: &Setup) {
         .then(|| File::open(&args.samples).ok())
         .flatten();
     let robot = &setup.robot;
-    let read = |log: File| reading::dataset(robot, "", Role::Validate, log.take(CHECKED)).ok();
+    let read = |log: File| reading::dataset(robot, "", LogRole::Validate, log.take(CHECKED)).ok();
     let found = log
         .and_then(read)
         .map(|dataset| implausible(robot, dataset));

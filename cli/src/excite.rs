@@ -16,8 +16,8 @@ use proprio_estimator::setup::{Setup, frame};
 use proprio_identification::forecast::SensorNoise;
 use proprio_identification::robot::IdentificationInput;
 use proprio_identification::{CovarianceRoot, Robot};
-use proprio_planning::excite::{Plan, Planner, Task};
-use proprio_planning::motion::{Fence, JointLimits, Series};
+use proprio_planning::excite::{PlannedMotion, Planner, Task};
+use proprio_planning::motion::{Fence, FourierSeries, JointLimits};
 use proprio_planning::workspace::{RISE, measured};
 use serde_json::json;
 use std::io::{self, Write};
@@ -337,7 +337,7 @@ fn fence(robot: &Robot, config: &Config, text: &str) -> Result<Fence, String> {
 }
 
 /// Writes the motion as a table of samples.
-fn write(mut out: impl Write, series: &Series, robot: &Robot) -> io::Result<()> {
+fn write(mut out: impl Write, series: &FourierSeries, robot: &Robot) -> io::Result<()> {
     write!(out, "t")?;
     for dof in measured(robot) {
         let name = robot.model.dof_name(dof);
@@ -361,7 +361,12 @@ fn write(mut out: impl Write, series: &Series, robot: &Robot) -> io::Result<()> 
 }
 
 /// Prints the forecast.
-fn report(args: &ExciteArgs, plan: &Plan, robot: &Robot, wanted: &[usize]) -> anyhow::Result<()> {
+fn report(
+    args: &ExciteArgs,
+    plan: &PlannedMotion,
+    robot: &Robot,
+    wanted: &[usize],
+) -> anyhow::Result<()> {
     let model = &robot.model;
     let start = plan.series.at(0.0).position;
     let torques = || plan.before.iter().zip(&plan.after);

@@ -8,7 +8,7 @@ use proprio_estimator::check::significant;
 use proprio_estimator::config::{Config, ConfigError, ForceTorque};
 use proprio_estimator::setup::{Setup, nearest};
 use proprio_identification::{Robot, parallel};
-use proprio_planning::knowledge::{Knowledge, Torque, limit, only, regime};
+use proprio_planning::knowledge::{Knowledge, TorqueKnowledge, limit, only, regime};
 use proprio_planning::workspace::{Deviation, Workspace, measured};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -339,7 +339,7 @@ impl SensorPlacement {
             "{}: {rank} combinations of {unknowns} parameters and offsets can be identified",
             self.title()
         );
-        let name = |torque: &Torque| model.dof_name(torque.dof).to_owned();
+        let name = |torque: &TorqueKnowledge| model.dof_name(torque.dof).to_owned();
         let torques = self.knowledge.torques.iter();
         let width = torques
             .clone()
@@ -369,7 +369,7 @@ impl SensorPlacement {
     }
 
     /// What a torque rests on that cannot be identified, in words.
-    fn why(&self, torque: &Torque) -> String {
+    fn why(&self, torque: &TorqueKnowledge) -> String {
         if torque.identified.is_none() {
             return "undetermined: too many contacts".into();
         }

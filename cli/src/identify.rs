@@ -24,7 +24,7 @@ use proprio_estimator::config::Config;
 use proprio_estimator::export;
 use proprio_estimator::setup::Setup;
 use proprio_identification::robot::IdentificationInput;
-use proprio_identification::{Options, Outcome, Progress, Role, Severity, Verdict, identify};
+use proprio_identification::{LogRole, Outcome, Progress, Severity, Verdict, identify};
 use std::fs;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -82,15 +82,12 @@ pub(crate) fn run(args: &IdentifyArgs) -> anyhow::Result<()> {
         config.parameters = None;
         config.identification.enabled = false;
     })?;
-    let train = args.samples.iter().map(|f| (f, Role::Train));
-    let validate = args.validate.iter().map(|f| (f, Role::Validate));
+    let train = args.samples.iter().map(|f| (f, LogRole::Train));
+    let validate = args.validate.iter().map(|f| (f, LogRole::Validate));
     let inputs = Inputs {
         config_file: &args.config,
         // Read now: it may be a result of an earlier run, which is removed below.
         urdf: Model::read_text(&config.model)?,
-        options: Options {
-            inputs: config.identification.inputs.clone(),
-        },
         config,
         setup,
         files: train.chain(validate).collect(),
@@ -137,8 +134,7 @@ struct Inputs<'a> {
     config: Config,
     setup: Setup,
     urdf: String,
-    options: Options,
-    files: Vec<(&'a PathBuf, Role)>,
+    files: Vec<(&'a PathBuf, LogRole)>,
     bar: ProgressBar,
 }
 
@@ -166,7 +162,8 @@ impl Inputs<'_> {
             datasets.push(read(&self.setup, &name, *role, table)?);
         }
         let mut progress = |at: &Progress| self.show(&at.step, reading + (1.0 - reading) * at.done);
-        let result = identify(&self.setup.robot, datasets, &self.options, &mut progress);
+        let inputs = &self.config.identification.inputs;
+        let result = identify(&self.setup.robot, datasets, inputs, &mut progress);
         if result.is_err() {
             self.bar.finish_and_clear();
         }
@@ -184,7 +181,11 @@ impl Inputs<'_> {
         let mut parameters = export::parameters(outcome, &setup.robot, program)?;
         let mut found = Vec::new();
         // What was identified from torques is no opinion of its own on them.
-        let is_second = !self.options.inputs.contains(&IdentificationInput::Torque)
+        let is_second = !self
+            .config
+            .identification
+            .inputs
+            .contains(&IdentificationInput::Torque)
             && !setup.robot.structure.sensors().is_empty();
         if is_second {
             self.show("drives", 1.0);

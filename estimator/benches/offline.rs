@@ -20,7 +20,7 @@ use proprio_dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
 use proprio_estimator::config::Config;
 use proprio_estimator::reading;
 use proprio_estimator::setup::Setup;
-use proprio_identification::{Options, Role, Verdict, identify};
+use proprio_identification::{LogRole, Verdict, identify};
 use std::fmt::Write as _;
 
 fn main() {
@@ -159,14 +159,9 @@ fn identify_a_log(bencher: Bencher<'_, '_>, samples: usize) {
     let text = log(&setup, samples);
     bencher.counter(ItemsCount::new(samples)).bench_local(|| {
         let log = text.as_bytes();
-        let dataset = reading::dataset(&setup.robot, "log.csv", Role::Train, log).expect("a log");
-        let outcome = identify(
-            &setup.robot,
-            vec![dataset],
-            &Options::default(),
-            &mut |_| (),
-        )
-        .expect("an outcome");
+        let dataset =
+            reading::dataset(&setup.robot, "log.csv", LogRole::Train, log).expect("a log");
+        let outcome = identify(&setup.robot, vec![dataset], &[], &mut |_| ()).expect("an outcome");
         assert_eq!(outcome.verdict, Verdict::Identified);
         outcome
     });

@@ -257,7 +257,7 @@ impl Bench {
     /// Checks that every component uses its rows: otherwise the benchmark measures something else.
     fn check(&self) {
         let online = self.pipeline.identification().expect("it identifies");
-        for group in 0..online.component_count() {
+        for group in 0..online.solution().components.len() {
             let (paused, counts) = online.state(group).expect("a group");
             assert!(
                 counts.learnt * 20 > (counts.suspected + counts.outlier) && counts.failed == 0,

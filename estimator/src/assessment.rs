@@ -16,7 +16,7 @@ use crate::pipeline::{Estimate, Pipeline};
 use crate::reading::{self, ReadingError};
 use crate::setup::Setup;
 use proprio_identification::dataset::observation::Observation;
-use proprio_identification::{InForce, Predicted, Robot, Role, judged, predicted};
+use proprio_identification::{InForce, LogRole, Predicted, Robot, judged, predicted};
 use proprio_topics::{JointTorque, Nanos};
 use std::io::Read;
 
@@ -93,7 +93,10 @@ impl Assessor {
     pub fn new(setup: &Setup, log: impl Read) -> Result<Self, ReadingError> {
         let robot = setup.robot.clone();
         Ok(Self {
-            instants: judged(&robot, reading::dataset(&robot, "", Role::Validate, log)?),
+            instants: judged(
+                &robot,
+                reading::dataset(&robot, "", LogRole::Validate, log)?,
+            ),
             next: 0,
             last: None,
             course: vec![in_force(setup, Nanos::MIN)],

@@ -10,7 +10,7 @@ use proprio_dynamics::regressor::identifiable::ParameterColumn;
 use proprio_dynamics::spatial::Wrench;
 use proprio_identification::Robot;
 use proprio_identification::robot::{AXES, ChannelRole};
-use proprio_identification::{Known, LogOutcome, Outcome, Role};
+use proprio_identification::{KnownParameters, LogOutcome, LogRole, Outcome};
 
 /// The identified parameters of `robot`: inertial parameters of the links in the covariance,
 /// offsets, calibrations, friction, rotor inertias. Offsets and friction are those at the end of
@@ -25,7 +25,7 @@ pub fn parameters(
     robot: &Robot,
     program: &str,
 ) -> Result<Parameters, ParametersError> {
-    let trained = || outcome.logs.iter().filter(|log| log.role == Role::Train);
+    let trained = || outcome.logs.iter().filter(|log| log.role == LogRole::Train);
     let provenance = Provenance {
         program: program.to_owned(),
         tau: outcome.tau.is_finite().then_some(outcome.tau),
@@ -149,7 +149,7 @@ fn frictions(log: &LogOutcome) -> Vec<Friction> {
 
 /// What is known with these parameters about `robot` before it takes a payload up.
 #[must_use]
-pub fn known(parameters: &Parameters, robot: &Robot) -> Known {
+pub fn known(parameters: &Parameters, robot: &Robot) -> KnownParameters {
     let links: Vec<usize> = parameters.identified().collect();
     let root = parameters.root();
     // The deviation of each channel's gain with itself, the largest.
@@ -166,7 +166,7 @@ pub fn known(parameters: &Parameters, robot: &Robot) -> Known {
             }
         }
     }
-    Known {
+    KnownParameters {
         root: root.columns(0, 10 * links.len()).into_owned(),
         links,
         gains,
@@ -292,8 +292,8 @@ mod tests {
                 .collect(),
             time_offsets: vec![],
             logs: vec![
-                log("train.csv", Role::Train, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
-                log("validate.csv", Role::Validate, [9.0; 6]),
+                log("train.csv", LogRole::Train, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
+                log("validate.csv", LogRole::Validate, [9.0; 6]),
             ],
             findings: vec![],
         }

@@ -8,7 +8,7 @@
 
 use crate::setup::Setup;
 use anyhow::Context;
-use proprio_identification::{Dataset, Finding, Recording, Robot, Role, implausible};
+use proprio_identification::{Dataset, Finding, LogRole, Recording, Robot, implausible};
 use proprio_topics::csv::Value;
 use proprio_topics::{ContactState, Nanos, Quality, Reading};
 use std::collections::BTreeSet;
@@ -172,7 +172,7 @@ fn findings(robot: &Robot, window: &mut [Received]) -> Vec<Finding> {
     }
     recording.set_rows(window.len() as u64, None);
     // A missing channel is reported by the data plane.
-    let dataset = Dataset::new(robot, "", Role::Validate, recording);
+    let dataset = Dataset::new(robot, "", LogRole::Validate, recording);
     dataset.map_or_else(|_| Vec::new(), |dataset| implausible(robot, dataset))
 }
 

@@ -9,7 +9,7 @@ use crate::setup::{Setup, similar_name};
 use proprio_identification::dataset::DatasetError;
 use proprio_identification::dataset::recording::SkippedRows;
 use proprio_identification::robot::Channel;
-use proprio_identification::{Dataset, Recording, Robot, Role, parallel};
+use proprio_identification::{Dataset, LogRole, Recording, Robot, parallel};
 use proprio_topics::csv::{self, Row, Series, SeriesValue, TableReader, TableReport, Value, What};
 use proprio_topics::{Kind, Nanos};
 use std::io::Read;
@@ -64,7 +64,7 @@ impl ReadingError {
 pub fn dataset(
     robot: &Robot,
     name: &str,
-    role: Role,
+    role: LogRole,
     log: impl Read,
 ) -> Result<Dataset, ReadingError> {
     let recording = recording(robot, log)?;
@@ -79,7 +79,7 @@ pub fn dataset(
 pub fn dataset_or_unreadable(
     robot: &Robot,
     name: &str,
-    role: Role,
+    role: LogRole,
     log: impl Read,
 ) -> Result<Dataset, ReadingError> {
     match dataset(robot, name, role, log) {

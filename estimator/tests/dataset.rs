@@ -17,7 +17,7 @@ use proprio_estimator::setup::Setup;
 use proprio_identification::dataset::observation::Observation;
 use proprio_identification::dataset::smooth::{Scratch, Smoother};
 use proprio_identification::robot::BaseMotion;
-use proprio_identification::{Dataset, Finding, Robot, Role, Severity};
+use proprio_identification::{Dataset, Finding, LogRole, Robot, Severity};
 use proprio_topics::{Nanos, Quality, Reason};
 use std::path::{Path, PathBuf};
 
@@ -162,7 +162,7 @@ impl Table {
 }
 
 fn read(robot: &Robot, log: impl std::io::Read) -> Dataset {
-    reading::dataset(robot, "log", Role::Train, log).expect("a log")
+    reading::dataset(robot, "log", LogRole::Train, log).expect("a log")
 }
 
 const COLUMNS: [&str; 8] = [

@@ -19,7 +19,7 @@ use proprio_estimator::setup::Setup;
 use proprio_estimator::{offline, reading};
 use proprio_identification::robot::{BaseMotion, IdentificationInput, TorqueSide};
 use proprio_identification::{
-    Finding, FindingCode, JointOutcome, LogOutcome, Options, Outcome, Predicted, Role, Severity,
+    Finding, FindingCode, JointOutcome, LogOutcome, LogRole, Outcome, Predicted, Severity,
     TwoRouteOutcome, Verdict, identify, implausible, payload,
 };
 use std::collections::HashMap;
@@ -52,15 +52,12 @@ fn between(log: &str, from: f64, to: f64) -> String {
         .collect()
 }
 
-fn run(setup: &Setup, logs: &[(&str, Role, &str)], inputs: &[IdentificationInput]) -> Outcome {
-    let dataset = |(file, role, text): &(&str, Role, &str)| {
+fn run(setup: &Setup, logs: &[(&str, LogRole, &str)], inputs: &[IdentificationInput]) -> Outcome {
+    let dataset = |(file, role, text): &(&str, LogRole, &str)| {
         reading::dataset_or_unreadable(&setup.robot, file, *role, text.as_bytes()).expect("a log")
     };
     let datasets = logs.iter().map(dataset).collect();
-    let options = Options {
-        inputs: inputs.to_vec(),
-    };
-    let outcome = identify(&setup.robot, datasets, &options, &mut |_| {}).expect("an outcome");
+    let outcome = identify(&setup.robot, datasets, inputs, &mut |_| {}).expect("an outcome");
     describe(&outcome);
     outcome
 }
@@ -192,8 +189,8 @@ fn kuka_one_predicts_the_other() {
         let outcome = run(
             &setup,
             &[
-                ("train", Role::Train, train),
-                ("test", Role::Validate, test),
+                ("train", LogRole::Train, train),
+                ("test", LogRole::Validate, test),
             ],
             &TORQUE,
         );
@@ -220,7 +217,10 @@ fn kuka_one_predicts_the_other() {
         nothing_is_suspected(&outcome);
     }
     // No encoder offset is found in both together.
-    let both = [("one", Role::Train, &*one), ("two", Role::Train, &*two)];
+    let both = [
+        ("one", LogRole::Train, &*one),
+        ("two", LogRole::Train, &*two),
+    ];
     let outcome = run(&setup, &both, &TORQUE);
     assert!(
         outcome
@@ -240,8 +240,8 @@ fn kuka_half_a_log_predicts_the_other_half() {
         let outcome = run(
             &setup,
             &[
-                ("train", Role::Train, train),
-                ("test", Role::Validate, test),
+                ("train", LogRole::Train, train),
+                ("test", LogRole::Validate, test),
             ],
             &TORQUE,
         );
@@ -287,8 +287,8 @@ fn kuka_one_region_predicts_the_other() {
             let outcome = run(
                 &setup,
                 &[
-                    ("train", Role::Train, train),
-                    ("test", Role::Validate, test),
+                    ("train", LogRole::Train, train),
+                    ("test", LogRole::Validate, test),
                 ],
                 &TORQUE,
             );
@@ -340,8 +340,8 @@ fn kuka_touched_is_identified_all_the_same() {
     let outcome = run(
         &setup,
         &[
-            ("touched", Role::Train, &touched),
-            ("test", Role::Validate, &two),
+            ("touched", LogRole::Train, &touched),
+            ("test", LogRole::Validate, &two),
         ],
         &TORQUE,
     );
@@ -377,9 +377,9 @@ fn a_touch_in_held_out_data_is_told() {
         push,
     );
     let logs = [
-        ("train", Role::Train, &*train),
-        ("rest", Role::Validate, &rest),
-        ("touched", Role::Validate, &touched),
+        ("train", LogRole::Train, &*train),
+        ("rest", LogRole::Validate, &rest),
+        ("touched", LogRole::Validate, &touched),
     ];
     let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
     let told: Vec<Vec<&Finding>> = (outcome.logs.iter())
@@ -432,10 +432,10 @@ fn jumps_and_grips_in_held_out_data_are_told() {
     };
     let (slipped, gripped) = (changed(900..usize::MAX, &again), changed(900..1100, &again));
     let logs = [
-        ("train", Role::Train, &*train),
-        ("again", Role::Validate, &again),
-        ("slipped", Role::Validate, &slipped),
-        ("gripped", Role::Validate, &gripped),
+        ("train", LogRole::Train, &*train),
+        ("again", LogRole::Validate, &again),
+        ("slipped", LogRole::Validate, &slipped),
+        ("gripped", LogRole::Validate, &gripped),
     ];
     let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
     let is_named = |log: &LogOutcome| {
@@ -466,16 +466,20 @@ fn what_pushes_leave_is_not_unexplained() {
             push,
         )
     };
-    let said = |logs: &[(&str, Role, &str)]| {
+    let said = |logs: &[(&str, LogRole, &str)]| {
         let outcome = run(&setup, logs, &[IdentificationInput::Wrench]);
         let findings = outcome.logs.last().expect("a log").findings.iter();
         let codes = [FindingCode::Disturbance, FindingCode::Unexplained];
         codes.map(|code| findings.clone().any(|f| f.code == code))
     };
-    let validated =
-        |log: &str| said(&[("train", Role::Train, &train), ("log", Role::Validate, log)]);
+    let validated = |log: &str| {
+        said(&[
+            ("train", LogRole::Train, &train),
+            ("log", LogRole::Validate, log),
+        ])
+    };
     assert_eq!(
-        said(&[("log", Role::Train, &pushed(&again))]),
+        said(&[("log", LogRole::Train, &pushed(&again))]),
         [true, false]
     );
     assert_eq!(validated(&again), [false, false]);
@@ -483,7 +487,7 @@ fn what_pushes_leave_is_not_unexplained() {
     let dead = change(&again, "joint/j4/position", |_| 0.3);
     let turned = change(&again, "wrench/ft/fy", |y| -y);
     for wrong in [dead, turned] {
-        assert!(said(&[("log", Role::Train, &pushed(&wrong))])[1]);
+        assert!(said(&[("log", LogRole::Train, &pushed(&wrong))])[1]);
         assert!(validated(&wrong)[1]);
         assert!(validated(&pushed(&wrong))[1]);
     }
@@ -508,8 +512,8 @@ fn a_jump_of_an_offset_is_told_and_does_no_harm() {
         let slip = change_rows(&train, &column, |row, value| value + 5.0 * share(row));
         let of = |train: &str| {
             let logs = [
-                ("train", Role::Train, train),
-                ("rest", Role::Validate, &*rest),
+                ("train", LogRole::Train, train),
+                ("rest", LogRole::Validate, &*rest),
             ];
             let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
             assert_eq!(outcome.verdict, Verdict::Identified);
@@ -571,8 +575,8 @@ fn leg_torques_from_either_sensor_agree() {
     let outcome = run(
         &setup,
         &[
-            ("first", Role::Train, &first),
-            ("second", Role::Validate, &second),
+            ("first", LogRole::Train, &first),
+            ("second", LogRole::Validate, &second),
         ],
         &[IdentificationInput::Wrench],
     );
@@ -621,16 +625,16 @@ fn predicted_ratios(
     let mut of_cad = vec![Vec::new(); logs.len()];
     for trained in choices {
         let is_trained = |log: usize| trained.contains(&log);
-        let given: Vec<(&str, Role, &str)> = logs
+        let given: Vec<(&str, LogRole, &str)> = logs
             .iter()
             .enumerate()
             .map(|(log, (file, table))| {
                 (
                     *file,
                     if is_trained(log) {
-                        Role::Train
+                        LogRole::Train
                     } else {
-                        Role::Validate
+                        LogRole::Validate
                     },
                     *table,
                 )
@@ -753,8 +757,8 @@ fn offsets_and_drifts_are_no_fault_of_the_parameters() {
     };
     let of = |table: &str| {
         let logs = [
-            ("first", Role::Train, &first[..]),
-            ("second", Role::Validate, table),
+            ("first", LogRole::Train, &first[..]),
+            ("second", LogRole::Validate, table),
         ];
         let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
         outcome.logs[1].predicted.clone()
@@ -1013,7 +1017,7 @@ fn gravity_that_points_elsewhere_is_named() {
     let on_a_wall = FrameMotion::standing(&Vec3::new(9.80665, 0.0, 0.0));
     wrong.robot.base = BaseMotion::Standing(on_a_wall);
     let [right, wrong] = [setup, wrong].map(|setup| {
-        let outcome = run(&setup, &[("log", Role::Train, &log)], &[]);
+        let outcome = run(&setup, &[("log", LogRole::Train, &log)], &[]);
         let named = (outcome.findings.into_iter()).find(|f| f.code == FindingCode::WrongGravity);
         (outcome.verdict, named)
     });
@@ -1058,7 +1062,7 @@ fn a_payload_is_what_a_link_carries_more_than_before() {
         let (before, after) = (log(&truth, 90 + seed), log(&loaded, 190 + seed));
         let again = log(&truth, 290 + seed);
 
-        let reference = run(&setup, &[("before", Role::Train, &before)], &[]);
+        let reference = run(&setup, &[("before", LogRole::Train, &before)], &[]);
         let reference = parameters(&reference, &setup.robot, "this test").expect("parameters");
         setup.apply(&reference).expect("they fit");
         setup.robot = setup.robot_as_identified();
@@ -1068,10 +1072,10 @@ fn a_payload_is_what_a_link_carries_more_than_before() {
             translation: Vec3::new(0.0, 0.03, 0.1),
         };
         let found = |log: &str| {
-            let dataset = reading::dataset(&setup.robot, "log", Role::Train, log.as_bytes());
+            let dataset = reading::dataset(&setup.robot, "log", LogRole::Train, log.as_bytes());
             let (frame, known) = (Frame { link, pose }, known(&reference, &setup.robot));
             let logs = vec![dataset.expect("a log")];
-            payload(&setup.robot, &known, &frame, logs, &Options::default()).expect("a payload")
+            payload(&setup.robot, &known, &frame, logs, &[]).expect("a payload")
         };
         let carried = found(&after);
         let (mass, std) = carried.mass();
@@ -1269,7 +1273,7 @@ fn sensor_the_wrong_way_round_is_named_and_nothing_identified() {
     for axis in AXES {
         log = change(&log, &format!("wrench/ft/{axis}"), |x| -x);
     }
-    let outcome = run(&setup, &[("turned", Role::Train, &log)], &[]);
+    let outcome = run(&setup, &[("turned", LogRole::Train, &log)], &[]);
     assert!(
         matches!(outcome.verdict, Verdict::Nothing(_)),
         "{:?}",
@@ -1309,13 +1313,13 @@ fn a_log_with_a_sensor_turned_is_refused_alone() {
         log(7, false),
     ];
     let roles = [
-        Role::Train,
-        Role::Train,
-        Role::Train,
-        Role::Validate,
-        Role::Validate,
+        LogRole::Train,
+        LogRole::Train,
+        LogRole::Train,
+        LogRole::Validate,
+        LogRole::Validate,
     ];
-    let given: Vec<(&str, Role, &str)> = logs
+    let given: Vec<(&str, LogRole, &str)> = logs
         .iter()
         .zip(roles)
         .map(|(log, role)| ("log", role, &**log))
@@ -1391,7 +1395,7 @@ fn a_sensor_in_another_frame_is_named_with_the_right_one() {
     ] {
         let outcome = run(
             &setup,
-            &[("turned", Role::Train, &turned(&pose, sign))],
+            &[("turned", LogRole::Train, &turned(&pose, sign))],
             &[],
         );
         assert!(
@@ -1410,7 +1414,7 @@ fn a_sensor_in_another_frame_is_named_with_the_right_one() {
     // An origin error of the size of errors of the bodies is not a wrong frame.
     let outcome = run(
         &setup,
-        &[("moved", Role::Train, &turned(&parent, 1.0))],
+        &[("moved", LogRole::Train, &turned(&parent, 1.0))],
         &[],
     );
     assert!(
@@ -1434,7 +1438,7 @@ fn of_two_sensors_the_turned_one_is_named() {
                 wrong = change(&wrong, &format!("wrench/{sensor}/{axis}"), |x| -x);
             }
         }
-        let outcome = run(&setup, &[("turned", Role::Train, &wrong)], &[]);
+        let outcome = run(&setup, &[("turned", LogRole::Train, &wrong)], &[]);
         assert!(
             matches!(outcome.verdict, Verdict::Nothing(_)),
             "{:?}",
@@ -1457,7 +1461,7 @@ fn readings_of_two_sensors_are_compared_as_they_are() {
     let setup = arm_with(&["ft", "wrist"]);
     let truth = real(&setup, 3);
     let log = simulate(&setup, &truth, 12.0, 0.01, 3);
-    let outcome = run(&setup, &[("log", Role::Train, &log)], &[]);
+    let outcome = run(&setup, &[("log", LogRole::Train, &log)], &[]);
     assert_eq!(outcome.verdict, Verdict::Identified);
     let table: Vec<Vec<f64>> = log
         .lines()
@@ -1559,8 +1563,8 @@ fn the_number_of_cores_changes_nothing() {
         .replace("/acceleration", "/a");
     let outcome = || {
         let logs = [
-            ("first", Role::Train, first.as_str()),
-            ("second", Role::Train, second.as_str()),
+            ("first", LogRole::Train, first.as_str()),
+            ("second", LogRole::Train, second.as_str()),
         ];
         let outcome = run(&setup, &logs, &[]);
         assert_eq!(outcome.verdict, Verdict::Identified);
@@ -1616,8 +1620,8 @@ fn the_offset_of_a_sensor_is_of_the_last_log_that_reads_it() {
         })
         .collect();
     let logs = [
-        ("whole", Role::Train, &*whole),
-        ("without", Role::Train, &*without),
+        ("whole", LogRole::Train, &*whole),
+        ("without", LogRole::Train, &*without),
     ];
     let outcome = run(&setup, &logs, &[]);
     let named = |log: usize| -> Vec<&str> {
@@ -1658,7 +1662,7 @@ fn nothing_is_called_identified_that_was_not_checked() {
         .chain(rows)
         .flat_map(|line| [line, "\n"])
         .collect();
-    let outcome = run(&setup, &[("short", Role::Train, &short)], &[]);
+    let outcome = run(&setup, &[("short", LogRole::Train, &short)], &[]);
     if matches!(outcome.verdict, Verdict::Nothing(_)) {
         panic!("the log is too short for this test: {:?}", outcome.findings);
     }
@@ -1693,7 +1697,7 @@ fn noise_of_a_torque_that_was_seldom_measured_is_known() {
     let log = simulate_torques(&setup, &truth, 125.0, 0.02, 3, |joint, i| {
         joint != 5 || (1080..1240).contains(&i)
     });
-    let outcome = run(&setup, &[("long", Role::Train, &log)], &TORQUE);
+    let outcome = run(&setup, &[("long", LogRole::Train, &log)], &TORQUE);
     let of = |joint: &str| {
         let name = format!("joint/{joint}/torque");
         outcome
@@ -1759,10 +1763,10 @@ fn rich_torques(setup: &Setup, truth: &Model, seconds: f64, seed: u64) -> String
 fn torques_of_a_rich_log_come_within_a_hundredth() {
     let setup = arm_with(&[]);
     let truth = real(&setup, 5);
-    let logs = [(5, Role::Train, 25.0), (7, Role::Validate, 12.0)];
+    let logs = [(5, LogRole::Train, 25.0), (7, LogRole::Validate, 12.0)];
     let logs =
         logs.map(|(seed, role, seconds)| (role, rich_torques(&setup, &truth, seconds, seed)));
-    let given: Vec<(&str, Role, &str)> = logs
+    let given: Vec<(&str, LogRole, &str)> = logs
         .iter()
         .map(|(role, log)| ("log", *role, &**log))
         .collect();
@@ -1817,8 +1821,8 @@ fn rotors_are_identified_from_torques_of_motors() {
         at_the_motors(&log, &ROTORS, friction)
     };
     let logs = [log(5, 0.5), log(6, 1.5), log(7, 1.0)];
-    let roles = [Role::Train, Role::Train, Role::Validate];
-    let given: Vec<(&str, Role, &str)> = logs
+    let roles = [LogRole::Train, LogRole::Train, LogRole::Validate];
+    let given: Vec<(&str, LogRole, &str)> = logs
         .iter()
         .zip(roles)
         .map(|(log, role)| ("log", role, &**log))
@@ -1875,7 +1879,7 @@ fn a_negative_rotor_is_named() {
     let rotors = [0.3, 0.2, 0.1, -0.1, 0.05, 0.0];
     let outcome = run(
         &setup,
-        &[("log", Role::Train, &at_the_motors(&log, &rotors, 0.5))],
+        &[("log", LogRole::Train, &at_the_motors(&log, &rotors, 0.5))],
         &TORQUE,
     );
     let of = |joint: &str| {
@@ -1916,7 +1920,7 @@ fn no_rotor_beside_cads_links_is_negative() {
         .chain(rows)
         .flat_map(|line| [line, "\n"])
         .collect();
-    let outcome = run(&setup, &[("short", Role::Train, &short)], &TORQUE);
+    let outcome = run(&setup, &[("short", LogRole::Train, &short)], &TORQUE);
     assert_eq!(outcome.verdict, Verdict::NoBetterThanCad);
     let inertias: Vec<f64> = outcome.rotors.iter().map(|rotor| rotor.inertia).collect();
     assert!(
@@ -1936,7 +1940,7 @@ fn a_negative_rotor_is_no_help_on_held_out_data() {
     for (seed, negative) in [(5, 0.3), (5, 1.0), (6, 0.3)] {
         let log = simulate_torques(&setup, &truth, 12.0, 0.05, seed, |_, _| true);
         let log = at_the_motors(&log, &[0.3, 0.2, 0.1, -negative, 0.05, 0.02], 0.5);
-        let outcome = run(&setup, &[("log", Role::Train, &log)], &TORQUE);
+        let outcome = run(&setup, &[("log", LogRole::Train, &log)], &TORQUE);
         let (cad, own, inside, _) = torque_errors(&setup, &truth, &outcome, 77);
         println!("torques of the links: {cad:.4} -> {own:.4} Nm, covered {inside:.3}");
         assert!(
@@ -1986,7 +1990,7 @@ fn joint_torques_do_not_hide_a_turned_sensor() {
         log = change(&log, &format!("wrench/ft/{axis}"), |x| -x);
     }
     let both = [IdentificationInput::Wrench, IdentificationInput::Torque];
-    let outcome = run(&setup, &[("turned", Role::Train, &log)], &both);
+    let outcome = run(&setup, &[("turned", LogRole::Train, &log)], &both);
     assert!(
         matches!(outcome.verdict, Verdict::Nothing(_)),
         "{:?}",
@@ -2017,7 +2021,7 @@ fn rotors_are_identified_beside_a_force_torque_sensor() {
         at_the_motors(&with_torques(&wrenches, &torques), &ROTORS, 0.8)
     };
     let both = [IdentificationInput::Wrench, IdentificationInput::Torque];
-    let outcome = run(&setup, &[("log", Role::Train, &log(8))], &both);
+    let outcome = run(&setup, &[("log", LogRole::Train, &log(8))], &both);
     assert_eq!(outcome.verdict, Verdict::Identified);
     assert_eq!(outcome.rotors.len(), 6);
     for (rotor, truth) in outcome.rotors.iter().zip(ROTORS) {
@@ -2074,7 +2078,7 @@ fn late_readings_are_found_with_their_deviation() {
         let log = axes
             .iter()
             .fold(log.clone(), |log, axis| shifted(&log, axis, late));
-        let outcome = run(&setup, &[("log", Role::Train, &log)], &[]);
+        let outcome = run(&setup, &[("log", LogRole::Train, &log)], &[]);
         let [offset] = &outcome.time_offsets[..] else {
             panic!("{:?}", outcome.time_offsets)
         };
@@ -2115,7 +2119,7 @@ fn torques_that_can_not_be_are_named_and_left_out() {
         FindingCode::NegativeRotorInertia,
     ];
     let named = |log: &str| {
-        let outcome = run(&setup, &[("log", Role::Train, log)], &TORQUE);
+        let outcome = run(&setup, &[("log", LogRole::Train, log)], &TORQUE);
         let found = outcome.findings.iter().chain(&outcome.logs[0].findings);
         let found = found.filter(|f| codes.contains(&f.code));
         let names: Vec<String> = found.map(|f| format!("{} {}", f.code, f.subject)).collect();
@@ -2239,7 +2243,7 @@ fn rotors_beside_links_that_stay_as_in_cad_are_as_uncertain_as_these() {
         .chain(rows)
         .flat_map(|line| [line, "\n"])
         .collect();
-    let outcome = run(&setup, &[("short", Role::Train, &short)], &TORQUE);
+    let outcome = run(&setup, &[("short", LogRole::Train, &short)], &TORQUE);
     assert_eq!(outcome.verdict, Verdict::NoBetterThanCad);
     assert!(outcome.links.iter().all(|link| link.identified == link.cad));
     for (rotor, truth) in outcome.rotors.iter().zip(ROTORS) {
@@ -2388,8 +2392,8 @@ fn with_gain(
     let mut setup = setup.clone();
     setup.robot.calibrated.gain = gain;
     let logs = [
-        ("train", Role::Train, train),
-        ("rest", Role::Validate, rest),
+        ("train", LogRole::Train, train),
+        ("rest", LogRole::Validate, rest),
     ];
     let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
     let parameters = parameters(&outcome, &setup.robot, "a test").expect("parameters");
@@ -2524,7 +2528,7 @@ fn what_a_gain_leaves_under_load_is_no_contact() {
     setup.robot.calibrated.gain = Gain::Diagonal;
     let outcome = run(
         &setup,
-        &[("log", Role::Train, &log)],
+        &[("log", LogRole::Train, &log)],
         &[IdentificationInput::Wrench],
     );
     let left_out = outcome.logs[0].excluded.iter();
@@ -2594,7 +2598,7 @@ fn the_drift_of_a_sensor_with_temperature_is_identified() {
     let wrench = [IdentificationInput::Wrench];
     // If temperature drift is not requested, temperatures change nothing.
     let text = |log: &str, setup: &Setup| {
-        let outcome = run(setup, &[("train", Role::Train, log)], &wrench);
+        let outcome = run(setup, &[("train", LogRole::Train, log)], &wrench);
         parameters(&outcome, &setup.robot, "a test")
             .expect("parameters")
             .to_string()
@@ -2610,7 +2614,7 @@ fn the_drift_of_a_sensor_with_temperature_is_identified() {
         gain: Gain::None,
         temperature: true,
     };
-    let outcome = run(&setup, &[("train", Role::Train, &log)], &wrench);
+    let outcome = run(&setup, &[("train", LogRole::Train, &log)], &wrench);
     let errors = calibration_errors(&outcome, &right);
     assert_eq!(errors.len(), 6);
     assert!(errors.iter().all(|error| error.abs() < 3.0), "{errors:?}");
@@ -2625,7 +2629,7 @@ fn the_drift_of_a_sensor_with_temperature_is_identified() {
     // A missing temperature is reported, and nothing else changes.
     let blind = run(
         &setup,
-        &[("train", Role::Train, &without_temperature)],
+        &[("train", LogRole::Train, &without_temperature)],
         &wrench,
     );
     assert!(blind.calibrations.is_empty());
@@ -2648,7 +2652,7 @@ fn a_gain_that_no_motion_tells_stays_the_workbenchs() {
     setup.robot.gain_std = 5e-4;
     let outcome = run(
         &setup,
-        &[("train", Role::Train, &log)],
+        &[("train", LogRole::Train, &log)],
         &[IdentificationInput::Wrench],
     );
     let found = &outcome.calibrations[0];
@@ -2684,8 +2688,8 @@ fn gains_cost_nothing_where_they_are_right() {
         let [own, without] = [Gain::Auto, Gain::None].map(|kind| {
             setup.robot.calibrated.gain = kind;
             let logs = [
-                ("train", Role::Train, &*train),
-                ("other", Role::Validate, &*other),
+                ("train", LogRole::Train, &*train),
+                ("other", LogRole::Validate, &*other),
             ];
             let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
             assert_eq!(
@@ -2716,7 +2720,7 @@ fn no_offset_walks_faster_than_its_noise() {
             x + offset
         })
     });
-    let outcome = run(&setup, &[("log", Role::Train, &log)], &[]);
+    let outcome = run(&setup, &[("log", LogRole::Train, &log)], &[]);
     for (axis, stated) in AXES.iter().zip(&stated) {
         let name = format!("wrench/ft/{axis}");
         let mut channels = outcome.channels.iter();
@@ -2752,7 +2756,7 @@ fn what_is_asked_for_in_vain_is_said() {
             &[],
         ),
     ] {
-        let outcome = run(&setup, &[("log", Role::Train, &log)], inputs);
+        let outcome = run(&setup, &[("log", LogRole::Train, &log)], inputs);
         let notes = outcome.findings.iter();
         let notes = notes.filter(|f| {
             [
@@ -2771,7 +2775,7 @@ fn joint_whose_zero_is_elsewhere_is_named() {
     let setup = arm();
     let log = simulate(&setup, &real(&setup, 3), 12.0, 0.01, 3);
     let names = |log: &str| -> Vec<String> {
-        let outcome = run(&setup, &[("log", Role::Train, log)], &[]);
+        let outcome = run(&setup, &[("log", LogRole::Train, log)], &[]);
         outcome
             .findings
             .into_iter()
@@ -2803,7 +2807,7 @@ fn encoder_that_counts_backwards_is_named() {
         let turned = header
             .filter(is_turned)
             .fold(log.clone(), |log, column| change(&log, column, |x| -x));
-        let findings = run(&setup, &[("log", Role::Train, &turned)], &[])
+        let findings = run(&setup, &[("log", LogRole::Train, &turned)], &[])
             .findings
             .into_iter();
         let own = findings
@@ -2836,7 +2840,7 @@ fn what_can_show_counts_torques_beside_wrenches() {
         &simulate_torques(&setup, &truth, 6.0, 0.05, 6, |_, _| true),
     );
     let of = |inputs: &[IdentificationInput]| {
-        let outcome = run(&setup, &[("log", Role::Train, &log)], inputs);
+        let outcome = run(&setup, &[("log", LogRole::Train, &log)], inputs);
         (outcome.rank, outcome.structural_rank)
     };
     let (wrench, torque) = (IdentificationInput::Wrench, IdentificationInput::Torque);
@@ -2862,7 +2866,7 @@ fn joint_whose_zero_is_elsewhere_in_some_logs_is_named() {
         let logs: Vec<_> = off
             .iter()
             .zip(LOGS)
-            .map(|(log, name)| (name, Role::Train, &**log))
+            .map(|(log, name)| (name, LogRole::Train, &**log))
             .collect();
         let findings = run(&setup, &logs, &[]).findings.into_iter();
         let own = findings.filter(|f| f.code == FindingCode::EncoderOffset);
@@ -2918,7 +2922,7 @@ fn readings_in_other_units_are_no_heavy_bodies() {
         axes.iter().fold(log.clone(), each)
     };
     let found = |log: &str| {
-        let outcome = run(&setup, &[("log", Role::Train, log)], &[]);
+        let outcome = run(&setup, &[("log", LogRole::Train, log)], &[]);
         let units = outcome.logs[0].findings.iter();
         let units =
             units.filter(|f| [FindingCode::WrongUnits, FindingCode::Scale].contains(&f.code));
@@ -2941,8 +2945,8 @@ fn readings_in_other_units_are_no_heavy_bodies() {
     let other = simulate(&setup, &real(&setup, 3), 6.0, 0.01, 4);
     let counts = scaled(&AXES, 300.0);
     let logs = [
-        ("counts", Role::Train, counts.as_str()),
-        ("good", Role::Train, &other),
+        ("counts", LogRole::Train, counts.as_str()),
+        ("good", LogRole::Train, &other),
     ];
     let outcome = run(&setup, &logs, &[]);
     assert_eq!(outcome.verdict, Verdict::Identified);
@@ -2970,7 +2974,7 @@ fn what_can_not_be_is_said_of_a_log_that_is_only_estimated_from() {
     let found = |log: &str| -> Vec<FindingCode> {
         let findings = implausible(
             &setup.robot,
-            reading::dataset(&setup.robot, "", Role::Validate, log.as_bytes()).expect("a log"),
+            reading::dataset(&setup.robot, "", LogRole::Validate, log.as_bytes()).expect("a log"),
         );
         findings.iter().map(|finding| finding.code).collect()
     };
@@ -2995,14 +2999,14 @@ fn what_can_not_be_is_said_of_a_log_that_is_only_estimated_from() {
     // A log too short for identification is long enough for estimation.
     assert_eq!(found(&between(&log, -1.0, 0.5)), []);
     // With identified parameters, the comparison still uses the URDF's masses.
-    let outcome = run(&setup, &[("log", Role::Train, &log)], &[]);
+    let outcome = run(&setup, &[("log", LogRole::Train, &log)], &[]);
     let mut identified = setup.clone();
     identified
         .apply(&parameters(&outcome, &setup.robot, "a test").expect("parameters"))
         .expect("its own");
     let turned = of_all(&wrench, -1.0);
     let codes = |setup: &Setup| {
-        let log = reading::dataset(&setup.robot, "", Role::Validate, turned.as_bytes());
+        let log = reading::dataset(&setup.robot, "", LogRole::Validate, turned.as_bytes());
         implausible(&setup.robot, log.expect("a log"))
     };
     assert_eq!(codes(&identified), codes(&setup));
@@ -3015,7 +3019,7 @@ fn readings_that_nothing_explains_are_said() {
     let setup = arm();
     let log = simulate(&setup, &real(&setup, 3), 6.0, 0.01, 3);
     let found = |log: &str| {
-        let outcome = run(&setup, &[("log", Role::Train, log)], &[]);
+        let outcome = run(&setup, &[("log", LogRole::Train, log)], &[]);
         let mut findings = outcome.logs.into_iter().flat_map(|log| log.findings);
         findings.find(|f| f.code == FindingCode::Unexplained)
     };
@@ -3044,15 +3048,10 @@ fn simulated_arm_is_identified_and_its_uncertainty_is_true() {
             let truth = real(&setup, seed);
             let right = Calibration::new(cross_talk(0.01, 700 + seed), Wrench::zero(), None);
             let log = miscalibrated(&simulate(&setup, &truth, 12.0, memory, seed), &right);
-            let dataset =
-                reading::dataset(&setup.robot, "arm", Role::Train, log.as_bytes()).expect("a log");
-            let outcome = identify(
-                &setup.robot,
-                vec![dataset],
-                &Options::default(),
-                &mut |_| {},
-            )
-            .expect("an outcome");
+            let dataset = reading::dataset(&setup.robot, "arm", LogRole::Train, log.as_bytes())
+                .expect("a log");
+            let outcome =
+                identify(&setup.robot, vec![dataset], &[], &mut |_| {}).expect("an outcome");
             assert_eq!(outcome.verdict, Verdict::Identified);
             let (cad, own, inside, deviations) =
                 torque_errors(&setup, &truth, &outcome, 500 + seed);
@@ -3086,17 +3085,17 @@ fn simulated_arm_is_identified_and_its_uncertainty_is_true() {
 fn logs_that_say_nothing_new_or_nothing_at_all_are_left_out() {
     let setup = arm();
     let log = simulate(&setup, &real(&setup, 3), 6.0, 0.01, 3);
-    let once = run(&setup, &[("one", Role::Train, &log)], &[]);
+    let once = run(&setup, &[("one", LogRole::Train, &log)], &[]);
     let header = log.lines().next().expect("a header").to_owned() + "\n";
     let dates = log.replace('\n', "\n2024-01-01T00:00:0");
     let logs = [
-        ("one", Role::Train, log.as_str()),
-        ("again", Role::Train, &log),
-        ("header", Role::Train, &header),
-        ("same", Role::Validate, &log),
+        ("one", LogRole::Train, log.as_str()),
+        ("again", LogRole::Train, &log),
+        ("header", LogRole::Train, &header),
+        ("same", LogRole::Validate, &log),
         (
             "other",
-            Role::Validate,
+            LogRole::Validate,
             &simulate(&setup, &real(&setup, 3), 6.0, 0.01, 4),
         ),
     ];
@@ -3143,9 +3142,9 @@ fn logs_that_say_nothing_new_or_nothing_at_all_are_left_out() {
         .map(|line| line.to_owned() + "\n")
         .collect();
     let logs = [
-        ("one", Role::Train, log.as_str()),
-        ("short", Role::Validate, &short),
-        ("shorter", Role::Validate, &shorter),
+        ("one", LogRole::Train, log.as_str()),
+        ("short", LogRole::Validate, &short),
+        ("shorter", LogRole::Validate, &shorter),
     ];
     let refusals: Vec<String> = run(&setup, &logs, &[]).logs.iter().map(refusal).collect();
     assert_eq!(refusals[1], "");
@@ -3173,7 +3172,10 @@ fn logs_that_say_nothing_new_or_nothing_at_all_are_left_out() {
         });
     let twice = run(
         &setup,
-        &[("one", Role::Train, &holes), ("again", Role::Train, &holes)],
+        &[
+            ("one", LogRole::Train, &holes),
+            ("again", LogRole::Train, &holes),
+        ],
         &[],
     );
     assert!(refusal(&twice.logs[1]).starts_with("duplicate_log: "));
@@ -3195,7 +3197,7 @@ fn logs_that_say_nothing_new_or_nothing_at_all_are_left_out() {
         (&milliseconds, "if t is in milliseconds"),
         (&dead, "wrench/ft does not change"),
     ] {
-        let outcome = run(&setup, &[("bad", Role::Train, log)], &[]);
+        let outcome = run(&setup, &[("bad", LogRole::Train, log)], &[]);
         let Verdict::Nothing(found) = outcome.verdict else {
             panic!("{:?}", outcome.verdict)
         };
@@ -3219,7 +3221,7 @@ fn a_sensor_that_is_held_between_its_readings_is_used() {
     });
     let outcome = run(
         &setup,
-        &[("held", Role::Train, &with_readings(&log, held))],
+        &[("held", LogRole::Train, &with_readings(&log, held))],
         &[],
     );
     assert_eq!(outcome.verdict, Verdict::Identified);
@@ -3238,7 +3240,7 @@ fn what_a_position_may_be_off_by_is_no_spike() {
             row.set(row.get() + 1);
             if row.get() % 100 == 50 { q + size } else { q }
         });
-        let outcome = run(&setup, &[("log", Role::Train, &spiked)], &[]);
+        let outcome = run(&setup, &[("log", LogRole::Train, &spiked)], &[]);
         let findings = outcome.logs[0].findings.iter();
         findings
             .filter(|f| f.code == FindingCode::Outliers && f.subject == "joint/j4")

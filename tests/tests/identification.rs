@@ -19,8 +19,8 @@ use proprio_estimator::parameters::{Offset, Parameters, Provenance};
 use proprio_estimator::pipeline::{Estimate, Job, Pipeline};
 use proprio_estimator::setup::Setup;
 use proprio_estimator::{files, reading};
-use proprio_identification::online::{Change, Counts, Paused};
-use proprio_identification::{FindingCode, Options, Outcome, Role, Severity, Verdict, identify};
+use proprio_identification::online::{DetectedChange, ObservationCounts, Paused};
+use proprio_identification::{FindingCode, LogRole, Outcome, Severity, Verdict, identify};
 use proprio_topics::csv::{Row, SeriesValue, TableReader, Value, What};
 use proprio_topics::{InertiaEstimate, Nanos, Quality, Reading};
 use serde_json::Value as Json;
@@ -855,7 +855,12 @@ fn pushes_that_nobody_declares_are_found_where_they_act() {
 
 /// Estimates; since when what was said of the arm's identification; its counts at the end; what
 /// changed.
-type Told = (Vec<Estimate>, Vec<(f64, Paused)>, Counts, Vec<Change>);
+type Told = (
+    Vec<Estimate>,
+    Vec<(f64, Paused)>,
+    ObservationCounts,
+    Vec<DetectedChange>,
+);
 
 /// What a pipeline told, and at which instants something was said of the arm's identification; its
 /// jobs come back after so many estimates.
@@ -980,7 +985,7 @@ fn a_push_that_nobody_declares_is_suspected_at_once_and_a_declared_one_is_no_sur
         let surprised = said.iter().any(|(_, paused)| *paused == Paused::Suspected);
         assert_eq!(surprised, expected == Paused::Suspected, "{said:?}");
         // The robot's own parameters are not forgotten.
-        assert!(!changes.contains(&Change::Load), "{changes:?}");
+        assert!(!changes.contains(&DetectedChange::Load), "{changes:?}");
         assert!(changes.len() <= more, "{changes:?}");
     }
 }
@@ -990,7 +995,7 @@ fn a_load_that_is_picked_up_is_noticed_and_learnt() {
     let sessions = arm();
     let log = sessions.log("payload");
     let (estimates, said, counts, changes) = told(learning(&sessions), &log, 0);
-    assert_eq!(changes, [Change::Load], "{said:?}");
+    assert_eq!(changes, [DetectedChange::Load], "{said:?}");
     assert_eq!((counts.changes, counts.load_changes), (1, 1));
     let from = sessions.facts["sessions"]["payload"]["payload"]["from"]
         .as_f64()
@@ -1192,7 +1197,7 @@ fn inertias(
     setup: Setup,
     log: &str,
     alter: impl Fn(f64, &str, &mut Reading, &mut Quality) -> bool,
-) -> (Vec<(Nanos, InertiaEstimate)>, Counts) {
+) -> (Vec<(Nanos, InertiaEstimate)>, ObservationCounts) {
     inertias_by(setup, log, alter, &mut None)
 }
 
@@ -1202,7 +1207,7 @@ fn inertias_by(
     log: &str,
     alter: impl Fn(f64, &str, &mut Reading, &mut Quality) -> bool,
     end: &mut Option<Pipeline>,
-) -> (Vec<(Nanos, InertiaEstimate)>, Counts) {
+) -> (Vec<(Nanos, InertiaEstimate)>, ObservationCounts) {
     let mut pipeline = Pipeline::new(setup);
     let mut reader = TableReader::new(log.as_bytes()).unwrap();
     let series: Vec<_> = reader
@@ -1418,7 +1423,7 @@ fn why_instants_are_left_out_is_counted() {
         inertias(learning(&sessions), &log, alter).1
     };
     let untouched = run(&|_, _, _, _| true);
-    let lost = |c: &Counts| {
+    let lost = |c: &ObservationCounts| {
         [
             c.contact,
             c.outlier,
@@ -1598,13 +1603,13 @@ fn standing_still_teaches_nothing() {
 }
 
 /// Identifies from logs given as text, with the URDF that is 20 % wrong.
-fn identified(sessions: &Sessions, logs: &[(&str, &str, Role)]) -> Outcome {
+fn identified(sessions: &Sessions, logs: &[(&str, &str, LogRole)]) -> Outcome {
     let robot = sessions.setup(Urdf::Cad, None).robot;
-    let dataset = |(file, text, role): &(&str, &str, Role)| {
+    let dataset = |(file, text, role): &(&str, &str, LogRole)| {
         reading::dataset_or_unreadable(&robot, file, *role, text.as_bytes()).unwrap()
     };
     let datasets = logs.iter().map(dataset).collect();
-    identify(&robot, datasets, &Options::default(), &mut |_| {}).unwrap()
+    identify(&robot, datasets, &[], &mut |_| {}).unwrap()
 }
 
 /// A setup with the identified parameters and its own offsets.
@@ -1714,8 +1719,8 @@ fn a_swing_is_enough_to_identify_what_a_sensor_carries() {
     for sessions in robots() {
         let (train, validate) = (sessions.log("train"), sessions.log("validate"));
         let logs = [
-            ("train.csv", &*train, Role::Train),
-            ("validate.csv", &*validate, Role::Validate),
+            ("train.csv", &*train, LogRole::Train),
+            ("validate.csv", &*validate, LogRole::Validate),
         ];
         let outcome = identified(&sessions, &logs);
         must_be_good("train", &sessions, &outcome);
@@ -1728,7 +1733,7 @@ fn a_swing_is_enough_to_identify_what_a_sensor_carries() {
 
         assert_eq!(
             outcome.logs.iter().map(|log| log.role).collect::<Vec<_>>(),
-            [Role::Train, Role::Validate]
+            [LogRole::Train, LogRole::Validate]
         );
         let (mut offsets, mut far) = (0, Vec::new());
         for (log, name) in outcome.logs.iter().zip(["train", "validate"]) {
@@ -1802,7 +1807,7 @@ fn declared_pushes_do_no_harm() {
     for sessions in robots() {
         let outcome = identified(
             &sessions,
-            &[("contact.csv", &sessions.log("contact"), Role::Train)],
+            &[("contact.csv", &sessions.log("contact"), LogRole::Train)],
         );
         must_be_good("pushes, declared", &sessions, &outcome);
         let left_out = &outcome.logs[0].excluded;
@@ -1838,7 +1843,7 @@ fn suspicions(outcome: &Outcome) -> Vec<(FindingCode, String)> {
 fn undeclared_pushes_do_no_harm() {
     for sessions in robots() {
         let log = undeclared(&sessions.log("contact"));
-        let outcome = identified(&sessions, &[("contact.csv", &log, Role::Train)]);
+        let outcome = identified(&sessions, &[("contact.csv", &log, LogRole::Train)]);
         println!("{:?} {:?}", suspicions(&outcome), outcome.logs[0].excluded);
         must_be_good("pushes, undeclared", &sessions, &outcome);
         let said = suspicions(&outcome);
@@ -1881,10 +1886,10 @@ fn undeclared_pushes_are_no_fault_of_the_sensor() {
     let sessions = arm();
     let (train, pushed) = (sessions.log("train"), undeclared(&sessions.log("contact")));
     for logs in [
-        vec![("contact.csv", &*pushed, Role::Train)],
+        vec![("contact.csv", &*pushed, LogRole::Train)],
         vec![
-            ("train.csv", &*train, Role::Train),
-            ("contact.csv", &*pushed, Role::Validate),
+            ("train.csv", &*train, LogRole::Train),
+            ("contact.csv", &*pushed, LogRole::Validate),
         ],
     ] {
         let outcome = identified(&sessions, &logs);
@@ -1927,7 +1932,7 @@ fn a_payload_is_identified() {
 
         // The later part: another robot, with 0.5 kg more beyond the sensor.
         let after = part(&log, all_from, f64::INFINITY);
-        let outcome = identified(&sessions, &[("after.csv", &after, Role::Train)]);
+        let outcome = identified(&sessions, &[("after.csv", &after, LogRole::Train)]);
         let truth = sessions.setup(Urdf::True, None).robot.model;
         let beyond = [
             "l_upper_arm",
@@ -1969,8 +1974,8 @@ fn a_payload_is_identified() {
         let before = identified(
             &sessions,
             &[
-                ("train.csv", &train, Role::Train),
-                ("before.csv", &part(&log, 0.0, from), Role::Train),
+                ("train.csv", &train, LogRole::Train),
+                ("before.csv", &part(&log, 0.0, from), LogRole::Train),
             ],
         );
         must_be_good("before the payload", &sessions, &before);
@@ -1985,10 +1990,10 @@ fn a_payload_picked_up_within_a_log_is_noticed_and_told() {
         let [from, all_from, mass] =
             ["from", "all_from", "mass"].map(|what| facts[what].as_f64().unwrap());
         let centre = numbers(&facts["centre"]);
-        let alone: &[(&str, &str, Role)] = &[("payload.csv", &log, Role::Train)];
-        let both: &[(&str, &str, Role)] = &[
-            ("train.csv", &train, Role::Train),
-            ("payload.csv", &log, Role::Train),
+        let alone: &[(&str, &str, LogRole)] = &[("payload.csv", &log, LogRole::Train)];
+        let both: &[(&str, &str, LogRole)] = &[
+            ("train.csv", &train, LogRole::Train),
+            ("payload.csv", &log, LogRole::Train),
         ];
         for logs in [alone, both] {
             let outcome = identified(&sessions, logs);

@@ -10,10 +10,10 @@ use proprio_estimator::setup::Setup;
 use proprio_identification::forecast::SensorNoise;
 use proprio_identification::prior::cad_root;
 use proprio_identification::robot::{BaseMotion, ChannelRole};
-use proprio_identification::{CovarianceRoot, Options, Outcome, Robot, Role, Verdict, identify};
+use proprio_identification::{CovarianceRoot, LogRole, Outcome, Robot, Verdict, identify};
 use proprio_planning::excite::{Planner, Task};
 use proprio_planning::knowledge::{limit, regime};
-use proprio_planning::motion::{JointLimits, Series};
+use proprio_planning::motion::{FourierSeries, JointLimits};
 use proprio_planning::workspace::{Deviation, Puppet, RISE, Workspace, range};
 use proprio_simulator::SimulatedRobot as Simulated;
 use proprio_topics::Nanos;
@@ -96,7 +96,13 @@ enum Boards {
 
 /// What the sensors of the true robot record of a motion: a table of samples at 100 Hz, with the
 /// stated noise, offsets at random, and errors of the gains of this standard deviation.
-fn record(truth: &Robot, series: &Series, boards: Boards, gain_std: f64, seed: u64) -> String {
+fn record(
+    truth: &Robot,
+    series: &FourierSeries,
+    boards: Boards,
+    gain_std: f64,
+    seed: u64,
+) -> String {
     let mut rng = fastrand::Rng::with_seed(seed);
     let of_joint = match boards {
         Boards::ExactJoints => &["position", "velocity", "acceleration"][..],
@@ -186,8 +192,8 @@ fn record(truth: &Robot, series: &Series, boards: Boards, gain_std: f64, seed: u
 fn identified(robot: &Robot, logs: &[String]) -> Outcome {
     let datasets = logs
         .iter()
-        .map(|log| reading::dataset(robot, "log.csv", Role::Train, log.as_bytes()).unwrap());
-    identify(robot, datasets.collect(), &Options::default(), &mut |_| {}).unwrap()
+        .map(|log| reading::dataset(robot, "log.csv", LogRole::Train, log.as_bytes()).unwrap());
+    identify(robot, datasets.collect(), &[], &mut |_| {}).unwrap()
 }
 
 /// Per torque, the deviation for this covariance.

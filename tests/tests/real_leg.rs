@@ -13,7 +13,7 @@ use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::log;
 use proprio_gateway::offline::{decode, encode};
 use proprio_gateway::plan::Plan;
-use proprio_identification::{Options, Role, identify};
+use proprio_identification::{LogRole, identify};
 use proprio_tests::watch::{Newest, Recorder, rows};
 use proprio_tests::{Rig, can, now, uml};
 use proprio_topics::csv::{self, Columns, Row, Series, Value, What};
@@ -570,14 +570,8 @@ fn on_line_the_torques_of_a_real_leg_are_what_they_are_from_its_log() {
     let identified = {
         let setup = leg.setup();
         let log = texts[1].as_bytes();
-        let dataset = reading::dataset(&setup.robot, spans[1], Role::Train, log).expect("a log");
-        let outcome = identify(
-            &setup.robot,
-            vec![dataset],
-            &Options::default(),
-            &mut |_| (),
-        )
-        .expect("an outcome");
+        let dataset = reading::dataset(&setup.robot, spans[1], LogRole::Train, log).expect("a log");
+        let outcome = identify(&setup.robot, vec![dataset], &[], &mut |_| ()).expect("an outcome");
         let mut with = setup.clone();
         with.apply(&parameters(&outcome, &setup.robot, "this test").expect("parameters"))
             .expect("they fit");

@@ -1,7 +1,7 @@
 //! What an outcome means, in plain words: whether to use the parameters, why, and what to do next.
 
 use proprio_identification::{
-    Both, Finding, FindingCode, LogOutcome, Outcome, Role, Severity, Verdict,
+    Both, Finding, FindingCode, LogOutcome, LogRole, Outcome, Severity, Verdict,
 };
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -110,7 +110,7 @@ impl Advice {
         if this.grade == Grade::Reject {
             this.why.push("No parameters were written.".into());
         } else {
-            if !outcome.logs.iter().any(|log| log.role == Role::Validate) {
+            if !outcome.logs.iter().any(|log| log.role == LogRole::Validate) {
                 this.next.push(
                     "Record a different motion and pass it with --validate: only that shows how \
                      good the parameters are outside the training logs."
@@ -135,11 +135,11 @@ impl Advice {
 
     /// Prediction errors: on the validation logs, if there are any.
     fn assess_errors(&mut self, outcome: &Outcome) {
-        let validated = outcome.logs.iter().any(|log| log.role == Role::Validate);
+        let validated = outcome.logs.iter().any(|log| log.role == LogRole::Validate);
         let role = if validated {
-            Role::Validate
+            LogRole::Validate
         } else {
-            Role::Train
+            LogRole::Train
         };
         let mut compared = false;
         let (mut least, mut gained, mut to_gain) = (f64::INFINITY, false, false);
@@ -194,8 +194,8 @@ impl Advice {
     fn state_error(&mut self, log: &LogOutcome) {
         let Both { cad, identified } = log.predicted.relative_error;
         let how = match log.role {
-            Role::Validate => ", which was not used for training",
-            Role::Train => "",
+            LogRole::Validate => ", which was not used for training",
+            LogRole::Train => "",
         };
         self.why.push(format!(
             "On {}{how}, the relative prediction error of {} is {} with the identified parameters \
@@ -218,11 +218,11 @@ impl Advice {
         let is_worse = identified > cad * (1.0 + NOTICEABLE);
         let is_no_better = identified > cad * (1.0 - NOTICEABLE);
         let (grade, why, next) = match log.role {
-            Role::Train if is_worse => {
+            LogRole::Train if is_worse => {
                 let why = "That is worse than the CAD.".to_owned();
                 (Grade::Care, why, None)
             }
-            Role::Validate if is_worse && is_disturbed(log) => (
+            LogRole::Validate if is_worse && is_disturbed(log) => (
                 Grade::Care,
                 format!(
                     "That is worse than the CAD, but {} contains undeclared contacts or loads.",
@@ -233,7 +233,7 @@ impl Advice {
                     log.file
                 )),
             ),
-            Role::Validate if is_worse => (
+            LogRole::Validate if is_worse => (
                 Grade::Reject,
                 "That is worse than the CAD: the parameters are not valid outside the training \
                  motion."
@@ -244,7 +244,7 @@ impl Advice {
                     log.file
                 )),
             ),
-            Role::Validate if is_no_better => {
+            LogRole::Validate if is_no_better => {
                 let why = "That is no better than the CAD.".to_owned();
                 (Grade::Care, why, None)
             }
@@ -260,7 +260,7 @@ impl Advice {
     fn refuse_wrong_configuration(&mut self, outcome: &Outcome) {
         let is_wrong = |(log, finding): &(Option<&LogOutcome>, &Finding)| {
             finding.severity >= Severity::Warning
-                && log.is_none_or(|log| log.role == Role::Train && log.used > 0)
+                && log.is_none_or(|log| log.role == LogRole::Train && log.used > 0)
                 && [
                     FindingCode::WrongSign,
                     FindingCode::WrongFrame,

@@ -10,7 +10,7 @@ use proprio_estimator::drive::{self, Drive, Row, Signal, Unfit};
 use proprio_estimator::offline::drive_rows;
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::setup::Setup;
-use proprio_identification::{LogOutcome, Outcome, Role};
+use proprio_identification::{LogOutcome, LogRole, Outcome};
 use serde_json::{Value as Json, json};
 use std::fs::File;
 use std::io::{BufRead, BufReader};
@@ -28,14 +28,14 @@ pub(super) fn identify(
     setup: &Setup,
     parameters: &Parameters,
     outcome: &Outcome,
-    files: &[(&PathBuf, Role)],
+    files: &[(&PathBuf, LogRole)],
     config: &Path,
 ) -> anyhow::Result<Vec<Found>> {
     let mut setup = setup.clone();
     setup.apply(parameters)?;
     let mut logs: Vec<Vec<Vec<Row>>> = Vec::new();
     for ((file, role), log) in files.iter().zip(&outcome.logs) {
-        if *role == Role::Train && reports(file)? {
+        if *role == LogRole::Train && reports(file)? {
             let mut setup = setup.clone();
             set_offsets(&mut setup, log);
             let table = open(file, config, &setup)?;

@@ -7,9 +7,9 @@ use proprio_dynamics::calibration::{
 use proprio_dynamics::spatial::{RigidInertia, Wrench};
 use proprio_identification::{
     BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, CovarianceRoot, Curve, Excluded,
-    Finding, FindingCode, FrictionOutcome, JointOutcome, LinkOutcome, LogOutcome, ModelComparison,
-    OffsetOutcome, Outcome, Predicted, Role, RotorOutcome, SensorOutcome, Severity, TimeOffset,
-    TwoRouteOutcome, Verdict, WeakDirection,
+    Finding, FindingCode, FrictionOutcome, JointOutcome, LinkOutcome, LogOutcome, LogRole,
+    ModelComparison, OffsetOutcome, Outcome, Predicted, RotorOutcome, SensorOutcome, Severity,
+    TimeOffset, TwoRouteOutcome, Verdict, WeakDirection,
 };
 use proprio_topics::Nanos;
 
@@ -95,7 +95,7 @@ fn excluded() -> Vec<Excluded> {
     ]
 }
 
-fn log(file: &str, role: Role) -> LogOutcome {
+fn log(file: &str, role: LogRole) -> LogOutcome {
     LogOutcome {
         file: file.into(),
         role,
@@ -225,8 +225,8 @@ pub(crate) fn outcome() -> Outcome {
             significant: true,
         }],
         logs: vec![
-            log("walk_1.csv", Role::Train),
-            log("walk_2.csv", Role::Validate),
+            log("walk_1.csv", LogRole::Train),
+            log("walk_2.csv", LogRole::Validate),
         ],
         findings: vec![Finding {
             severity: Severity::Note,

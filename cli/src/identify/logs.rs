@@ -5,7 +5,7 @@ use crate::samples;
 use anyhow::Context;
 use proprio_estimator::reading;
 use proprio_estimator::setup::Setup;
-use proprio_identification::{Dataset, Role};
+use proprio_identification::{Dataset, LogRole};
 use std::fs::File;
 use std::io::{BufRead, BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
@@ -36,7 +36,7 @@ pub(super) fn open(
 pub(super) fn read(
     setup: &Setup,
     name: &str,
-    role: Role,
+    role: LogRole,
     table: &mut (impl Read + Send),
 ) -> anyhow::Result<Dataset> {
     let dataset = reading::dataset_or_unreadable(&setup.robot, name, role, table);
@@ -44,7 +44,7 @@ pub(super) fn read(
 }
 
 /// Names of the logs: file names, with as many parent folders as make them unique.
-pub(super) fn names(files: &[(&PathBuf, Role)]) -> Vec<String> {
+pub(super) fn names(files: &[(&PathBuf, LogRole)]) -> Vec<String> {
     let short = |file: &Path, parts: usize| -> String {
         let all: Vec<_> = file
             .components()
@@ -87,7 +87,7 @@ mod tests {
         ]
         .map(PathBuf::from)
         .to_vec();
-        let files: Vec<(&PathBuf, Role)> = files.iter().map(|f| (f, Role::Train)).collect();
+        let files: Vec<(&PathBuf, LogRole)> = files.iter().map(|f| (f, LogRole::Train)).collect();
         assert_eq!(
             names(&files),
             [

@@ -10,9 +10,8 @@ use proprio_estimator::config::ConfigError;
 use proprio_estimator::export;
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::setup::{Setup, frame};
-use proprio_identification::{
-    Dataset, Options, Payload, Role, Severity, Verdict, identify, payload,
-};
+use proprio_identification::robot::IdentificationInput;
+use proprio_identification::{Dataset, LogRole, Payload, Severity, Verdict, identify, payload};
 use std::path::{Path, PathBuf};
 
 /// The components of a tensor of inertia, the diagonal first.
@@ -42,12 +41,10 @@ pub(super) fn run(
         file: config_file.to_owned(),
         problem: format!("--payload: {problem}"),
     })?;
-    let options = Options {
-        inputs: config.identification.inputs.clone(),
-    };
+    let inputs = &config.identification.inputs;
     let parameters = match (reference, configured) {
         ([], Some(file)) => load(&file)?,
-        (files, _) => without_payload(files, config_file, &setup, &options)?,
+        (files, _) => without_payload(files, config_file, &setup, inputs)?,
     };
     setup
         .apply(&parameters)
@@ -56,7 +53,7 @@ pub(super) fn run(
     setup.robot = setup.robot_as_identified();
     let known = export::known(&parameters, &setup.robot);
     let datasets = datasets(samples, config_file, &setup)?;
-    let found = payload(&setup.robot, &known, &frame, datasets, &options)?;
+    let found = payload(&setup.robot, &known, &frame, datasets, inputs)?;
     for finding in found
         .findings
         .iter()
@@ -81,7 +78,7 @@ fn without_payload(
     files: &[PathBuf],
     config: &Path,
     setup: &Setup,
-    options: &Options,
+    inputs: &[IdentificationInput],
 ) -> anyhow::Result<Parameters> {
     let is_toml = |file: &PathBuf| file.extension().is_some_and(|word| word == "toml");
     match files {
@@ -99,7 +96,7 @@ fn without_payload(
         }
         logs => {
             let datasets = datasets(logs, config, setup)?;
-            let outcome = identify(&setup.robot, datasets, options, &mut |_| ())?;
+            let outcome = identify(&setup.robot, datasets, inputs, &mut |_| ())?;
             // Without better parameters, the CAD's are known as well as CAD's are.
             let advice = Advice::of(&outcome);
             if advice.grade == Grade::Reject && outcome.verdict != Verdict::NoBetterThanCad {
@@ -117,7 +114,7 @@ fn load(file: &Path) -> anyhow::Result<Parameters> {
 
 /// Reads logs.
 fn datasets(files: &[PathBuf], config: &Path, setup: &Setup) -> anyhow::Result<Vec<Dataset>> {
-    let files: Vec<(&PathBuf, Role)> = files.iter().map(|file| (file, Role::Train)).collect();
+    let files: Vec<(&PathBuf, LogRole)> = files.iter().map(|file| (file, LogRole::Train)).collect();
     let names = names(&files);
     let all = files.iter().zip(names).map(|((file, role), name)| {
         let mut table = open(file, config, setup)?;

@@ -83,7 +83,7 @@
 
 use super::advice::{Advice, findings};
 use proprio_dynamics::calibration::force_first;
-use proprio_identification::{CalibrationOutcome, LogOutcome, Outcome, Role, Severity, Verdict};
+use proprio_identification::{CalibrationOutcome, LogOutcome, LogRole, Outcome, Severity, Verdict};
 use proprio_topics::Nanos;
 use serde_json::{Map, Value as Json, json};
 use std::ops::Range;
@@ -186,10 +186,10 @@ fn object<'a, T>(items: &'a [T], entry: impl Fn(&'a T) -> (&'a String, Json)) ->
 }
 
 /// A role's word.
-pub(crate) fn role(role: Role) -> &'static str {
+pub(crate) fn role(role: LogRole) -> &'static str {
     match role {
-        Role::Train => "train",
-        Role::Validate => "validate",
+        LogRole::Train => "train",
+        LogRole::Validate => "validate",
     }
 }
 

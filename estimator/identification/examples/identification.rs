@@ -4,7 +4,7 @@
 use proprio_dynamics::model::{MeasurementDirection, MeasurementFrame, Model};
 use proprio_dynamics::spatial::{Pose, RigidInertia, Vec3};
 use proprio_dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics, Noise, SensorCut};
-use proprio_identification::{Dataset, Options, Outcome, Recording, Robot, Role, identify};
+use proprio_identification::{Dataset, LogRole, Outcome, Recording, Robot, identify};
 use proprio_topics::{JointState as Encoder, Nanos, Quality, Reading, Wrench as ForceTorque};
 use std::error::Error;
 
@@ -41,9 +41,8 @@ fn identified(
             recording.push(channel, *t, &Reading::Joint(encoder), Quality::GOOD);
         }
     }
-    let dataset = Dataset::new(&robot, "swing", Role::Train, recording)?;
-    let options = Options::default();
-    Ok(identify(&robot, vec![dataset], &options, &mut |_| ())?)
+    let dataset = Dataset::new(&robot, "swing", LogRole::Train, recording)?;
+    Ok(identify(&robot, vec![dataset], &[], &mut |_| ())?)
 }
 
 /// Simulates a log of the shipped arm and identifies from it, beginning with 20 % too small masses.

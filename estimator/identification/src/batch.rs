@@ -20,7 +20,7 @@ mod gains;
 
 use crate::batch::gains::fit_gains;
 use crate::cross_validation;
-use crate::dataset::{Dataset, Role};
+use crate::dataset::{Dataset, LogRole};
 use crate::diagnose::search::{Search, wrong_signs};
 use crate::diagnose::undeclared::{self, Undeclared};
 use crate::diagnose::{configuration, load};
@@ -33,7 +33,7 @@ use crate::fit::{
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::Seconds;
 use crate::measurement::reduction::{reduce, residuals};
-use crate::prior::Fit;
+use crate::prior::MapEstimate;
 use crate::report::assemble;
 use crate::report::outcome::Outcome;
 use crate::robot::{IdentificationInput, Robot, TorqueSide};
@@ -43,14 +43,6 @@ use crate::training::{
 };
 use proprio_dynamics::calibration::{Gain, Kind};
 use std::ops::ControlFlow;
-
-/// What to identify from.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Options {
-    /// The measurements to use. Empty: the F/T sensors if the robot has any, else the measured
-    /// joint torques.
-    pub inputs: Vec<IdentificationInput>,
-}
 
 /// Progress of [`identify`].
 #[derive(Clone, Debug, PartialEq)]
@@ -73,7 +65,8 @@ const MAX_REJECTED_LOADS: usize = 2;
 /// Most rounds of contacts and gains.
 const GAIN_ROUNDS: usize = 4;
 
-/// Identifies the robot's parameters from logs.
+/// Identifies the robot's parameters from logs. `inputs`: the measurements to use; none: the F/T
+/// sensors if the robot has any, else the measured joint torques.
 ///
 /// # Errors
 /// [`IdentifyError`]: no log to train on, observations of another robot, numbers that no parameters
@@ -81,14 +74,14 @@ const GAIN_ROUNDS: usize = 4;
 pub fn identify(
     robot: &Robot,
     datasets: Vec<Dataset>,
-    options: &Options,
+    inputs: &[IdentificationInput],
     progress: &mut dyn FnMut(&Progress),
 ) -> Result<Outcome, IdentifyError> {
-    if !datasets.iter().any(|log| log.role == Role::Train) {
+    if !datasets.iter().any(|log| log.role == LogRole::Train) {
         return Err(IdentifyError::NoLogs);
     }
     let mut report_progress = |step: String, done: f64| progress(&Progress { step, done });
-    let inputs = chosen_inputs(robot, options);
+    let inputs = chosen_inputs(robot, inputs);
 
     // 1. Logs.
     let mut logs = prepare_logs(robot, datasets);
@@ -181,15 +174,18 @@ pub fn identify(
 }
 
 /// The inputs that are configured, or else those that the robot has.
-pub(crate) fn chosen_inputs(robot: &Robot, options: &Options) -> Vec<IdentificationInput> {
-    if options.inputs.is_empty() {
+pub(crate) fn chosen_inputs(
+    robot: &Robot,
+    inputs: &[IdentificationInput],
+) -> Vec<IdentificationInput> {
+    if inputs.is_empty() {
         vec![if robot.structure.sensors().is_empty() {
             IdentificationInput::Torque
         } else {
             IdentificationInput::Wrench
         }]
     } else {
-        options.inputs.clone()
+        inputs.to_vec()
     }
 }
 
@@ -451,7 +447,7 @@ fn cross_validated_fit(
     let NoiseAndMap {
         prior,
         noise,
-        fit: Fit { tau, x, .. },
+        fit: MapEstimate { tau, x, .. },
         change,
         ..
     } = estimate;
@@ -513,7 +509,7 @@ mod tests {
     fn log(instants: &[Annotated]) -> TrainingLog {
         TrainingLog {
             file: String::new(),
-            role: Role::Train,
+            role: LogRole::Train,
             span: (instants[0].t, instants[instants.len() - 1].t),
             instants: instants.to_vec(),
             excluded: Vec::new(),

@@ -23,10 +23,12 @@ use crate::linear::information::Information;
 use crate::measurement::model::{Groups, MeasurementModel};
 use crate::measurement::noise_estimate::estimate_noise;
 use crate::measurement::noise_model::{DriftLimits, NoiseModel};
-use crate::measurement::reduction::{Residuals, Segment, reduce_with, residuals};
+use crate::measurement::reduction::{LogSegment, Residuals, reduce_with, residuals};
 use crate::parallel;
 use crate::prior::Prior;
-use crate::report::prediction::{self, Candidate, Errors, Free, PredictionError};
+use crate::report::prediction::{
+    self, FittedOffsets, JudgedParameters, PredictionError, PredictionErrors,
+};
 use crate::training::{MIN_FOLD, MIN_SECONDS, folds, map_segments};
 use nalgebra::DVector;
 use proprio_topics::Nanos;
@@ -43,7 +45,7 @@ pub(crate) struct Retention {
     /// Retained fraction of the change from CAD, per link of the layout, then per extra parameter.
     pub share: Vec<f64>,
     pub findings: Vec<Finding>,
-    blocks: Vec<Block>,
+    blocks: Vec<FoldBlock>,
     /// Per fold, the parameters from all other folds.
     sets: Vec<DVector<f64>>,
 }
@@ -53,7 +55,7 @@ impl Retention {
     pub(crate) fn noise(
         &self,
         measurement: &MeasurementModel<'_>,
-        segments: &[Segment<'_>],
+        segments: &[LogSegment<'_>],
         noise: NoiseModel,
         walk_limits: &DriftLimits,
     ) -> NoiseModel {
@@ -80,7 +82,7 @@ impl Retention {
 }
 
 /// Consecutive instants of a segment, and their fold.
-struct Block {
+struct FoldBlock {
     segment: usize,
     range: Range<usize>,
     fold: usize,
@@ -93,7 +95,7 @@ struct Block {
 pub(crate) fn held_out(
     measurement: &MeasurementModel<'_>,
     prior: &Prior,
-    segments: &[Segment<'_>],
+    segments: &[LogSegment<'_>],
     noise: &NoiseModel,
     tau: f64,
 ) -> Result<Retention, IdentifyError> {
@@ -132,7 +134,7 @@ pub(crate) fn held_out(
         },
     );
     let mut sets: Vec<DVector<f64>> = Vec::new();
-    let mut candidates: Vec<Candidate> = Vec::new();
+    let mut candidates: Vec<JudgedParameters> = Vec::new();
     // Per fold, CAD and the parameters from the others.
     let mut pairs: Vec<[usize; 2]> = Vec::new();
     let cad_is_one = unknowns.parameters_without_cad().is_empty() && unknowns.joints.is_empty();
@@ -146,23 +148,26 @@ pub(crate) fn held_out(
         let instants =
             of_others.flat_map(|block| &segments[block.segment].instants[block.range.clone()]);
         let friction = prediction::friction(measurement, instants, &both);
-        let both_judged = both.iter().zip(friction).map(|(d, friction)| Candidate {
-            course: vec![(Nanos::ZERO, d.clone())],
-            friction,
-        });
+        let both_judged = both
+            .iter()
+            .zip(friction)
+            .map(|(d, friction)| JudgedParameters {
+                course: vec![(Nanos::ZERO, d.clone())],
+                friction,
+            });
         let cad_is_known = cad_is_one && fold > 0;
         candidates.extend(both_judged.skip(usize::from(cad_is_known)));
         let last = candidates.len() - 1;
         pairs.push([if cad_is_known { 0 } else { last - 1 }, last]);
         sets.push(both.into_iter().nth(1).unwrap_or_default());
     }
-    let errors: Vec<Vec<Errors>> = segments
+    let errors: Vec<Vec<PredictionErrors>> = segments
         .iter()
         .map(|segment| {
             PredictionError::of_fit(measurement, segment.instants).errors(
                 unknowns,
                 &candidates,
-                Free::Constants,
+                FittedOffsets::Constants,
             )
         })
         .collect();
@@ -201,18 +206,18 @@ pub(crate) fn held_out(
 }
 
 /// Divides segments into blocks, and assigns these to `count` folds in the order of time.
-fn blocks(segments: &[Segment<'_>], count: usize) -> Vec<Block> {
+fn blocks(segments: &[LogSegment<'_>], count: usize) -> Vec<FoldBlock> {
     let total: usize = segments.iter().map(|segment| segment.instants.len()).sum();
     let most = (total / count).max(1);
     let mut blocks = Vec::new();
-    for (segment, Segment { instants, .. }) in segments.iter().enumerate() {
+    for (segment, LogSegment { instants, .. }) in segments.iter().enumerate() {
         let mut start = 0;
         for end in 1..=instants.len() {
             let is_long = |end: usize| {
                 (instants[end].t - instants[start].t).seconds() >= BLOCK || end - start >= most
             };
             if end == instants.len() || is_long(end) {
-                blocks.push(Block {
+                blocks.push(FoldBlock {
                     segment,
                     range: start..end,
                     fold: 0,
@@ -234,7 +239,7 @@ fn blocks(segments: &[Segment<'_>], count: usize) -> Vec<Block> {
 /// contribute: from residuals with one set per fold to residuals with one set.
 fn residuals_of_folds<'a>(
     mut residuals: Residuals,
-    blocks: impl Iterator<Item = &'a Block>,
+    blocks: impl Iterator<Item = &'a FoldBlock>,
 ) -> Residuals {
     let count = residuals.measured.first().map_or(0, Vec::len);
     let mut folds = vec![0; count];

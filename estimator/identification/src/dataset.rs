@@ -26,7 +26,7 @@ use recording::Recording;
 
 /// The use of a log.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Role {
+pub enum LogRole {
     /// Parameters are identified from it.
     Train,
     /// Only for assessment: its offsets and friction are fitted to it, for CAD and for the
@@ -49,7 +49,7 @@ pub struct Dataset {
     /// Its name in the outcome: its file name.
     pub name: String,
     /// Its use.
-    pub role: Role,
+    pub role: LogRole,
     pub(crate) instants: Vec<Observation>,
     pub(crate) findings: Vec<Finding>,
     /// Sample spacing, if it exceeds the time that a channel may be silent.
@@ -65,7 +65,7 @@ impl Dataset {
     pub fn new(
         robot: &Robot,
         name: &str,
-        role: Role,
+        role: LogRole,
         mut recording: Recording,
     ) -> Result<Self, DatasetError> {
         recording
@@ -106,7 +106,7 @@ impl Dataset {
 
     /// A log that cannot be used at all, with the reason. It is still part of the outcome.
     #[must_use]
-    pub fn unreadable(name: &str, role: Role, reason: String) -> Self {
+    pub fn unreadable(name: &str, role: LogRole, reason: String) -> Self {
         Self {
             name: name.to_owned(),
             role,

@@ -10,7 +10,7 @@ use crate::measurement::noise_model::Seconds;
 use crate::measurement::noise_model::{DriftLimits, NoiseModel};
 use crate::measurement::reduction::{ReducedLog, reduce, residuals};
 use crate::measurement::unknowns::{ExtraParameter, Unknowns};
-use crate::prior::{Fit, Posterior, Prior, PriorError};
+use crate::prior::{MapEstimate, Posterior, Prior, PriorError};
 use crate::robot::{IdentificationInput, Robot};
 use crate::training::{TrainingLog, map_segments, sample};
 use nalgebra::DVector;
@@ -31,7 +31,7 @@ pub enum IdentifyError {
     Dynamics(#[from] DynamicsError),
     /// The MAP parameters cannot be computed.
     #[error("no parameters can be fitted to the logs: {0}")]
-    Fit(#[from] PriorError),
+    MapEstimate(#[from] PriorError),
 }
 
 /// Time constant of the fastest random walk of an offset \[s\]: the motion that excites the
@@ -58,7 +58,7 @@ pub(crate) struct Identified {
     pub prior: Prior,
     pub noise: NoiseModel,
     pub information: Information,
-    pub fit: Fit,
+    pub fit: MapEstimate,
     /// Identified parameters less CAD, after shrinking.
     pub d: DVector<f64>,
     /// CAD's parameters in the same columns: zero, except for parameters that CAD does not contain,
@@ -159,7 +159,7 @@ pub(crate) fn without_negative_rotors(
     prior: &Prior,
     unknowns: &Unknowns,
     information: &Information,
-    fit: &Fit,
+    fit: &MapEstimate,
 ) -> Result<DVector<f64>, IdentifyError> {
     let mut x = fit.x.clone();
     let mut keep: Vec<usize> = (0..unknowns.parameters()).collect();
@@ -190,7 +190,11 @@ pub(crate) fn without_negative_rotors(
 }
 
 /// Rotors whose estimated inertia is significantly negative.
-pub(crate) fn negative_rotors(robot: &Robot, unknowns: &Unknowns, fit: &Fit) -> Vec<Finding> {
+pub(crate) fn negative_rotors(
+    robot: &Robot,
+    unknowns: &Unknowns,
+    fit: &MapEstimate,
+) -> Vec<Finding> {
     if unknowns.extra.is_empty() {
         return Vec::new();
     }
@@ -223,7 +227,7 @@ pub(crate) fn negative_rotors(robot: &Robot, unknowns: &Unknowns, fit: &Fit) -> 
 pub(crate) struct NoiseAndMap {
     pub(crate) prior: Prior,
     pub(crate) noise: NoiseModel,
-    pub(crate) fit: Fit,
+    pub(crate) fit: MapEstimate,
     pub(crate) information: Information,
     /// Precision of the prior of each extra parameter ([`gain_precision`]).
     pub(crate) precision: Vec<f64>,
@@ -322,7 +326,7 @@ pub(crate) fn alternate_noise_and_map(
 ///
 /// Cross-talk is the greater part of the real leg's error: without gains, its parameters are 27 %
 /// worse on other spans.
-fn gain_precision(robot: &Robot, unknowns: &Unknowns, fit: &Fit) -> Vec<f64> {
+fn gain_precision(robot: &Robot, unknowns: &Unknowns, fit: &MapEstimate) -> Vec<f64> {
     const SCALE: (f64, f64) = (0.1, 1.0);
     let is_gain = |extra: &ExtraParameter| {
         matches!(extra, ExtraParameter::Calibration(_, Unknown::Gain { .. }))

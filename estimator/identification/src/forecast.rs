@@ -10,7 +10,7 @@ use crate::dataset::observation::{Annotated, Observation};
 use crate::dataset::resampling::RATE;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
-use crate::measurement::reduction::{ReducedLog, Segment, reduce};
+use crate::measurement::reduction::{LogSegment, ReducedLog, reduce};
 use crate::measurement::unknowns::ExtraParameter;
 use crate::prior::{Prior, PriorError};
 use crate::report::outcome::CovarianceRoot;
@@ -71,7 +71,7 @@ pub enum ForecastError {
 }
 
 /// What the observations of one motion would tell.
-pub struct Told(ReducedLog);
+pub struct MotionInformation(ReducedLog);
 
 /// Forecasts for a robot whose F/T sensors are read.
 #[derive(Clone)]
@@ -142,18 +142,18 @@ impl<'a> Forecast<'a> {
 
     /// What these consecutive observations tell.
     #[must_use]
-    pub fn told(&self, observations: Vec<Observation>) -> Told {
+    pub fn told(&self, observations: Vec<Observation>) -> MotionInformation {
         let instants: Vec<Annotated> = observations.into_iter().map(Annotated::from).collect();
-        let segment = Segment {
+        let segment = LogSegment {
             instants: &instants,
             log: None,
         };
-        Told(reduce(&mut self.measurement.clone(), segment, &self.noise))
+        MotionInformation(reduce(&mut self.measurement.clone(), segment, &self.noise))
     }
 
     /// The covariance after these observations. None if it is singular.
     #[must_use]
-    pub fn covariance(&self, told: Told) -> Option<CovarianceRoot> {
+    pub fn covariance(&self, told: MotionInformation) -> Option<CovarianceRoot> {
         let (r, _) = told.0.information.to_triangle();
         let (count, unknowns) = (self.before.nrows(), self.before.ncols());
         let mut all = self.before.clone().resize_vertically(count + unknowns, 0.0);

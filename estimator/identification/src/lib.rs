@@ -84,14 +84,14 @@ pub mod robot;
 pub mod statistics;
 mod training;
 
-pub use batch::{Options, Progress, identify};
+pub use batch::{Progress, identify};
 pub use dataset::recording::Recording;
-pub use dataset::{Dataset, Role};
+pub use dataset::{Dataset, LogRole};
 pub use diagnose::plausibility::implausible;
 pub use finding::{Finding, FindingCode, Severity};
 pub use fit::IdentifyError;
 pub use measurement::unknowns::COULOMB_SPEED;
-pub use payload::{Known, Payload, PayloadError, payload};
+pub use payload::{KnownParameters, Payload, PayloadError, payload};
 pub use report::outcome::{
     BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, CovarianceRoot, Curve,
     FrictionOutcome, InForce, JointOutcome, LinkOutcome, LogOutcome, ModelComparison,

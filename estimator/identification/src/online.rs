@@ -4,7 +4,7 @@
 //! ```text
 //! Online::observe                 real-time loop: fixed time, no allocation
 //!     rows of each component -> block of 0.1 s -> gate -> [R | z]
-//! Online::take_job -> Job::run    any thread
+//! Online::take_job -> SolutionJob::run    any thread
 //!     [R | z] + prior -> bodies, offsets, covariance, noise, changes
 //!     ticks           -> what else than stated may be the case
 //! Online::give_back, Online::apply
@@ -13,7 +13,7 @@
 //!
 //! A solution, and the time from which it is in use, depend on the observed stamps and values
 //! alone. So live operation and replay agree, provided that jobs come back before their stamp. Late
-//! ones are applied later, and counted ([`Counts::late`]).
+//! ones are applied later, and counted ([`ObservationCounts::late`]).
 //!
 //! # Components
 //! Sub-trees that can be free of contacts are linked by the F/T sensors that they share. Each such
@@ -64,34 +64,32 @@ mod selection;
 pub mod state;
 
 mod component;
+mod earlier;
 mod job;
 mod parameters;
 mod solution;
 
-pub use bank::{COVERED, Hypothesis, Sight, View};
-pub use job::Job;
+pub use bank::{COVERED, Hypothesis, MotionReading, WrenchReading};
+pub use job::SolutionJob;
 pub use solution::{
-    Change, ComponentSolution, Counts, Doubt, Observation, OnlineError, Paused, Solution,
+    ComponentSolution, DetectedChange, Doubt, ObservationCounts, OnlineError, OnlineObservation,
+    Paused, Solution,
 };
 
-use bank::{Bank, Share, TICK, Tick};
-use component::{Component, KEPT, LARGE};
-use job::Part;
-use proprio_dynamics::regressor::LINK_PARAMETERS;
+use bank::{Bank, TICK, Tick};
+use component::{Component, ComponentLayout, KEPT, LARGE};
+use job::ComponentJob;
 use solution::{BLOCK, SOLVE};
 
 use std::sync::Arc;
 
-use nalgebra::DMatrix;
 use proprio_topics::Nanos;
 
-use crate::linear::information::{InformationError, Panel};
 use crate::prior::Prior;
-use crate::robot::BaseMotion;
-use proprio_dynamics::model::Model;
+use crate::robot::Robot;
 use proprio_dynamics::regressor::{StackedRegressor, Weighting};
-use proprio_dynamics::spatial::{RigidInertia, Wrench};
-use proprio_dynamics::{ContactSet, DynamicsError, Kinematics, Structure};
+use proprio_dynamics::spatial::Wrench;
+use proprio_dynamics::{DynamicsError, Kinematics};
 
 /// On-line identification of a robot's inertial parameters and F/T offsets. See the [module](self).
 #[derive(Debug)]
@@ -100,7 +98,7 @@ pub struct Online {
     components: Vec<Component>,
     period: Nanos,
     newest: Nanos,
-    job: Option<Box<Job>>,
+    job: Option<Box<SolutionJob>>,
     /// Time of the job's snapshot; None before the first observation.
     snapshot: Option<Nanos>,
     is_away: bool,
@@ -115,69 +113,24 @@ pub struct Online {
 }
 
 impl Online {
-    /// Starts from `cad`, one inertia per link with the relative error `relative`, and `offsets`,
-    /// one per sensor. One observation is expected per `period`. `always` are the contacts that are
-    /// never absent.
+    /// Starts from the robot's CAD, and `offsets`, one per sensor. One observation is expected per
+    /// `period`.
     ///
     /// # Errors
     /// [`OnlineError`].
-    #[allow(clippy::too_many_arguments, reason = "each of another kind")]
-    pub fn new(
-        model: &Model,
-        structure: &Structure,
-        cad: &[RigidInertia],
-        offsets: &[Wrench],
-        always: &ContactSet,
-        base: usize,
-        period: Nanos,
-        relative: f64,
-        base_motion: &BaseMotion,
-    ) -> Result<Self, OnlineError> {
-        let kinematics = Kinematics::new(model, base)?;
+    pub fn new(robot: &Robot, offsets: &[Wrench], period: Nanos) -> Result<Self, OnlineError> {
+        let (model, structure) = (&robot.model, &robot.structure);
+        let kinematics = Kinematics::new(model, robot.base_link)?;
         let mut stacked = StackedRegressor::new(structure);
         let readings = vec![Wrench::zero(); structure.sensors().len()];
-        stacked.update(&kinematics, &readings, always, &[])?;
+        stacked.update(&kinematics, &readings, &robot.always, &[])?;
         stacked.eliminate_contacts(Weighting::Noise);
-        // Sub-trees that can be free, and which of them share a sensor.
-        let is_free: Vec<bool> = stacked
-            .subtrees()
-            .iter()
-            .map(|subtree| subtree.remaining() > 0 && subtree.sensors().len() > 0)
-            .collect();
-        let mut group: Vec<usize> = (0..is_free.len()).collect();
-        for sensor in 0..structure.sensors().len() {
-            let sharing: Vec<usize> = (0..is_free.len())
-                .filter(|&k| is_free[k] && structure.subtrees()[k].sensors.contains(sensor))
-                .collect();
-            if let [a, b] = sharing[..] {
-                let (from, to) = (group[a].max(group[b]), group[a].min(group[b]));
-                group
-                    .iter_mut()
-                    .filter(|g| **g == from)
-                    .for_each(|g| *g = to);
-            }
-        }
-        let per_job = usize::try_from(2 * SOLVE.0 / period.0.max(1))
-            .unwrap_or(0)
-            .max(1);
-        let per_block = usize::try_from(BLOCK.0 / period.0.max(1)).unwrap_or(0) + 2;
-        let components: Vec<Component> = (0..is_free.len())
-            .filter(|&k| is_free[k] && group[k] == k)
-            .map(|first| {
-                let subtrees = (0..is_free.len())
-                    .filter(|&k| is_free[k] && group[k] == first)
-                    .collect();
-                Component::new(
-                    model,
-                    &stacked,
-                    subtrees,
-                    cad,
-                    offsets,
-                    always,
-                    per_job,
-                    per_block,
-                    period.seconds(),
-                )
+        let per = |time: Nanos| usize::try_from(time.0 / period.0.max(1)).unwrap_or(0);
+        let (per_job, per_block) = (per(SOLVE + SOLVE).max(1), per(BLOCK) + 2);
+        let components: Vec<Component> = (linked_subtrees(&stacked).into_iter())
+            .map(|subtrees| {
+                let layout = ComponentLayout::new(robot, &stacked, subtrees, offsets);
+                Component::new(layout, per_job, per_block, period.seconds())
             })
             .collect();
         if components.is_empty() {
@@ -191,32 +144,27 @@ impl Online {
         {
             drop(std::hint::black_box(Vec::<u8>::with_capacity(KEPT)));
         }
-        let shares: Vec<Share<'_>> = (components.iter())
-            .map(|component| Share {
-                subtrees: &component.subtrees,
-                intermittent: component.intermittent,
-            })
-            .collect();
-        let base = (base, base_motion);
-        let bank = Bank::new(model, structure, base, cad, offsets, &shares, relative)?;
+        let cad = model.inertias();
         let tick = Tick::new(model.dof_count(), structure.sensors().len());
         let ticks = vec![tick; usize::try_from(2 * SOLVE.0 / TICK.0).unwrap_or(0)];
+        let relative = robot.urdf_relative_std;
         let prior = Arc::new(Prior::new(cad)?.with_relative_std(relative));
         let solution = Solution {
             data: Nanos::MIN,
             components: components.iter().map(|c| c.unknown(cad, offsets)).collect(),
             doubts: vec![Doubt::COMPLETE; model.dof_count()],
         };
-        let job = Box::new(Job {
+        let layouts = components.iter().map(|component| &*component.layout);
+        let job = Box::new(SolutionJob {
             data: Nanos::MIN,
-            parts: (components.iter().zip(&solution.components))
+            components: (components.iter().zip(&solution.components))
                 .map(|(component, known)| {
-                    Part::new(component, known.clone(), period, &prior, relative)
+                    ComponentJob::new(component, known.clone(), period, &prior, relative)
                 })
                 .collect(),
             prior,
             solution: solution.clone(),
-            bank,
+            bank: Bank::new(robot, offsets, layouts)?,
             ticks: ticks.clone(),
             tick_count: 0,
         });
@@ -237,126 +185,13 @@ impl Online {
         })
     }
 
-    /// Starts from an earlier identification: these links have these inertias, with `root^T root`
-    /// the covariance of their ten parameters each, in this order. Their errors are taken as
-    /// Gaussian. The prior about CAD remains. It is already in these parameters, so that it counts
-    /// twice, but little beside them.
-    ///
-    /// # Errors
-    /// The root has another width, or a covariance that is not positive definite in some component.
-    /// Then that component and those after it are unchanged.
-    pub fn begin_with(
-        &mut self,
-        cad: &[RigidInertia],
-        links: &[(usize, RigidInertia)],
-        root: &DMatrix<f64>,
-    ) -> Result<(), OnlineError> {
-        let width = LINK_PARAMETERS * links.len();
-        if root.ncols() != width {
-            let (what, got, expected) = ("columns of the covariance's root", root.ncols(), width);
-            return Err(InformationError::Size {
-                what,
-                got,
-                expected,
-            }
-            .into());
-        }
-        let pairs = self
-            .components
-            .iter_mut()
-            .zip(&mut self.solution.components);
-        for (number, (component, known)) in pairs.enumerate() {
-            let (offset_count, unknowns) =
-                (component.offsets.len(), component.information.unknowns());
-            // Columns of the component, columns of the root, and parameters relative to CAD.
-            let mut columns = Vec::new();
-            for (place, link) in component.links.iter().enumerate() {
-                let Some(at) = links.iter().position(|(number, _)| number == link) else {
-                    continue;
-                };
-                let (found, cad) = (links[at].1.parameters(), cad[*link].parameters());
-                columns.extend((0..LINK_PARAMETERS).map(|i| {
-                    (
-                        offset_count + LINK_PARAMETERS * place + i,
-                        LINK_PARAMETERS * at + i,
-                        found[i] - cad[i],
-                    )
-                }));
-                known.bodies[place] = links[at].1;
-            }
-            if columns.is_empty() {
-                continue;
-            }
-            // U of these columns alone, scaled by their deviations: P = S U^T U S, so that the
-            // whitened error is U^-T S^-1 (d - d_0).
-            let mut own =
-                DMatrix::from_fn(root.nrows(), columns.len(), |i, j| root[(i, columns[j].1)]);
-            let deviations: Vec<f64> = own.column_iter().map(|column| column.norm()).collect();
-            for (mut column, deviation) in own.column_iter_mut().zip(&deviations) {
-                column /= *deviation;
-            }
-            let upper = own.qr().r();
-            let inverse = upper
-                .transpose()
-                .try_inverse()
-                .filter(|inverse| inverse.iter().all(|x| x.is_finite()));
-            let Some(inverse) = inverse.filter(|_| upper.nrows() == columns.len()) else {
-                return Err(InformationError::Undetermined {
-                    unknown: columns[0].0,
-                }
-                .into());
-            };
-            let mut panel = Panel::new(unknowns, columns.len());
-            for whitened in inverse.row_iter() {
-                let (mut row, mut right) = (vec![0.0; unknowns], 0.0);
-                for ((&(column, _, value), deviation), weight) in
-                    columns.iter().zip(&deviations).zip(whitened.iter())
-                {
-                    row[column] = weight / deviation;
-                    right += row[column] * value;
-                }
-                panel.push_row(&row, right)?;
-            }
-            component.information.absorb(&mut panel)?;
-            // In use from the beginning; other links keep CAD.
-            let Some(job) = &mut self.job else { continue };
-            let Some(part) = job.parts.get_mut(number) else {
-                continue;
-            };
-            let mut begun = part.selection.in_use().clone();
-            let (rows, parameters) = begun.root.shape();
-            begun.root = begun.root.resize_vertically(rows + columns.len(), 0.0);
-            for (j, (&(column, _, value), deviation)) in columns.iter().zip(&deviations).enumerate()
-            {
-                begun.change[column - offset_count] = value;
-                begun.root.column_mut(column - offset_count).fill(0.0);
-                for i in 0..=j {
-                    begun.root[(rows + i, column - offset_count)] = upper[(i, j)] * deviation;
-                }
-            }
-            begun.root = begun.root.qr().r();
-            begun.bodies.clone_from(&known.bodies);
-            begun.tau = f64::NAN;
-            debug_assert_eq!(begun.root.ncols(), parameters);
-            part.selection.replace_all(begun);
-            part.write_solution(known);
-            part.last_valid.clone_from(known);
-        }
-        Ok(())
-    }
-
-    /// Number of components.
-    pub fn component_count(&self) -> usize {
-        self.components.len()
-    }
-
     /// Why identification of a component pauses, and the counts of its observations; None if the
     /// component does not exist.
-    pub fn state(&self, component: usize) -> Option<(Paused, Counts)> {
+    pub fn state(&self, component: usize) -> Option<(Paused, ObservationCounts)> {
         let of = self.components.get(component)?;
         Some((
             of.paused,
-            Counts {
+            ObservationCounts {
                 late: self.late,
                 ..of.counts
             },
@@ -372,8 +207,8 @@ impl Online {
     ///
     /// # Errors
     /// Sizes do not match, or numbers are not finite. Nothing is changed then.
-    pub fn observe(&mut self, observation: &Observation<'_>) -> Result<(), DynamicsError> {
-        let Observation {
+    pub fn observe(&mut self, observation: &OnlineObservation<'_>) -> Result<(), DynamicsError> {
+        let OnlineObservation {
             t,
             kinematics,
             readings,
@@ -416,7 +251,12 @@ impl Online {
     /// its offset is learnt anew, and all else is kept. Does not allocate.
     pub fn forget_offset(&mut self, sensor: usize) {
         for component in &mut self.components {
-            if let Some(place) = component.sensors.iter().position(|own| *own == sensor) {
+            if let Some(place) = component
+                .layout
+                .sensors
+                .iter()
+                .position(|own| *own == sensor)
+            {
                 component.forget_offset(place);
             }
         }
@@ -426,13 +266,13 @@ impl Online {
     /// [`Self::forget_offset`]. Never for a sensor that is not identified.
     pub fn knows_zero(&self, sensor: usize) -> bool {
         let mut own = self.components.iter();
-        own.find(|component| component.sensors.contains(&sensor))
+        own.find(|component| component.layout.sensors.contains(&sensor))
             .is_some_and(|component| !component.is_outdated)
     }
 
     /// Returns a job to run once a second; None while the last one has not come back or waits for
     /// its stamp. Does not allocate.
-    pub fn take_job(&mut self) -> Option<Box<Job>> {
+    pub fn take_job(&mut self) -> Option<Box<SolutionJob>> {
         let due = self.snapshot? + SOLVE;
         if self.is_away || self.newest < due {
             return None;
@@ -443,7 +283,7 @@ impl Online {
         job.data = self.newest;
         std::mem::swap(&mut job.ticks, &mut self.ticks);
         job.tick_count = std::mem::take(&mut self.tick_count);
-        for (part, component) in job.parts.iter_mut().zip(&mut self.components) {
+        for (part, component) in job.components.iter_mut().zip(&mut self.components) {
             component.join();
             // Both have the same unknowns.
             let _ = part.information.copy_from(&component.information);
@@ -465,7 +305,7 @@ impl Online {
     }
 
     /// Returns a finished job.
-    pub fn give_back(&mut self, job: Box<Job>) {
+    pub fn give_back(&mut self, job: Box<SolutionJob>) {
         self.job = Some(job);
     }
 
@@ -489,7 +329,7 @@ impl Online {
         self.is_away = false;
         self.late += u64::from(std::mem::take(&mut self.is_overdue));
         std::mem::swap(&mut self.solution, &mut job.solution);
-        for (part, component) in job.parts.iter_mut().zip(&mut self.components) {
+        for (part, component) in job.components.iter_mut().zip(&mut self.components) {
             component.variances.copy_from_slice(&part.variances);
             component.drift_rates.copy_from_slice(&part.drift_rates);
             component.is_outdated &=
@@ -514,9 +354,9 @@ impl Online {
                 component.paused = Paused::No;
                 component.counts.changes += 1;
                 match change {
-                    Change::Offset => component.counts.offset_changes += 1,
-                    Change::Load => component.counts.load_changes += 1,
-                    Change::Anew => {
+                    DetectedChange::Offset => component.counts.offset_changes += 1,
+                    DetectedChange::Load => component.counts.load_changes += 1,
+                    DetectedChange::Anew => {
                         (component.motion, component.rows) = (0.0, 0);
                     }
                 }
@@ -527,10 +367,34 @@ impl Online {
         true
     }
 
-    /// The last change found in a component ([`Counts::changes`] is their number).
-    pub fn last_change(&self, component: usize) -> Option<Change> {
+    /// The last change found in a component ([`ObservationCounts::changes`] is their number).
+    pub fn last_change(&self, component: usize) -> Option<DetectedChange> {
         self.components.get(component)?.last_change
     }
+}
+
+/// The sub-trees that can be free of contacts, in groups that share sensors.
+fn linked_subtrees(stacked: &StackedRegressor) -> Vec<Vec<usize>> {
+    let structure = stacked.structure();
+    let is_free: Vec<bool> = (stacked.subtrees().iter())
+        .map(|subtree| subtree.remaining() > 0 && subtree.sensors().len() > 0)
+        .collect();
+    let free: Vec<usize> = (0..is_free.len()).filter(|&k| is_free[k]).collect();
+    let mut group: Vec<usize> = (0..is_free.len()).collect();
+    for sensor in 0..structure.sensors().len() {
+        let has_sensor = |k: &&usize| structure.subtrees()[**k].sensors.contains(sensor);
+        let sharing: Vec<usize> = free.iter().filter(has_sensor).copied().collect();
+        if let [a, b] = sharing[..] {
+            let (from, to) = (group[a].max(group[b]), group[a].min(group[b]));
+            let others = group.iter_mut().filter(|g| **g == from);
+            others.for_each(|g| *g = to);
+        }
+    }
+    let firsts = free.iter().filter(|&&k| group[k] == k);
+    firsts
+        .map(|first| free.iter().copied().filter(|&k| group[k] == *first))
+        .map(Iterator::collect)
+        .collect()
 }
 
 #[cfg(test)]
@@ -538,9 +402,13 @@ mod tests {
     use super::*;
     use crate::arithmetic::normals;
     use crate::linear::information::Information;
-    use crate::online::parameters::Parameters;
+    use crate::online::parameters::ParameterEstimate;
+    use crate::robot::BaseMotion;
+    use nalgebra::DMatrix;
     use nalgebra::DVector;
+    use proprio_dynamics::ContactSet;
     use proprio_dynamics::DofSet;
+    use proprio_dynamics::model::Model;
     use proprio_dynamics::model::{MeasurementDirection, MeasurementFrame};
     use proprio_dynamics::spatial::Pose;
     use proprio_dynamics::spatial::Vec3;
@@ -550,7 +418,7 @@ mod tests {
 
     /// A trunk of four links, and four limbs of four links behind a sensor each. The first limb
     /// ends in a foot behind another sensor.
-    fn robot() -> (Model, Vec<String>) {
+    fn robot() -> Robot {
         let (mut text, mut sensors, mut links) =
             (String::from("<robot name=\"r\">"), Vec::new(), 0);
         let mut link = |parent: Option<usize>, is_sensor: bool| {
@@ -586,43 +454,32 @@ mod tests {
         let text = text + "</robot>";
         let keep: Vec<&str> = sensors.iter().map(String::as_str).collect();
         let model = Model::from_urdf(&text, &keep).unwrap();
-        (model, sensors)
-    }
-
-    fn structure(model: &Model, sensors: &[String]) -> Structure {
         let noise = Noise {
             force: [0.1, 0.2, 0.3],
             torque: [0.01, 0.02, 0.03],
         };
         let (frame, direction) = (MeasurementFrame::Child, MeasurementDirection::ChildToParent);
-        let cuts: Vec<SensorCut> = (sensors.iter())
+        let cuts: Vec<(&str, SensorCut)> = (keep.iter())
             .map(|joint| {
-                SensorCut::new(model, joint, frame, direction, &Pose::identity(), &noise).unwrap()
+                let pose = Pose::identity();
+                let cut = SensorCut::new(&model, joint, frame, direction, &pose, &noise);
+                (*joint, cut.unwrap())
             })
             .collect();
-        Structure::new(model, &cuts, &[], Structure::LENGTH_SCALE).unwrap()
+        let gravity = Vec3::new(0.0, 0.0, -9.81);
+        let mut robot = Robot::standing("r", model, "l0", &gravity, &cuts, &[]).unwrap();
+        robot.base = BaseMotion::Imu(Pose::identity());
+        robot
     }
 
-    fn online(model: &Model, structure: &Structure) -> Online {
-        let offsets = vec![Wrench::zero(); structure.sensors().len()];
-        let none = ContactSet::default();
-        let period = Nanos::from_millis(10);
-        Online::new(
-            model,
-            structure,
-            model.inertias(),
-            &offsets,
-            &none,
-            0,
-            period,
-            0.2,
-            &BaseMotion::Imu(Pose::identity()),
-        )
-        .unwrap()
+    fn online(robot: &Robot) -> Online {
+        let offsets = vec![Wrench::zero(); robot.structure.sensors().len()];
+        Online::new(robot, &offsets, Nanos::from_millis(10)).unwrap()
     }
 
     /// Observations every ten milliseconds of a robot in random motion, with random readings.
-    fn observe(model: &Model, count: usize, observations: i64, online: &mut [&mut Online]) {
+    fn observe(robot: &Robot, observations: i64, online: &mut [&mut Online]) {
+        let (model, count) = (&robot.model, robot.structure.sensors().len());
         let mut kinematics = Kinematics::new(model, 0).unwrap();
         let dofs = model.dof_count();
         let (joints, fine) = (vec![Reason::None; dofs], vec![Reason::None; count]);
@@ -647,7 +504,7 @@ mod tests {
             };
             let readings: Vec<Wrench> = rest[9..].chunks_exact(6).map(six).collect();
             for online in &mut *online {
-                let observation = Observation {
+                let observation = OnlineObservation {
                     t: Nanos::from_millis(10 * step),
                     kinematics: &kinematics,
                     readings: &readings,
@@ -668,14 +525,20 @@ mod tests {
     /// The gate accepts the drift that an offset may have had since the data of the solution.
     #[test]
     fn the_drift_of_offsets_passes_the_gate() {
-        let (model, sensors) = robot();
-        let mut online = online(&model, &structure(&model, &sensors));
+        let robot = robot();
+        let mut online = online(&robot);
         let mut known = online.job.as_ref().unwrap().solution.components[0].clone();
-        observe(&model, sensors.len(), 1, &mut [&mut online]);
+        observe(&robot, 1, &mut [&mut online]);
         let component = &mut online.components[0];
         // Unknowns that explain the observation, except for an offset.
-        let (unknowns, mut a, mut y) = (component.kinds.unknowns(), Vec::new(), Vec::new());
-        for (kind, rows) in component.kinds.iter().zip(component.gathered.iter()) {
+        let (unknowns, mut a, mut y) =
+            (component.layout.columns.unknowns(), Vec::new(), Vec::new());
+        for (kind, rows) in component
+            .layout
+            .columns
+            .iter()
+            .zip(component.gathered.iter())
+        {
             for row in rows.values().chunks_exact(kind.columns.len() + 1) {
                 let mut whole = vec![0.0; unknowns];
                 for (&column, value) in kind.columns.iter().zip(row) {
@@ -713,7 +576,7 @@ mod tests {
     /// The covariance of a mixture matches its definition.
     #[test]
     fn a_mixture_of_two_sets_has_its_mean_and_covariance() {
-        let set = |seed: u64| Parameters {
+        let set = |seed: u64| ParameterEstimate {
             change: normals(seed, 3),
             root: DMatrix::from_vec(4, 3, normals(seed + 1, 12)),
             bodies: Vec::new(),
@@ -723,7 +586,7 @@ mod tests {
         let (first, second) = (set(1), set(3));
         let [a, b] = [&first, &second].map(|set| DVector::from_column_slice(&set.change));
         for share in [0.0, 0.3, 1.0] {
-            let mixed = Parameters::between(&first, &second, share).unwrap();
+            let mixed = ParameterEstimate::between(&first, &second, share).unwrap();
             let [p, p1, p2] = [&mixed, &first, &second].map(|set| set.root.tr_mul(&set.root));
             let apart = (&b - &a) * (&b - &a).transpose() * (share * (1.0 - share));
             assert!(
@@ -741,11 +604,10 @@ mod tests {
     /// A failure to solve is reported, with the earlier solution in use, until it is over.
     #[test]
     fn a_failure_is_reported_until_it_is_over() {
-        let (model, sensors) = robot();
-        let mut job = online(&model, &structure(&model, &sensors)).job.unwrap();
+        let mut job = online(&robot()).job.unwrap();
         let last_valid = job.solution.components[0].clone();
         for (tau, text) in [(f64::NAN, Some("the scale tau is NaN")), (1.0, None)] {
-            job.parts[0].tau = tau;
+            job.components[0].tau = tau;
             job.run();
             let reported: Vec<Option<String>> =
                 job.failures().map(|f| f.map(ToString::to_string)).collect();
@@ -767,15 +629,14 @@ mod tests {
     /// absorbed limb by limb.
     #[test]
     fn limbs_give_the_same_information_separately() {
-        let (model, sensors) = robot();
-        let structure = structure(&model, &sensors);
-        let [mut apart, mut together] = [(); 2].map(|()| online(&model, &structure));
+        let robot = robot();
+        let [mut apart, mut together] = [(); 2].map(|()| online(&robot));
         assert_eq!(
             (apart.components.len(), apart.components[0].limbs.len()),
             (1, 5)
         );
         together.components[0].limbs.clear();
-        observe(&model, sensors.len(), 260, &mut [&mut apart, &mut together]);
+        observe(&robot, 260, &mut [&mut apart, &mut together]);
         // Thirty of the 36 rows of an observation, since the last full second.
         let component = &mut apart.components[0];
         let by_limbs: u64 = component

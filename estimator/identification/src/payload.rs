@@ -10,14 +10,13 @@
 //! What `d` explains is eliminated, so the covariance of `p` contains the uncertainty of the robot;
 //! and that of the sensors' gains: every weight scales with them, and cross-talk turns moments.
 
-use crate::Options;
 use crate::batch::{self, exclude_disturbed, plausible_model, prepare_logs};
 use crate::dataset::Dataset;
 use crate::diagnose::load::{Normal, body};
 use crate::finding::Finding;
 use crate::fit::IdentifyError;
 use crate::report::outcome::{Outcome, Verdict};
-use crate::robot::Robot;
+use crate::robot::{IdentificationInput, Robot};
 use crate::training::training_logs;
 use nalgebra::{DMatrix, SMatrix, SVector};
 use proprio_dynamics::model::Frame;
@@ -33,7 +32,7 @@ type Square = SMatrix<f64, LINK_PARAMETERS, LINK_PARAMETERS>;
 
 /// What is known about a robot before it takes a payload up.
 #[derive(Clone, Debug)]
-pub struct Known {
+pub struct KnownParameters {
     /// The links whose parameters were identified. The model of the robot has these parameters.
     pub links: Vec<usize>,
     /// `U` of their covariance `U^T U`, ten columns per link.
@@ -75,19 +74,19 @@ pub enum PayloadError {
 
 /// Identifies what a frame of the robot carries in these logs.
 ///
-/// `robot` has the parameters and calibrations that were identified without the payload.
+/// `inputs`: as for [`crate::identify`]. `robot` has the parameters and calibrations that were identified without the payload.
 ///
 /// # Errors
 /// [`PayloadError`].
 pub fn payload(
     robot: &Robot,
-    known: &Known,
+    known: &KnownParameters,
     frame: &Frame,
     datasets: Vec<Dataset>,
-    options: &Options,
+    inputs: &[IdentificationInput],
 ) -> Result<Payload, PayloadError> {
     let name = || robot.model.link_name(frame.link).to_owned();
-    let inputs = batch::chosen_inputs(robot, options);
+    let inputs = batch::chosen_inputs(robot, inputs);
     let mut logs = prepare_logs(robot, datasets);
     let measurement = match plausible_model(robot, &inputs, &mut logs)? {
         ControlFlow::Continue(measurement) => measurement,
@@ -166,7 +165,7 @@ fn reason(outcome: Outcome) -> String {
 }
 
 /// The inverse of the covariance of these links' parameters; zero for those that are not known.
-fn precision(known: &Known, links: &[usize]) -> Option<DMatrix<f64>> {
+fn precision(known: &KnownParameters, links: &[usize]) -> Option<DMatrix<f64>> {
     let mut columns = Vec::new();
     for (place, link) in links.iter().enumerate() {
         if let Some(at) = known.links.iter().position(|own| own == link) {

@@ -36,7 +36,7 @@
 //! of the prior.
 //!
 //! # The weight
-//! [`Fit::next_tau`] maximises the evidence. The prior in the ten parameters of a link, `exp(-D /
+//! [`MapEstimate::next_tau`] maximises the evidence. The prior in the ten parameters of a link, `exp(-D /
 //! (2 tau^2))`, is a Wishart distribution (`n = 5 + 1/tau^2` degrees of freedom, scale `tau^2 J0`,
 //! mode at CAD). Its mean divergence is known:
 //!
@@ -74,7 +74,7 @@ use nalgebra::{Matrix4, SMatrix, SVector, SymmetricEigen};
 
 use proprio_dynamics::spatial::{Mat3, RigidInertia, Vec3};
 
-pub use posterior::{Fit, Posterior};
+pub use posterior::{MapEstimate, Posterior};
 
 type Matrix10 = SMatrix<f64, 10, 10>;
 type Vector10 = SVector<f64, 10>;

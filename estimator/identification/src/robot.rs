@@ -150,6 +150,38 @@ pub enum RobotError {
     Structure(#[from] StructureError),
 }
 
+/// The degrees of freedom that move a link against the root.
+pub(crate) fn dofs_above(model: &Model, mut link: usize) -> Vec<usize> {
+    let mut dofs = Vec::new();
+    while link > 0 {
+        let joint = &model.joints()[link - 1];
+        dofs.extend(joint.dof);
+        link = joint.parent;
+    }
+    dofs
+}
+
+/// The degrees of freedom that move one of these links against the base, ascending: their joints
+/// are on a path between them.
+pub(crate) fn dofs_between(
+    model: &Model,
+    base: usize,
+    links: &[usize],
+) -> impl Iterator<Item = usize> + use<> {
+    let of_base = dofs_above(model, base);
+    let mut is_between = vec![false; model.dof_count()];
+    for &link in links {
+        let own = dofs_above(model, link);
+        for dof in own.iter().filter(|dof| !of_base.contains(dof)) {
+            is_between[*dof] = true;
+        }
+        for dof in of_base.iter().filter(|dof| !own.contains(dof)) {
+            is_between[*dof] = true;
+        }
+    }
+    (0..is_between.len()).filter(move |&dof| is_between[dof])
+}
+
 impl Robot {
     /// Per degree of freedom, its position before any sample of it: where it is locked, else 0.
     #[must_use]

@@ -2,11 +2,11 @@
 //! the segments in which they are processed.
 
 use crate::dataset::observation::{Annotated, Observation, UnitSet};
-use crate::dataset::{Dataset, Role};
+use crate::dataset::{Dataset, LogRole};
 use crate::finding::{Finding, FindingCode, Severity};
 use crate::measurement::model::MeasurementModel;
-use crate::measurement::reduction::Segment;
-use crate::measurement::rows::Rows;
+use crate::measurement::reduction::LogSegment;
+use crate::measurement::rows::MeasurementRows;
 use crate::parallel;
 use crate::robot::{ChannelRole, Robot};
 use proprio_dynamics::spatial::Wrench;
@@ -59,7 +59,7 @@ pub(crate) const SEGMENT_INSTANTS: usize = 10_000;
 /// A log whose observations are ready to be used.
 pub(crate) struct TrainingLog {
     pub file: String,
-    pub role: Role,
+    pub role: LogRole,
     pub span: (Nanos, Nanos),
     pub instants: Vec<Annotated>,
     pub excluded: Vec<Excluded>,
@@ -101,14 +101,14 @@ impl TrainingLog {
 
 /// The training logs that are not refused.
 pub(crate) fn training_logs(logs: &[TrainingLog]) -> Vec<&TrainingLog> {
-    let is_used = |log: &&TrainingLog| log.role == Role::Train && !log.refused;
+    let is_used = |log: &&TrainingLog| log.role == LogRole::Train && !log.refused;
     logs.iter().filter(is_used).collect()
 }
 
 pub(crate) fn training_logs_mut(
     logs: &mut [TrainingLog],
 ) -> impl Iterator<Item = &mut TrainingLog> {
-    let is_used = |log: &&mut TrainingLog| log.role == Role::Train && !log.refused;
+    let is_used = |log: &&mut TrainingLog| log.role == LogRole::Train && !log.refused;
     logs.iter_mut().filter(is_used)
 }
 
@@ -138,12 +138,12 @@ pub(crate) fn refuse_repeated(logs: &mut [TrainingLog]) {
         };
         let mut log = log;
         // The one for validation is refused.
-        if log.role == Role::Train && other.role == Role::Validate {
+        if log.role == LogRole::Train && other.role == LogRole::Validate {
             std::mem::swap(&mut log, &mut other);
         }
         let instead = match log.role {
-            Role::Train => "it is used once",
-            Role::Validate => {
+            LogRole::Train => "it is used once",
+            LogRole::Validate => {
                 "it was excluded, because training data cannot validate the parameters; record \
                  another motion"
             }
@@ -159,7 +159,7 @@ pub(crate) fn refuse_repeated(logs: &mut [TrainingLog]) {
 pub(crate) fn no_log(logs: &[TrainingLog]) -> String {
     /// Most reasons that are named.
     const NAMED: usize = 3;
-    let training = logs.iter().filter(|log| log.role == Role::Train);
+    let training = logs.iter().filter(|log| log.role == LogRole::Train);
     let reasons: Vec<String> = training
         .flat_map(|log| {
             let refusals = log
@@ -309,8 +309,8 @@ fn too_few(
 /// Results of a pass over each segment, on all cores, in the order of the segments.
 pub(crate) fn map_segments<'a, T: Send>(
     measurement: &MeasurementModel<'_>,
-    segments: &[Segment<'a>],
-    pass: impl Fn(&mut MeasurementModel<'_>, usize, Segment<'a>) -> T + Sync,
+    segments: &[LogSegment<'a>],
+    pass: impl Fn(&mut MeasurementModel<'_>, usize, LogSegment<'a>) -> T + Sync,
 ) -> Vec<T> {
     parallel::map_with(
         segments.len(),
@@ -320,13 +320,13 @@ pub(crate) fn map_segments<'a, T: Send>(
 }
 
 /// All instants of all logs, in segments of at most `most`.
-pub(crate) fn segments_of<'a>(training: &[&'a TrainingLog], most: usize) -> Vec<Segment<'a>> {
+pub(crate) fn segments_of<'a>(training: &[&'a TrainingLog], most: usize) -> Vec<LogSegment<'a>> {
     let mut segments = Vec::new();
     for (number, log) in training.iter().enumerate() {
         let count = log.instants.len().div_ceil(most).max(1);
         for part in 0..count {
             let at = |k: usize| log.instants.len() * k / count;
-            segments.push(Segment {
+            segments.push(LogSegment {
                 instants: &log.instants[at(part)..at(part + 1)],
                 log: Some(number),
             });
@@ -340,7 +340,7 @@ pub(crate) fn segments_of<'a>(training: &[&'a TrainingLog], most: usize) -> Vec<
 pub(crate) fn sample<'a>(
     measurement: &MeasurementModel<'_>,
     training: &[&'a TrainingLog],
-) -> Vec<Segment<'a>> {
+) -> Vec<LogSegment<'a>> {
     let total: usize = training.iter().map(|log| log.instants.len()).sum();
     if total <= SAMPLE_INSTANTS {
         return segments_of(training, usize::MAX);
@@ -353,15 +353,18 @@ pub(crate) fn sample<'a>(
         .sum();
     let every = ((in_stretches + SAMPLE_INSTANTS / 2) / SAMPLE_INSTANTS).max(1);
     let length = SAMPLE_INSTANTS / segments.len().div_ceil(every);
-    let stretch = |segment: &Segment<'a>, start: usize| Segment {
+    let stretch = |segment: &LogSegment<'a>, start: usize| LogSegment {
         instants: &segment.instants[start..segment.instants.len().min(start + length)],
         ..*segment
     };
     let taken = segments.iter().step_by(every);
-    let mut sampled: Vec<Segment<'a>> = taken.map(|segment| stretch(segment, 0)).collect();
+    let mut sampled: Vec<LogSegment<'a>> = taken.map(|segment| stretch(segment, 0)).collect();
     // How often each channel occurs, up to `MIN_FOLD`: without any sample of it, its noise would be
     // estimated as zero.
-    let (mut measurement, mut rows) = (measurement.clone(), Rows::new(measurement.unknowns()));
+    let (mut measurement, mut rows) = (
+        measurement.clone(),
+        MeasurementRows::new(measurement.unknowns()),
+    );
     let mut appears = vec![0; measurement.unknowns().channels()];
     let mut count_channels = |instant: &Annotated, appears: &mut [usize]| -> bool {
         let made = measurement.make(instant, &mut rows).is_ok();

@@ -8,7 +8,7 @@ use common::Random;
 use nalgebra::{DMatrix, DVector, Matrix4};
 use proprio_dynamics::spatial::{Mat3, Pose, RigidInertia, Vec3};
 use proprio_identification::prior::{
-    Fit, GREATEST_TAU, LEAST_MASS, LEAST_RADIUS, Posterior, Prior, PriorError,
+    GREATEST_TAU, LEAST_MASS, LEAST_RADIUS, MapEstimate, Posterior, Prior, PriorError,
 };
 use proptest::prelude::*;
 
@@ -101,7 +101,7 @@ fn is_body(body: &RigidInertia) -> bool {
 /// Gradient of the cost, and the size of its terms.
 fn optimality(
     prior: &Prior,
-    fit: &Fit,
+    fit: &MapEstimate,
     data: &DMatrix<f64>,
     right: &DVector<f64>,
     precision: &[f64],

@@ -1,15 +1,15 @@
 //! The motion that lessens the deviations of some torques the most.
 //!
 //! Criterion: the sum of the logarithms of the deviations, over the states of a [`Workspace`],
-//! after the motion ([`Forecast`]). Its numbers ([`Series::within`]) are found by an evolution
+//! after the motion ([`Forecast`]). Its numbers ([`FourierSeries::within`]) are found by an evolution
 //! strategy: from the best of some random motions, with the mean of the best of each generation
 //! and a step that the path of the mean adapts (Hansen, Ostermeier, "Completely derandomized
 //! self-adaptation in evolution strategies", 2001, without its covariance matrix). It needs no
 //! derivatives, which limits and boxes do not have.
 
 use crate::knowledge::at_rest;
-use crate::motion::{Fence, JointLimits, Series, harmonics, reach, within};
-use crate::workspace::{Deviation, Puppet, Rows, Workspace};
+use crate::motion::{Fence, FourierSeries, JointLimits, harmonics, reach, within};
+use crate::workspace::{Deviation, Puppet, TorqueRows, Workspace};
 use fastrand::Rng;
 use nalgebra::DVector;
 use proprio_dynamics::DynamicsError;
@@ -59,9 +59,9 @@ pub struct Task<'a> {
 }
 
 /// The motion, and what it is good for.
-pub struct Plan {
+pub struct PlannedMotion {
     /// The motion.
-    pub series: Series,
+    pub series: FourierSeries,
     /// The deviations of all torques before it.
     pub before: Vec<Deviation>,
     /// The deviations after it.
@@ -106,7 +106,7 @@ pub struct Planner<'a> {
     forecast: Forecast<'a>,
     workspace: Workspace,
     /// The wanted torques in the columns of the forecasts.
-    rows: Rows,
+    rows: TorqueRows,
     /// Postures within all boxes, of the moving joints.
     starts: Vec<Vec<f64>>,
 }
@@ -131,7 +131,7 @@ impl<'a> Planner<'a> {
             for (position, limits) in posture.iter_mut().zip(&task.limits) {
                 if let Some(limits) = limits {
                     let (lower, upper) = (limits.range.lower, limits.range.upper);
-                    // Where a motion may start: see `Series::within`.
+                    // Where a motion may start: see `FourierSeries::within`.
                     let place = 0.8 * (2.0 * rng.f64() - 1.0);
                     *position = 0.5 * (lower + upper) + 0.5 * (upper - lower) * place;
                 }
@@ -157,7 +157,7 @@ impl<'a> Planner<'a> {
         let mut puppet = Puppet::new(robot)?;
         let dofs = robot.model.dof_count();
         let examples = starts.iter().take(10).map(|position| {
-            let state = crate::workspace::State {
+            let state = crate::workspace::MotionState {
                 position: position.clone(),
                 velocity: vec![0.0; dofs],
                 acceleration: vec![0.0; dofs],
@@ -190,7 +190,7 @@ impl<'a> Planner<'a> {
     ///
     /// # Errors
     /// [`ExciteError`].
-    pub fn plan(&self, progress: &mut dyn FnMut(f64)) -> Result<Plan, ExciteError> {
+    pub fn plan(&self, progress: &mut dyn FnMut(f64)) -> Result<PlannedMotion, ExciteError> {
         let mut rng = Rng::with_seed(self.task.seed.wrapping_add(1));
         let first: Vec<Vec<f64>> = (0..FIRST).map(|_| self.random(&mut rng)).collect();
         let costs = parallel::map(FIRST, |k| self.cost(&first[k]));
@@ -233,7 +233,7 @@ impl<'a> Planner<'a> {
         let series = self.series(&found.1)?.ok_or(ExciteError::Boxes)?;
         let before = self.before()?;
         let after = self.deviations(&series)?;
-        Ok(Plan {
+        Ok(PlannedMotion {
             series,
             before,
             after,
@@ -244,7 +244,7 @@ impl<'a> Planner<'a> {
     ///
     /// # Errors
     /// [`ExciteError`].
-    pub fn random_motion(&self, seed: u64) -> Result<Series, ExciteError> {
+    pub fn random_motion(&self, seed: u64) -> Result<FourierSeries, ExciteError> {
         let mut rng = Rng::with_seed(seed);
         for _ in 0..100 {
             if let Some(series) = self.series(&self.random(&mut rng))? {
@@ -276,7 +276,7 @@ impl<'a> Planner<'a> {
     ///
     /// # Errors
     /// [`ExciteError`].
-    pub fn deviations(&self, series: &Series) -> Result<Vec<Deviation>, ExciteError> {
+    pub fn deviations(&self, series: &FourierSeries) -> Result<Vec<Deviation>, ExciteError> {
         let told = self.forecast.told(self.observations(series)?);
         let covariance = (self.forecast.covariance(told)).ok_or(ForecastError::Singular)?;
         Ok(self.workspace.deviations(self.task.robot, &covariance))
@@ -287,7 +287,7 @@ impl<'a> Planner<'a> {
         &self.workspace
     }
 
-    fn observations(&self, series: &Series) -> Result<Vec<Observation>, DynamicsError> {
+    fn observations(&self, series: &FourierSeries) -> Result<Vec<Observation>, DynamicsError> {
         let mut puppet = Puppet::new(self.task.robot)?;
         let instants = series.instants(PERIOD);
         instants
@@ -295,7 +295,7 @@ impl<'a> Planner<'a> {
             .collect()
     }
 
-    fn series(&self, numbers: &[f64]) -> Result<Option<Series>, DynamicsError> {
+    fn series(&self, numbers: &[f64]) -> Result<Option<FourierSeries>, DynamicsError> {
         let Task {
             robot,
             limits,
@@ -303,7 +303,7 @@ impl<'a> Planner<'a> {
             seconds,
             ..
         } = &self.task;
-        Series::within(robot, limits, fences, *seconds, numbers)
+        FourierSeries::within(robot, limits, fences, *seconds, numbers)
     }
 
     /// The numbers of a random motion from a posture within all boxes.

@@ -12,7 +12,7 @@
 //!
 //! Gains of the sensors are taken as right, and readings as exact.
 
-use crate::workspace::{Deviation, Puppet, State, UPRIGHT, Workspace, range};
+use crate::workspace::{Deviation, MotionState, Puppet, UPRIGHT, Workspace, range};
 use nalgebra::{DMatrix, SMatrix};
 use proprio_dynamics::DynamicsError;
 use proprio_dynamics::calibration::UNKNOWN_OFFSET;
@@ -43,12 +43,12 @@ pub struct Knowledge {
     /// The identified combinations.
     pub base_parameters: Vec<BaseParameter>,
     /// Each torque.
-    pub torques: Vec<Torque>,
+    pub torques: Vec<TorqueKnowledge>,
 }
 
 /// What is known of a torque.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Torque {
+pub struct TorqueKnowledge {
     /// The degree of freedom.
     pub dof: usize,
     /// Standard deviation from CAD alone, where the sensors were read for a second with the robot
@@ -174,7 +174,7 @@ pub fn at_rest(
     known: Option<&CovarianceRoot>,
 ) -> Result<CovarianceRoot, ForecastError> {
     let dofs = robot.model.dof_count();
-    let mut state = State {
+    let mut state = MotionState {
         position: robot.position_without_samples(),
         velocity: vec![0.0; dofs],
         acceleration: vec![0.0; dofs],
@@ -222,7 +222,7 @@ impl Knowledge {
             .collect();
         let torque = |((dof, rows), (cad, end)): ((usize, Option<&DMatrix<f64>>), _)| {
             let (cad, end): (&Deviation, &Deviation) = (cad, end);
-            let mut torque = Torque {
+            let mut torque = TorqueKnowledge {
                 dof,
                 cad: cad.torque,
                 identified: end.torque,

@@ -17,7 +17,7 @@
 //! Limits hold between the checked instants too: these are `GRID` apart, and what a harmonic can
 //! rise in between is within the [`MARGIN`] that is kept.
 
-use crate::workspace::State;
+use crate::workspace::MotionState;
 use proprio_dynamics::model::{Frame, Limits};
 use proprio_dynamics::spatial::Vec3;
 use proprio_dynamics::{DynamicsError, FrameMotion, JointState, Kinematics};
@@ -150,7 +150,7 @@ pub fn within(
 
 /// A motion of some joints.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Series {
+pub struct FourierSeries {
     /// Its duration [s].
     seconds: f64,
     /// Per degree of freedom, the position where it starts and stops, and `[a_k, b_k]`.
@@ -183,7 +183,7 @@ fn fade(t: f64, seconds: f64) -> [f64; 3] {
     }
 }
 
-impl Series {
+impl FourierSeries {
     /// From free numbers: per moving joint (of these limits) the place of its start, and `[a, b]`
     /// of each harmonic in units of the greatest that its limits allow. Everything is scaled down
     /// until all limits and boxes hold. None if the start is outside a box.
@@ -294,7 +294,7 @@ impl Series {
 
     /// The state at a time since the start \[s\].
     #[must_use]
-    pub fn at(&self, t: f64) -> State {
+    pub fn at(&self, t: f64) -> MotionState {
         let t = t.clamp(0.0, self.seconds);
         let [w, w1, w2] = fade(t, self.seconds);
         let rate = TAU * CYCLES / self.seconds;
@@ -305,7 +305,7 @@ impl Series {
                 [sin, cos, rate]
             })
             .collect();
-        let mut state = State::default();
+        let mut state = MotionState::default();
         for (start, series) in &self.joints {
             let mut value = [0.0; 3];
             for ([a, b], [sin, cos, rate]) in series.iter().zip(&waves) {
@@ -329,7 +329,7 @@ mod tests {
 
     #[test]
     fn derivatives_are_those_of_the_positions_and_the_ends_are_at_rest() {
-        let series = Series {
+        let series = FourierSeries {
             seconds: 9.0,
             joints: vec![(0.4, vec![[0.3, -0.2], [0.1, 0.5]]), (1.0, Vec::new())],
         };

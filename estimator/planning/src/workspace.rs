@@ -35,7 +35,7 @@ pub const RISE: f64 = 0.5;
 
 /// Positions, velocities and accelerations of all joints, by degree of freedom.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct State {
+pub struct MotionState {
     /// [rad or m]
     pub position: Vec<f64>,
     /// [rad/s or m/s]
@@ -87,7 +87,7 @@ impl<'a> Puppet<'a> {
     ///
     /// # Errors
     /// The state is of another robot, or not finite.
-    pub fn observe(&mut self, t: Nanos, state: &State) -> Result<Observation, DynamicsError> {
+    pub fn observe(&mut self, t: Nanos, state: &MotionState) -> Result<Observation, DynamicsError> {
         let (robot, model) = (self.robot, &self.robot.model);
         let mut active = robot.always;
         let carrying = || {
@@ -156,13 +156,13 @@ impl<'a> Puppet<'a> {
 }
 
 /// Positions within the limits, and velocities and accelerations of lively motion.
-fn states(robot: &Robot, count: usize) -> Vec<State> {
+fn states(robot: &Robot, count: usize) -> Vec<MotionState> {
     let mut rng = Rng::with_seed(SEED);
     let model = &robot.model;
     let dofs = model.dof_count();
     let still = robot.position_without_samples();
     let mut state = || {
-        let mut state = State {
+        let mut state = MotionState {
             position: still.clone(),
             velocity: vec![0.0; dofs],
             acceleration: vec![0.0; dofs],
@@ -254,7 +254,7 @@ impl Workspace {
         robot: &Robot,
         columns: &[ParameterColumn],
         calibrations: &[(usize, Unknown)],
-    ) -> Rows {
+    ) -> TorqueRows {
         let of_offset = |sensor: usize| LINK_PARAMETERS * self.links + 6 * sensor;
         let place = |column: &ParameterColumn| match *column {
             ParameterColumn::Inertial { link, parameter } => LINK_PARAMETERS * link + parameter,
@@ -296,7 +296,7 @@ impl Workspace {
             }
             (*dof, Some((own, rest)))
         });
-        Rows {
+        TorqueRows {
             torques: torques.collect(),
         }
     }
@@ -319,7 +319,7 @@ pub struct Deviation {
 }
 
 /// The torques in the columns of a covariance.
-pub struct Rows {
+pub struct TorqueRows {
     torques: Vec<(usize, Option<Block>)>,
 }
 
@@ -327,7 +327,7 @@ pub struct Rows {
 /// not contain.
 type Block = (DMatrix<f64>, DVector<f64>);
 
-impl Rows {
+impl TorqueRows {
     /// The deviation of each torque for the covariance `root root^T`.
     #[must_use]
     pub fn deviations(&self, root: &DMatrix<f64>) -> Vec<Deviation> {

@@ -24,7 +24,7 @@ use proprio_dynamics::spatial::{RigidInertia, Vec3, Wrench};
 use proprio_dynamics::{ContactSet, DofSet, FrameMotion, JointState, Kinematics, SensorSet};
 use proprio_identification::online::state::{SensorFingerprint, StateError};
 use proprio_identification::online::{
-    Job as SolverJob, Observation, Online, OnlineError, Solution,
+    Online, OnlineError, OnlineObservation, Solution, SolutionJob,
 };
 use proprio_identification::prior::PriorError;
 use proprio_identification::robot::{BaseMotion, ChannelRole};
@@ -71,7 +71,7 @@ struct Workspace {
 /// A job of on-line identification: solves for the parameters and prepares the propagation of their
 /// covariance. [`Job::run`] it in any thread, then [`super::Pipeline::give_back`].
 pub struct Job {
-    solver_job: Box<SolverJob>,
+    solver_job: Box<SolutionJob>,
     workspace: Box<Workspace>,
 }
 
@@ -191,17 +191,7 @@ fn to_u32(number: usize) -> u32 {
 impl OnlineIdentification {
     pub(super) fn new(setup: &Setup) -> Result<Self, OnlineError> {
         let period = setup.identification_period;
-        let mut online = Online::new(
-            &setup.robot.model,
-            &setup.robot.structure,
-            setup.robot.model.inertias(),
-            &setup.state.offsets,
-            &setup.robot.always,
-            setup.robot.base_link,
-            period,
-            setup.robot.urdf_relative_std,
-            &setup.robot.base,
-        )?;
+        let mut online = Online::new(&setup.robot, &setup.state.offsets, period)?;
         if let Some(parameters) = setup.state.identified() {
             let links: Vec<(usize, RigidInertia)> = parameters
                 .identified()
@@ -209,7 +199,7 @@ impl OnlineIdentification {
                 .collect();
             let root = parameters.root();
             let of_links = root.columns(0, 10 * links.len()).into_owned();
-            online.begin_with(setup.robot.model.inertias(), &links, &of_links)?;
+            online.begin_with(&links, &of_links)?;
         }
         let dofs = setup.robot.model.dof_count();
         let held = Motion {
@@ -329,7 +319,7 @@ impl OnlineIdentification {
             return;
         }
         // No error: sizes are those of the setup, and all values are finite.
-        let _ = self.online.observe(&Observation {
+        let _ = self.online.observe(&OnlineObservation {
             t,
             kinematics: &self.kinematics,
             readings: &self.readings,

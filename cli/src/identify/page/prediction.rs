@@ -6,7 +6,9 @@ use crate::identify::advice::percent;
 use crate::identify::summary::role;
 use crate::report::plot::{Ink, Plot, PlotAxis, Trace};
 use crate::report::{self, Cell, ReportTable, number};
-use proprio_identification::{Both, Curve, LogOutcome, ModelComparison, Outcome, Predicted, Role};
+use proprio_identification::{
+    Both, Curve, LogOutcome, LogRole, ModelComparison, Outcome, Predicted,
+};
 use proprio_topics::Nanos;
 
 /// How many points all lines of a report have together, at the most: at some seven bytes each it
@@ -126,7 +128,7 @@ pub(super) fn curves(outcome: &Outcome) -> Vec<String> {
     let most = (POINTS / (LINES * count.clamp(1, CURVES))).min(900);
     // Validation logs first: they show more than logs that were fitted.
     let mut logs: Vec<&LogOutcome> = outcome.logs.iter().collect();
-    logs.sort_by_key(|l| l.role == Role::Train);
+    logs.sort_by_key(|l| l.role == LogRole::Train);
     let mut shown: Vec<[Vec<&Curve>; 2]> = logs
         .iter()
         .map(|log| {

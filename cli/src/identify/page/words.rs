@@ -1,6 +1,6 @@
 //! Words that several parts of the page use: channels of a sensor, roles of logs, counts of things.
 
-use proprio_identification::Role;
+use proprio_identification::LogRole;
 
 /// Channels of an F/T sensor, in the order of their six numbers.
 pub(super) const WRENCH: [(&str, &str); 6] = [
@@ -12,10 +12,10 @@ pub(super) const WRENCH: [(&str, &str); 6] = [
     ("tz", "Nm"),
 ];
 
-pub(super) fn role_words(role: Role) -> &'static str {
+pub(super) fn role_words(role: LogRole) -> &'static str {
     match role {
-        Role::Train => "training",
-        Role::Validate => "validation",
+        LogRole::Train => "training",
+        LogRole::Validate => "validation",
     }
 }
 

@@ -3,9 +3,9 @@
 //! as a finding.
 
 use crate::dataset::recording::Recording;
-use crate::dataset::repeats::{Repeat, Repeats};
+use crate::dataset::repeats::{ChannelRepeats, RepeatedReadings};
 use crate::dataset::smooth::quantum;
-use crate::dataset::stream::{JointTrack, MOTION, Stream};
+use crate::dataset::stream::{JointTrack, MOTION, SampleStream};
 use crate::finding::{Finding, FindingCode};
 use crate::robot::{ChannelRole, Robot};
 use crate::statistics::robust_std;
@@ -28,7 +28,7 @@ struct Disorder {
 }
 
 /// A stream of any number of axes.
-trait Series {
+trait AnyStream {
     fn order(&mut self) -> Disorder;
     fn remove(&mut self, stamps: &[Nanos]);
     fn measure(&mut self, max_silence: Nanos);
@@ -36,7 +36,7 @@ trait Series {
 
 impl Recording {
     /// Every stream of a channel.
-    fn streams(&mut self, role: ChannelRole) -> Vec<&mut dyn Series> {
+    fn streams(&mut self, role: ChannelRole) -> Vec<&mut dyn AnyStream> {
         match role {
             ChannelRole::Joint(dof) => {
                 let track = &mut self.joints[dof];
@@ -57,7 +57,7 @@ impl Recording {
     }
 }
 
-impl<const D: usize> Series for Stream<D> {
+impl<const D: usize> AnyStream for SampleStream<D> {
     /// Removes as few samples as possible so that every stamp is later than the previous one: keeps
     /// a longest increasing subsequence.
     fn order(&mut self) -> Disorder {
@@ -121,7 +121,7 @@ impl<const D: usize> Series for Stream<D> {
     }
 }
 
-impl<const D: usize> Stream<D> {
+impl<const D: usize> SampleStream<D> {
     /// Removes samples of one axis that lie far from three neighbours on each side. Returns their
     /// number, the largest deviation, and its time. Deviations up to `least` are accepted.
     fn despike(&mut self, axis: usize, least: f64) -> Option<(usize, f64, Nanos)> {
@@ -169,7 +169,7 @@ impl<const D: usize> Stream<D> {
 /// torques and gyroscopes.
 pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
     let channels = recording.channels.clone();
-    let mut repeats = std::mem::replace(&mut recording.repeats, Repeats::new(0));
+    let mut repeats = std::mem::replace(&mut recording.repeats, RepeatedReadings::new(0));
     let max_silence = robot.max_silence;
     let mut found = Vec::new();
     let mut disorders = Vec::new();
@@ -292,7 +292,7 @@ pub(crate) fn merged<T>(
 fn repeated(
     recording: &mut Recording,
     channels: &[crate::robot::Channel],
-    repeats: &mut Repeats,
+    repeats: &mut RepeatedReadings,
     found: &mut Vec<Finding>,
 ) {
     for (channel, repeat) in channels.iter().zip(&mut repeats.channels) {
@@ -336,12 +336,12 @@ fn repeated(
             }
         }
     }
-    let of_rows = |r: &Repeat| {
+    let of_rows = |r: &ChannelRepeats| {
         let mut all: Vec<Nanos> = r.later.iter().chain(&r.same_stamp).copied().collect();
         all.sort_unstable();
         all
     };
-    let seen: Vec<&Repeat> = repeats.channels.iter().filter(|r| r.readings > 0).collect();
+    let seen: Vec<&ChannelRepeats> = repeats.channels.iter().filter(|r| r.readings > 0).collect();
     let rows = seen.first().map(|r| of_rows(r)).unwrap_or_default();
     if let (Some(first), true) = (
         rows.first(),
@@ -389,7 +389,7 @@ fn repeated(
     }));
 }
 
-impl<const D: usize> Stream<D> {
+impl<const D: usize> SampleStream<D> {
     /// Removes the samples after `from` up to `to`.
     fn retain_outside(&mut self, from: Nanos, to: Nanos) {
         let outside: Vec<bool> = self.t.iter().map(|t| *t <= from || *t > to).collect();
@@ -399,7 +399,7 @@ impl<const D: usize> Stream<D> {
 
 /// Where an encoder stops from one sample to the next out of fast motion and then stays for at
 /// least half a second, which is physically impossible.
-fn stopped(position: &Stream<1>) -> Option<(Nanos, Nanos)> {
+fn stopped(position: &SampleStream<1>) -> Option<(Nanos, Nanos)> {
     let (t, x) = (&position.t, position.column(0));
     let mut i = 1;
     while i < t.len() {

@@ -3,7 +3,7 @@
 use crate::dataset::cleaning::{FREEZE, STEEP, label, merged, steep};
 use crate::dataset::recording::{Recording, SkippedRows};
 use crate::dataset::smooth::{Scratch, quantum};
-use crate::dataset::stream::{MOTION, Stream, range};
+use crate::dataset::stream::{MOTION, SampleStream, range};
 use crate::finding::{Finding, FindingCode};
 use crate::robot::{AXES, ChannelRole, Robot};
 use crate::statistics::median;
@@ -62,7 +62,7 @@ pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
                              remove the column"
                         ),
                         Wrong::Noise(off) => {
-                            *stream = Stream::default();
+                            *stream = SampleStream::default();
                             format!(
                                 "joint/{joint}: the logged {given} is not that of the {}: \
                                  {off:.3} {unit} off, most of it noise; it is not used",
@@ -190,7 +190,7 @@ fn gaps(recording: &Recording, channels: &[crate::robot::Channel], found: &mut V
 /// that on both sides ([`steep`]). Saturation that escapes this test hides two or three steps,
 /// which does no harm. `moves`: whether the robot moves from the one stamp to the other.
 fn cut_off<const D: usize>(
-    stream: &Stream<D>,
+    stream: &SampleStream<D>,
     axis: usize,
     moves: impl Fn(Nanos, Nanos) -> bool,
 ) -> Option<(f64, Vec<usize>)> {
@@ -261,7 +261,7 @@ fn cut_off<const D: usize>(
 
 /// Excludes these samples of one quantity as saturated, and reports them.
 fn saturated<const D: usize>(
-    stream: &mut Stream<D>,
+    stream: &mut SampleStream<D>,
     (value, samples): (f64, Vec<usize>),
     channel: String,
     axis: &'static str,
@@ -303,7 +303,11 @@ enum Wrong {
 ///
 /// Without it, accelerations that a controller differenced raise the error on held-out torques from
 /// .7 to 30 %.
-fn wrong_derivative(reference: &Stream<1>, given: &Stream<1>, order: usize) -> Option<Wrong> {
+fn wrong_derivative(
+    reference: &SampleStream<1>,
+    given: &SampleStream<1>,
+    order: usize,
+) -> Option<Wrong> {
     const EDGE: f64 = 0.3;
     const MOST: usize = 2000;
     const NOTICEABLE: f64 = 0.1;
@@ -428,7 +432,7 @@ fn motion(recording: &Recording, found: &mut Vec<Finding>) {
     }
     // The gyroscope shows motion, the accelerometer that gravity turns from pose to pose.
     let imu = &recording.imu;
-    let changes = |stream: &Stream<3>, by: f64| {
+    let changes = |stream: &SampleStream<3>, by: f64| {
         (0..3).any(|axis| range(stream.value.iter().map(|value| value[axis])) > by)
     };
     let rotates = changes(&imu.angular_velocity, 0.1) || changes(&imu.proper_acceleration, 1.0);

@@ -1,6 +1,6 @@
 //! Observations: the values of all channels at one time, and annotations by fits.
 
-use crate::online::bank::hypothesis::{Motion, View};
+use crate::online::bank::hypothesis::{MotionReading, SeenMotion};
 use crate::robot::{Channel, ChannelRole};
 use proprio_dynamics::spatial::Wrench;
 use proprio_dynamics::{BitSet, ContactSet, FrameMotion};
@@ -73,8 +73,8 @@ impl Observation {
 
     /// As a hypothesis takes the readings of joints and base.
     #[must_use]
-    pub(crate) fn seen(self, view: View) -> Self {
-        let mut motion = Motion {
+    pub(crate) fn seen(self, view: MotionReading) -> Self {
+        let mut motion = SeenMotion {
             position: self.position,
             velocity: self.velocity,
             acceleration: self.acceleration,

@@ -1,7 +1,7 @@
 //! Samples of a log, channel by channel, as they were recorded.
 
-use crate::dataset::repeats::Repeats;
-use crate::dataset::stream::{ImuTrack, JointTrack, MOTION, Stream};
+use crate::dataset::repeats::RepeatedReadings;
+use crate::dataset::stream::{ImuTrack, JointTrack, MOTION, SampleStream};
 use crate::finding::Finding;
 use crate::robot::{Channel, ChannelRole, Robot};
 use proprio_topics::{Nanos, Quality, Reading, Reason};
@@ -17,7 +17,7 @@ pub struct Recording {
     pub(crate) channels: Vec<Channel>,
     /// By degree of freedom; empty for locked joints.
     pub(crate) joints: Vec<JointTrack>,
-    pub(crate) sensors: Vec<Stream<6>>,
+    pub(crate) sensors: Vec<SampleStream<6>>,
     /// Per F/T sensor the temperature of its board [degrees Celsius], in the order of arrival until
     /// sorted.
     pub(crate) temperatures: Vec<Vec<(Nanos, f64)>>,
@@ -30,7 +30,7 @@ pub struct Recording {
     pub(crate) last: Nanos,
     pub(crate) rows: u64,
     pub(crate) skipped: Option<SkippedRows>,
-    pub(crate) repeats: Repeats,
+    pub(crate) repeats: RepeatedReadings,
     /// Channels that do not change while the robot moves, from and to when.
     pub(crate) frozen: Vec<(String, Nanos, Nanos)>,
     /// The most samples of a channel whose stamps go backward, and when first.
@@ -56,7 +56,7 @@ impl Recording {
         let sensors = robot.structure.sensors().len();
         Self {
             joints: vec![JointTrack::default(); robot.model.dof_count()],
-            sensors: vec![Stream::default(); sensors],
+            sensors: vec![SampleStream::default(); sensors],
             temperatures: vec![Vec::new(); sensors],
             imu: ImuTrack::default(),
             declared: vec![Vec::new(); robot.contacts.len()],
@@ -66,7 +66,7 @@ impl Recording {
             last: Nanos::MIN,
             rows: 0,
             skipped: None,
-            repeats: Repeats::new(robot.channels.len()),
+            repeats: RepeatedReadings::new(robot.channels.len()),
             frozen: Vec::new(),
             backward: None,
             findings: Vec::new(),
@@ -237,7 +237,7 @@ impl Recording {
 impl Recording {
     /// The stamps of a channel's main stream.
     pub(crate) fn stamps(&self, role: ChannelRole) -> (&[Nanos], Nanos, Nanos) {
-        fn of<const D: usize>(s: &Stream<D>) -> (&[Nanos], Nanos, Nanos) {
+        fn of<const D: usize>(s: &SampleStream<D>) -> (&[Nanos], Nanos, Nanos) {
             (&s.t, s.max_gap, s.spacing)
         }
         match role {

@@ -5,14 +5,14 @@ use proprio_topics::{Nanos, Reading};
 
 /// Finds readings that repeat the previous one, as they are read.
 #[derive(Debug, Clone)]
-pub(crate) struct Repeats {
-    pub(crate) channels: Vec<Repeat>,
+pub(crate) struct RepeatedReadings {
+    pub(crate) channels: Vec<ChannelRepeats>,
 }
 
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Repeat {
-    first: Option<Snapshot>,
-    last: Option<Snapshot>,
+pub(crate) struct ChannelRepeats {
+    first: Option<ReadingBits>,
+    last: Option<ReadingBits>,
     pub(crate) readings: usize,
     /// Repeats with a later stamp, of channels whose noise makes a repeat impossible.
     pub(crate) later: Vec<Nanos>,
@@ -22,16 +22,16 @@ pub(crate) struct Repeat {
 
 /// A reading, for comparison.
 #[derive(Debug, Clone, Copy)]
-struct Snapshot {
+struct ReadingBits {
     t: Nanos,
     bits: [u64; 9],
     /// Whether the noise of the quantity makes a repeat impossible.
     is_noisy: bool,
 }
 
-impl Repeat {
+impl ChannelRepeats {
     /// Compares a reading with the last one.
-    fn compare(&mut self, snapshot: Snapshot) {
+    fn compare(&mut self, snapshot: ReadingBits) {
         if let Some(last) = self.last
             && last.bits == snapshot.bits
         {
@@ -44,10 +44,10 @@ impl Repeat {
     }
 }
 
-impl Repeats {
+impl RepeatedReadings {
     pub(crate) fn new(channels: usize) -> Self {
         Self {
-            channels: vec![Repeat::default(); channels],
+            channels: vec![ChannelRepeats::default(); channels],
         }
     }
 
@@ -75,7 +75,7 @@ impl Repeats {
             }
             _ => return,
         };
-        let snapshot = Snapshot {
+        let snapshot = ReadingBits {
             t,
             bits: numbers.map(f64::to_bits),
             is_noisy,

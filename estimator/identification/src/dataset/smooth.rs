@@ -70,7 +70,7 @@ pub struct Smoother {
     values: Vec<f64>,
     origin: Nanos,
     /// Stretches without a gap.
-    segments: Vec<Segment>,
+    segments: Vec<Stretch>,
     /// Half-widths of the windows to choose from \[s\], ascending.
     widths: Vec<f64>,
     /// Standard deviation of a (thinned) sample.
@@ -78,7 +78,7 @@ pub struct Smoother {
 }
 
 #[derive(Debug, Clone)]
-struct Segment {
+struct Stretch {
     first: usize,
     /// One past the last.
     end: usize,
@@ -90,7 +90,7 @@ struct Segment {
 /// The result of a fit: the estimates of the three derivatives by degrees 3, 5, 7; for degrees 3, 5
 /// their variances for sigma = 1, and those of the step to the next degree.
 #[derive(Debug, Clone, Copy, Default)]
-struct Fit {
+struct PolynomialFit {
     estimate: [[f64; 3]; 3],
     variance: [[f64; 3]; 2],
     step: [[f64; 3]; 2],
@@ -126,7 +126,7 @@ impl Smoother {
                 let at = values[block.start];
                 thinned.push(at + values[block].iter().map(|v| v - at).sum::<f64>() / count);
             }
-            segments.push(Segment {
+            segments.push(Stretch {
                 first: start,
                 end: times.len(),
                 knots: Vec::new(),
@@ -193,7 +193,7 @@ impl Smoother {
         let knot = (place / KNOT_SPACING).floor() as usize;
         let choice = |knot: usize| segment.knots.get(knot.min(segment.knots.len() - 1));
         // One fit gives all derivatives of its own and of lower degrees.
-        let mut fits: [Option<(usize, usize, Option<Fit>)>; 6] = [None; 6];
+        let mut fits: [Option<(usize, usize, Option<PolynomialFit>)>; 6] = [None; 6];
         let choices = derivatives
             .clone()
             .filter_map(|d| Some([choice(knot)?[d], choice(knot + 1)?[d]]));
@@ -235,12 +235,12 @@ impl Smoother {
     /// highest degree.
     fn fit(
         &self,
-        segment: &Segment,
+        segment: &Stretch,
         time: f64,
         width: f64,
         degree: usize,
         scratch: &mut Scratch,
-    ) -> Option<Fit> {
+    ) -> Option<PolynomialFit> {
         let times = &self.times[segment.first..segment.end];
         let begin = times.partition_point(|t| *t <= time - width);
         let end = times.partition_point(|t| *t < time + width);
@@ -307,11 +307,12 @@ impl Smoother {
                         let mut sums = vec![(0.0, 0.0); count + 1];
                         for knot in 0..count {
                             let (sum, there) = sums[knot];
-                            let left_out = fits[knot * windows + window].map(|fit: Fit| {
-                                let step = fit.estimate[degree + 1][derivative]
-                                    - fit.estimate[degree][derivative];
-                                step * step - variance * fit.step[degree][derivative]
-                            });
+                            let left_out =
+                                fits[knot * windows + window].map(|fit: PolynomialFit| {
+                                    let step = fit.estimate[degree + 1][derivative]
+                                        - fit.estimate[degree][derivative];
+                                    step * step - variance * fit.step[degree][derivative]
+                                });
                             sums[knot + 1] =
                                 left_out.map_or((sum, there), |b| (sum + b, there + 1.0));
                         }
@@ -450,7 +451,7 @@ impl Scratch {
         time: f64,
         width: f64,
         degree: usize,
-    ) -> Option<Fit> {
+    ) -> Option<PolynomialFit> {
         self.scaled.clear();
         self.scaled.extend(times.iter().map(|t| (t - time) / width));
         self.weights.clear();
@@ -461,7 +462,7 @@ impl Scratch {
         let middle = values[values.len() / 2];
         self.values.clear();
         self.values.extend(values.iter().map(|v| v - middle));
-        let mut fit = Fit::default();
+        let mut fit = PolynomialFit::default();
         // The weight of each polynomial's coefficient in each derivative.
         let mut gain = [[0.0; TERMS]; 3];
         let mut sum = [middle, 0.0, 0.0];

@@ -6,7 +6,7 @@ use proprio_topics::{Nanos, Reason};
 
 /// The samples of one channel, `D` numbers each, with strictly increasing stamps.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Stream<const D: usize> {
+pub(crate) struct SampleStream<const D: usize> {
     pub(crate) t: Vec<Nanos>,
     pub(crate) value: Vec<Values<D>>,
     /// Samples that their device or quality bits mark as faulty; excluded from the above.
@@ -21,17 +21,17 @@ pub(crate) type Values<const D: usize> = [f64; D];
 
 #[derive(Debug, Clone, Default)]
 pub(crate) struct JointTrack {
-    pub(crate) position: Stream<1>,
-    pub(crate) velocity: Stream<1>,
-    pub(crate) acceleration: Stream<1>,
-    pub(crate) torque: Stream<1>,
+    pub(crate) position: SampleStream<1>,
+    pub(crate) velocity: SampleStream<1>,
+    pub(crate) acceleration: SampleStream<1>,
+    pub(crate) torque: SampleStream<1>,
 }
 
 #[derive(Debug, Clone, Default)]
 pub(crate) struct ImuTrack {
-    pub(crate) proper_acceleration: Stream<3>,
-    pub(crate) angular_velocity: Stream<3>,
-    pub(crate) angular_acceleration: Stream<3>,
+    pub(crate) proper_acceleration: SampleStream<3>,
+    pub(crate) angular_velocity: SampleStream<3>,
+    pub(crate) angular_acceleration: SampleStream<3>,
 }
 
 /// The state of a joint at one time.
@@ -109,7 +109,7 @@ pub(crate) fn is_dense(spacing: Nanos, period: Nanos) -> bool {
     spacing > Nanos::ZERO && spacing.0 < period.0 / 4 * 3
 }
 
-impl<const D: usize> Stream<D> {
+impl<const D: usize> SampleStream<D> {
     pub(crate) fn push(&mut self, t: Nanos, value: Values<D>, fault: Reason) {
         if value.iter().any(|v| v.is_nan()) {
             return;
@@ -290,7 +290,7 @@ fn cubic(x: [f64; 4], t: f64) -> [f64; 4] {
     ]
 }
 
-impl<const D: usize> Stream<D> {
+impl<const D: usize> SampleStream<D> {
     /// Appends the samples that follow these.
     pub(crate) fn append(&mut self, mut next: Self) {
         self.t.append(&mut next.t);
@@ -310,7 +310,7 @@ pub(crate) fn range(values: impl Iterator<Item = f64>) -> f64 {
 }
 
 impl JointTrack {
-    pub(crate) fn each(&mut self, mut f: impl FnMut(&mut Stream<1>)) {
+    pub(crate) fn each(&mut self, mut f: impl FnMut(&mut SampleStream<1>)) {
         [
             &mut self.position,
             &mut self.velocity,

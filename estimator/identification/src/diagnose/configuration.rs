@@ -4,7 +4,7 @@
 //! Every alternative changes the readings linearly, or the proper acceleration of the base, in
 //! which the rows are linear as well. So one pass over a log serves all of them. It collects the
 //! squares and products of these columns, with CAD, and without what constant offsets, friction and
-//! rotors explain ([`Evidence`]):
+//! rotors explain ([`ConfigurationEvidence`]):
 //!
 //! ```text
 //! [ rows for 1 g along x, y, z | g_i y_j of each sensor | torque of the joint | r ]
@@ -35,9 +35,11 @@
 mod fault;
 mod mounting;
 
-use crate::dataset::Role;
+use crate::dataset::LogRole;
 use crate::dataset::observation::{Annotated, Observation};
-use crate::diagnose::configuration::fault::{Compared, Fault, torque_faults, wrench_fault};
+use crate::diagnose::configuration::fault::{
+    ReadingFault, TorqueComparison, torque_faults, wrench_fault,
+};
 use crate::diagnose::configuration::mounting::{Mounting, mountings};
 use crate::finding::{Finding, FindingCode};
 use crate::hypothesis::accepted;
@@ -45,8 +47,8 @@ use crate::linear::nuisance::NuisanceFilter;
 use crate::measurement::channels::{attribute_to, sensor_name};
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::nuisance_prior;
-use crate::measurement::rows::Rows;
-use crate::online::bank::hypothesis::{GRAVITY, View};
+use crate::measurement::rows::MeasurementRows;
+use crate::online::bank::hypothesis::{GRAVITY, MotionReading};
 use crate::parallel;
 use crate::robot::{BaseMotion, IdentificationInput, Robot};
 use crate::training::TrainingLog;
@@ -94,21 +96,21 @@ pub(crate) fn check(
     inputs: &[IdentificationInput],
     logs: &mut [TrainingLog],
 ) -> Result<ControlFlow<(String, Vec<Finding>)>, DynamicsError> {
-    let (mut all, mut trained) = (Evidence::new(robot), 0);
+    let (mut all, mut trained) = (ConfigurationEvidence::new(robot), 0);
     let mut alone = Vec::new();
     for log in &mut *logs {
-        let mut evidence = Evidence::new(robot);
+        let mut evidence = ConfigurationEvidence::new(robot);
         if !log.refused {
             evidence.add_log(robot, inputs, log)?;
             for (dof, fault) in evidence.faulty_torques(robot) {
                 let torque = evidence.joint(dof);
-                evidence.groups[torque] = Group::new(evidence.width());
+                evidence.groups[torque] = GramMatrix::new(evidence.width());
                 let (reason, finding) = fault.of_torque(robot, dof);
                 log.exclude_torque(dof, reason, finding);
             }
             log.add_findings(evidence.wrong_units(robot));
         }
-        if log.role == Role::Train && !log.refused {
+        if log.role == LogRole::Train && !log.refused {
             all.add(&evidence);
             trained += 1;
         }
@@ -129,7 +131,7 @@ pub(crate) fn check(
     }
     // A sensor that was mounted differently in a minority of the logs.
     for (log, (change, wrong)) in logs.iter_mut().zip(alone) {
-        let is_all = log.role == Role::Train && trained == 1;
+        let is_all = log.role == LogRole::Train && trained == 1;
         if !log.refused && !is_all && change >= ENOUGH_ALONE * all.change() {
             log.add_findings(wrong);
         }
@@ -139,12 +141,12 @@ pub(crate) fn check(
 
 /// Squares and products of the columns in the rows of one quantity.
 #[derive(Clone)]
-struct Group {
+struct GramMatrix {
     gram: DMatrix<f64>,
     rows: f64,
 }
 
-impl Group {
+impl GramMatrix {
     fn new(width: usize) -> Self {
         Self {
             gram: DMatrix::zeros(width, width),
@@ -172,18 +174,18 @@ impl Group {
 }
 
 /// See the [module](self).
-struct Evidence {
+struct ConfigurationEvidence {
     sensors: usize,
     /// The rows of F/T sensors, in which a force has the weight of its torque at a lever of
     /// [`Structure::LENGTH_SCALE`]; torques and forces of each sensor, to which the residual of its
     /// rows is attributed; the torque of each degree of freedom.
-    groups: Vec<Group>,
+    groups: Vec<GramMatrix>,
     /// The base and its proper acceleration, if it stands still.
     base: Option<(usize, Vec3)>,
     instants: usize,
 }
 
-impl Evidence {
+impl ConfigurationEvidence {
     fn new(robot: &Robot) -> Self {
         let sensors = robot.structure.sensors().len();
         let mut new = Self {
@@ -193,7 +195,7 @@ impl Evidence {
             instants: 0,
         };
         let count = new.joint(robot.model.dof_count());
-        new.groups = vec![Group::new(new.width()); count];
+        new.groups = vec![GramMatrix::new(new.width()); count];
         new
     }
 
@@ -267,7 +269,10 @@ impl Evidence {
         for torque in (0..unknowns.sensors.len()).flat_map(|place| 6 * place..6 * place + 3) {
             variances[torque] = Structure::LENGTH_SCALE.powi(2);
         }
-        let [mut rows, mut moved] = [Rows::new(&unknowns), Rows::new(&unknowns)];
+        let [mut rows, mut moved] = [
+            MeasurementRows::new(&unknowns),
+            MeasurementRows::new(&unknowns),
+        ];
         for instant in stretch {
             if measurement.make(instant, &mut rows).is_err() {
                 continue;
@@ -276,7 +281,9 @@ impl Evidence {
             let mut lines = DMatrix::zeros(rows.count, last + 1);
             if self.base.is_some() {
                 let mut right = |axis: Vec3| {
-                    let other = (*instant).clone().map(|own| own.seen(View::Upright(axis)));
+                    let other = (*instant)
+                        .clone()
+                        .map(|own| own.seen(MotionReading::Upright(axis)));
                     let is_made = measurement.make(&other, &mut moved).is_ok();
                     (is_made && moved.count == rows.count)
                         .then(|| DVector::from_column_slice(&moved.r))
@@ -302,7 +309,7 @@ impl Evidence {
                 }
                 lines[(row, last)] = rows.r(row);
             }
-            let g = |rows: &Rows| {
+            let g = |rows: &MeasurementRows| {
                 DMatrix::from_fn(rows.count, prior.len(), |row, column| {
                     match column.checked_sub(offsets) {
                         None => rows.g(row)[column],
@@ -356,12 +363,12 @@ impl Evidence {
     }
 
     /// Degrees of freedom whose torque has a wrong unit or sign.
-    fn faulty_torques(&self, robot: &Robot) -> Vec<(usize, Fault)> {
+    fn faulty_torques(&self, robot: &Robot) -> Vec<(usize, ReadingFault)> {
         let mut torque = DVector::zeros(self.width());
         torque[self.width() - 2] = 1.0;
         let compared: Vec<_> = self.groups[self.joint(0)..]
             .iter()
-            .map(|group| Compared::new(&group.gram, group.rows, &torque))
+            .map(|group| TorqueComparison::new(&group.gram, group.rows, &torque))
             .collect();
         let slides: Vec<bool> = (0..compared.len())
             .map(|dof| robot.model.is_prismatic(dof))
@@ -388,7 +395,7 @@ impl Evidence {
                         Matrix6::from_diagonal(&Vector6::from_fn(own))
                     });
                     let group = &self.groups[1 + 2 * sensor + kind];
-                    let compared = Compared::new(&group.gram, group.rows, &reading)?;
+                    let compared = TorqueComparison::new(&group.gram, group.rows, &reading)?;
                     (compared.predicted > ABOVE_NOISE * noise).then_some((compared, most))
                 });
             let fault = wrench_fault(&compared);
@@ -396,14 +403,15 @@ impl Evidence {
         }
         // The prediction of one sensor uses the other sensors of its sub-tree: one that is far too
         // large makes the others look too small.
-        let is_large = |fault: Fault| matches!(fault, Fault::Unit(ratio) if ratio > 1.0);
+        let is_large =
+            |fault: ReadingFault| matches!(fault, ReadingFault::Unit(ratio) if ratio > 1.0);
         if faults.iter().any(|(_, fault, _)| is_large(*fault)) {
-            faults.retain(|(_, fault, _)| *fault == Fault::Odd || is_large(*fault));
+            faults.retain(|(_, fault, _)| *fault == ReadingFault::Odd || is_large(*fault));
         }
         let findings = faults.into_iter();
         findings
             .map(|(sensor, fault, [torque, force])| {
-                let ratio = |of: Option<(Compared, f64)>| of.map(|(own, _)| own.ratio);
+                let ratio = |of: Option<(TorqueComparison, f64)>| of.map(|(own, _)| own.ratio);
                 fault.of_wrench(&sensor_name(robot, sensor), ratio(force), ratio(torque))
             })
             .collect()

@@ -16,11 +16,11 @@
 //! simulated.
 
 use crate::dataset::observation::{Observation, UnitSet};
-use crate::diagnose::load::Load;
+use crate::diagnose::load::LoadChange;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
-use crate::measurement::reduction::{Segment, blocks, residuals};
-use crate::measurement::rows::Rows;
+use crate::measurement::reduction::{LogSegment, blocks, residuals};
+use crate::measurement::rows::MeasurementRows;
 use crate::statistics::chi_square;
 use crate::statistics::quantile;
 use crate::training::{SEGMENT_INSTANTS, TrainingLog, map_segments};
@@ -64,7 +64,7 @@ const WINDOW: usize = 150;
 pub(crate) fn contacts(
     measurement: &MeasurementModel<'_>,
     all: &[&TrainingLog],
-    loads: &[Load],
+    loads: &[LoadChange],
     noise: &NoiseModel,
     d: &DVector<f64>,
 ) -> Vec<Vec<UnitSet>> {
@@ -81,7 +81,7 @@ pub(crate) fn contacts(
             .max(1);
         let at = |part: usize| log.instants.len() * part / count;
         for part in 0..count {
-            segments.push(Segment {
+            segments.push(LogSegment {
                 instants: &log.instants[at(part)..at(part + 1)],
                 log: None,
             });
@@ -89,7 +89,7 @@ pub(crate) fn contacts(
         }
     }
     let found = map_segments(measurement, &segments, |measurement, number, segment| {
-        let own: Vec<&Load> = loads
+        let own: Vec<&LoadChange> = loads
             .iter()
             .filter(|load| load.log == logs[number])
             .collect();
@@ -104,8 +104,8 @@ pub(crate) fn contacts(
 
 fn of_segment(
     measurement: &mut MeasurementModel<'_>,
-    segment: Segment<'_>,
-    loads: &[&Load],
+    segment: LogSegment<'_>,
+    loads: &[&LoadChange],
     noise: &NoiseModel,
     d: &DVector<f64>,
 ) -> Vec<UnitSet> {
@@ -126,7 +126,10 @@ fn of_segment(
         .collect();
     let mut series = vec![vec![vec![f64::NAN; ranges.len()]; channels]; units.len()];
     let mut motion = vec![0.0; ranges.len()];
-    let (mut rows, mut own) = (Rows::new(&unknowns), Rows::new(&unknowns));
+    let (mut rows, mut own) = (
+        MeasurementRows::new(&unknowns),
+        MeasurementRows::new(&unknowns),
+    );
     let (mut white, mut e) = (Vec::new(), vec![0.0; channels]);
     measurement.include_disturbed(true);
     for (block, range) in ranges.iter().enumerate() {
@@ -149,11 +152,9 @@ fn of_segment(
                     continue;
                 }
                 white.clear();
-                white.extend((0..own.count).map(|row| {
-                    own.r(row)
-                        - crate::arithmetic::dot(own.a(row), d.as_slice())
-                        - crate::arithmetic::dot(own.g(row), nuisance.as_slice())
-                }));
+                white.extend(
+                    (0..own.count).map(|row| own.residual(row, d.as_slice(), nuisance.as_slice())),
+                );
                 own.whiten_with(&variances, &mut white, 1);
                 own.channel_noise(&variances, &mut white, &mut e);
                 for channel in (0..channels).filter(|&channel| own.has(channel)) {

@@ -8,7 +8,7 @@ use crate::hypothesis::needed;
 use crate::linear::information::Information;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
-use crate::measurement::reduction::{Segment, reduce};
+use crate::measurement::reduction::{LogSegment, reduce};
 use crate::measurement::unknowns::Unknowns;
 use crate::parallel;
 use crate::prior::Prior;
@@ -35,7 +35,7 @@ pub(crate) const REACH: f64 = 1.0;
 
 /// A load that changes within a log.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Load {
+pub(crate) struct LoadChange {
     /// Number of the training log.
     pub log: usize,
     /// Place of its link in the layout.
@@ -52,7 +52,7 @@ pub(crate) struct Load {
     pub units: UnitSet,
 }
 
-impl Load {
+impl LoadChange {
     /// Whether an instant of that log is in the excluded part.
     pub(crate) fn has(&self, t: Nanos) -> bool {
         self.span.0 <= t && t <= self.span.1
@@ -180,7 +180,7 @@ pub(crate) fn find(
     training: &[&TrainingLog],
     noise: &NoiseModel,
     tau: f64,
-) -> Option<Load> {
+) -> Option<LoadChange> {
     let unknowns = measurement.unknowns();
     let mut segments = Vec::new();
     let mut of_log: Vec<Range<usize>> = Vec::new();
@@ -197,7 +197,7 @@ pub(crate) fn find(
                 .get(i)
                 .is_none_or(|instant| (instant.t - log.instants[start].t).seconds() >= seconds);
             if ends {
-                segments.push(Segment {
+                segments.push(LogSegment {
                     instants: &log.instants[start..i],
                     log: Some(number),
                 });
@@ -304,7 +304,7 @@ pub(crate) fn find(
         segments[from].instants.first()?.t,
         segments[to - 1].instants.last()?.t,
     );
-    Some(Load {
+    Some(LoadChange {
         log,
         place,
         span: (first, last),
@@ -322,7 +322,7 @@ pub(crate) fn added_body(
     measurement: &MeasurementModel<'_>,
     prior: &Prior,
     training: &[&TrainingLog],
-    load: &Load,
+    load: &LoadChange,
     noise: &NoiseModel,
     used: &Information,
     tau: f64,
@@ -333,7 +333,7 @@ pub(crate) fn added_body(
     let count = log.instants[first..].iter().take_while(is_clear).count();
     let mut measurement = measurement.clone();
     measurement.include_disturbed(true);
-    let segment = Segment {
+    let segment = LogSegment {
         instants: &log.instants[first..first + count],
         log: Some(load.log),
     };

@@ -1,7 +1,7 @@
 //! Implausible logs: wrong units, signs and frames of channels, channels that are dead or
 //! saturated. `proprio estimate` runs the tests that identification runs before any fit.
 
-use crate::dataset::{Dataset, Role};
+use crate::dataset::{Dataset, LogRole};
 use crate::diagnose::configuration;
 use crate::finding::{Finding, FindingCode};
 use crate::robot::{IdentificationInput, Robot};
@@ -48,7 +48,7 @@ pub fn implausible(robot: &Robot, dataset: Dataset) -> Vec<Finding> {
     // tested.
     log.refused = !has_motion || folds(log.instants.iter().map(|instant| instant.t)) < 1;
     // Alone: what contradicts the configuration is a finding of this log.
-    log.role = Role::Validate;
+    log.role = LogRole::Validate;
     let wrench = [IdentificationInput::Wrench];
     // No error is expected: the observations are of this robot.
     let _ = configuration::check(robot, &wrench, std::slice::from_mut(&mut log));

@@ -35,11 +35,11 @@ use crate::hypothesis::{accepted, deviations, needed};
 use crate::linear::information::Information;
 use crate::measurement::channels::sensor_name;
 use crate::measurement::model::MeasurementModel;
-use crate::measurement::reduction::{Segment, reduce, reduce_with, residuals};
-use crate::measurement::rows::Rows;
+use crate::measurement::reduction::{LogSegment, reduce, reduce_with, residuals};
+use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::Unknowns;
-use crate::online::bank::hypothesis::View;
-use crate::prior::{Fit, Posterior};
+use crate::online::bank::hypothesis::MotionReading;
+use crate::prior::{MapEstimate, Posterior};
 use crate::report::outcome::TimeOffset;
 use crate::robot::Robot;
 use crate::training::{TrainingLog, map_segments};
@@ -91,7 +91,7 @@ const SINGLE: f64 = 8.0;
 const REACH: f64 = 0.03;
 
 /// The squared residuals of a fit plus twice its prior cost.
-fn cost(unknowns: &Unknowns, fit: &Fit, precision: &[f64]) -> f64 {
+fn cost(unknowns: &Unknowns, fit: &MapEstimate, precision: &[f64]) -> f64 {
     let extra = fit.x.iter().skip(unknowns.inertial());
     let extra = extra.zip(precision).map(|(x, precision)| x * x * precision);
     fit.residual_square + fit.divergence / fit.tau.powi(2) + extra.sum::<f64>()
@@ -99,7 +99,7 @@ fn cost(unknowns: &Unknowns, fit: &Fit, precision: &[f64]) -> f64 {
 
 /// Instants of all logs, so many in all and of each log at least, in stretches from the first to
 /// the last.
-fn stretches<'a>(training: &[&'a TrainingLog], enough: [usize; 2]) -> Vec<Vec<Segment<'a>>> {
+fn stretches<'a>(training: &[&'a TrainingLog], enough: [usize; 2]) -> Vec<Vec<LogSegment<'a>>> {
     let share = (enough[0] / training.len().max(1)).max(enough[1]);
     let of_log = |log: &&'a TrainingLog| {
         let all = log.instants.as_slice();
@@ -107,7 +107,7 @@ fn stretches<'a>(training: &[&'a TrainingLog], enough: [usize; 2]) -> Vec<Vec<Se
         let count = all.len().min(share) / stretches;
         let segment = |stretch: usize| {
             let start = (all.len() - count) * stretch / (stretches - 1).max(1);
-            Segment {
+            LogSegment {
                 instants: &all[start..start + count],
                 log: None,
             }
@@ -152,14 +152,18 @@ pub(crate) fn wrong_signs(
     let segments = stretches(training, ENOUGH_FOR_SIGN).concat();
     let cost_with = |negated: &[usize]| {
         let (mut measurement, mut reduced) = (measurement.clone(), Vec::new());
-        for Segment { instants, log } in &segments {
+        for LogSegment { instants, log } in &segments {
             let other = |own: &Annotated| {
-                let views = negated.iter().map(|&dof| View::Reversed(dof));
+                let views = negated.iter().map(|&dof| MotionReading::Reversed(dof));
                 own.clone().map(|own| views.fold(own, Observation::seen))
             };
             let instants: Vec<Annotated> = instants.iter().map(other).collect();
             let (instants, log) = (&instants[..], *log);
-            reduced.push(reduce(&mut measurement, Segment { instants, log }, noise));
+            reduced.push(reduce(
+                &mut measurement,
+                LogSegment { instants, log },
+                noise,
+            ));
         }
         let all = added(&reduced, unknowns.parameters());
         let (r, z) = all.to_triangle();
@@ -194,14 +198,14 @@ pub(crate) fn wrong_signs(
 
 /// An error that is estimated.
 #[derive(Clone, Debug, PartialEq)]
-enum Error {
+enum SetupError {
     /// The zero of a joint's encoder (its place among the tested ones), in all logs or in one.
     Zero { joint: usize, log: Option<usize> },
     /// The common delay of these streams: F/T sensors, then joint torques.
     Delay(Range<usize>),
 }
 
-impl Error {
+impl SetupError {
     fn precision(&self) -> f64 {
         match self {
             Self::Zero { .. } => ZERO_STD.powi(-2),
@@ -224,7 +228,7 @@ pub(crate) struct Search<'a> {
     /// parameters; and its right side.
     r: DMatrix<f64>,
     z: DVector<f64>,
-    candidates: Vec<Error>,
+    candidates: Vec<SetupError>,
     /// Reduction of the cost that one error must reach.
     gain: f64,
 }
@@ -246,22 +250,22 @@ impl<'a> Search<'a> {
             let reduced = map_segments(measurement, segments, |measurement, _, segment| {
                 let rates = rates(measurement, segment, identified);
                 let d = identified.fit.x.as_slice();
-                let mut other = Rows::new(unknowns);
+                let mut other = MeasurementRows::new(unknowns);
                 let mut columns = |measurement: &mut MeasurementModel<'_>,
                                    number: usize,
-                                   rows: &Rows,
+                                   rows: &MeasurementRows,
                                    columns: &mut [f64]| {
                     let instant = &segment.instants[number];
                     for (joint, &dof) in dofs.iter().enumerate() {
                         // The row holds at the true position: the measured one minus the error.
                         // The small change of the offset terms is ignored.
-                        let moved = View::Encoder(dof, [STEP, 0.0]);
+                        let moved = MotionReading::Encoder(dof, [STEP, 0.0]);
                         let moved = instant.clone().map(|own| own.seen(moved));
                         let is_made = measurement.make(&moved, &mut other).is_ok();
                         for row in (0..rows.count).filter(|_| is_made && other.count == rows.count)
                         {
-                            let right = |rows: &Rows| rows.r(row) - dot(rows.a(row), d);
-                            columns[row * width + joint] = (right(&other) - right(rows)) / STEP;
+                            let change = other.without_bodies(row, d) - rows.without_bodies(row, d);
+                            columns[row * width + joint] = change / STEP;
                         }
                     }
                     // A reading enters a row as its offset does.
@@ -301,7 +305,7 @@ impl<'a> Search<'a> {
         let (r, z) = sum.to_triangle();
         let each = (0..logs).filter(|_| logs > 1).map(Some);
         let zeros = [None].into_iter().chain(each).flat_map(|log| {
-            let of = move |joint| Error::Zero { joint, log };
+            let of = move |joint| SetupError::Zero { joint, log };
             (0..joints).map(of)
         });
         let mut search = Self {
@@ -320,34 +324,36 @@ impl<'a> Search<'a> {
     }
 
     /// The delay of each F/T sensor, and that of all joint torques.
-    fn streams(&self) -> Vec<Error> {
+    fn streams(&self) -> Vec<SetupError> {
         let Unknowns {
             sensors, joints, ..
         } = &self.identified.unknowns;
-        let mut all: Vec<Error> = (0..sensors.len())
-            .map(|own| Error::Delay(own..own + 1))
+        let mut all: Vec<SetupError> = (0..sensors.len())
+            .map(|own| SetupError::Delay(own..own + 1))
             .collect();
         if !joints.is_empty() {
-            all.push(Error::Delay(sensors.len()..sensors.len() + joints.len()));
+            all.push(SetupError::Delay(
+                sensors.len()..sensors.len() + joints.len(),
+            ));
         }
         all
     }
 
-    fn column(&self, error: &Error) -> DVector<f64> {
+    fn column(&self, error: &SetupError) -> DVector<f64> {
         let (joints, logs) = (self.dofs.len(), self.training.len());
         let own: Vec<usize> = match error {
-            Error::Zero { joint, log } => {
+            SetupError::Zero { joint, log } => {
                 let logs = log.map_or(0..logs, |log| log..log + 1);
                 logs.map(|log| joints * log + joint).collect()
             }
-            Error::Delay(streams) => streams.clone().map(|own| joints * logs + own).collect(),
+            SetupError::Delay(streams) => streams.clone().map(|own| joints * logs + own).collect(),
         };
         self.r.select_columns(&own).column_sum()
     }
 
     /// The parameters' columns, then those of these errors. (Other errors are zero: their columns
     /// are omitted.)
-    fn columns(&self, errors: &[Error]) -> DMatrix<f64> {
+    fn columns(&self, errors: &[SetupError]) -> DMatrix<f64> {
         let parameters = self.identified.unknowns.parameters();
         let own = self
             .r
@@ -361,7 +367,7 @@ impl<'a> Search<'a> {
     }
 
     /// The MAP parameters and these errors, and their cost.
-    fn fit(&self, errors: &[Error]) -> Option<(f64, Fit)> {
+    fn fit(&self, errors: &[SetupError]) -> Option<(f64, MapEstimate)> {
         let Identified {
             unknowns,
             prior,
@@ -369,7 +375,7 @@ impl<'a> Search<'a> {
             ..
         } = self.identified;
         let mut precision = unknowns.precision.clone();
-        precision.extend(errors.iter().map(Error::precision));
+        precision.extend(errors.iter().map(SetupError::precision));
         let columns = self.columns(errors);
         let posterior = Posterior::new(prior, &unknowns.links, &columns, &self.z, &precision);
         let fit = posterior.ok()?.fit(fit.tau).ok()?;
@@ -377,7 +383,7 @@ impl<'a> Search<'a> {
     }
 
     /// These errors, all of them estimated together, with their deviations.
-    fn estimates(&self, errors: &[Error]) -> Option<Vec<Estimate>> {
+    fn estimates(&self, errors: &[SetupError]) -> Option<Vec<Estimate>> {
         let (_, fit) = self.fit(errors)?;
         let (root, first) = (fit.covariance_root(), self.identified.unknowns.parameters());
         let own = (first..first + errors.len()).map(|k| (fit.x[k], root.row(k).norm()));
@@ -386,13 +392,13 @@ impl<'a> Search<'a> {
 
     /// The most likely candidates beside these errors: those with the largest gain if the prior
     /// were quadratic, and the same joints in all logs.
-    fn likely(&self, errors: &[Error]) -> Vec<Error> {
+    fn likely(&self, errors: &[SetupError]) -> Vec<SetupError> {
         let Some((_, fit)) = self.fit(errors) else {
             return Vec::new();
         };
         let own = self.columns(errors);
         let (residuals, root) = (&self.z - &own * &fit.x, fit.covariance_root());
-        let gain = |error: &Error| {
+        let gain = |error: &SetupError| {
             let column = self.column(error);
             let known = root.tr_mul(&own.tr_mul(&column)).norm_squared();
             let precision = error.precision();
@@ -403,16 +409,16 @@ impl<'a> Search<'a> {
             .candidates
             .iter()
             .filter(|error| !errors.contains(error));
-        let mut ranked: Vec<(f64, &Error)> = rest.map(|error| (gain(error), error)).collect();
+        let mut ranked: Vec<(f64, &SetupError)> = rest.map(|error| (gain(error), error)).collect();
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
-        let mut likely: Vec<Error> = ranked
+        let mut likely: Vec<SetupError> = ranked
             .into_iter()
             .take(TRIED)
             .map(|(_, own)| own.clone())
             .collect();
         for place in 0..likely.len() {
-            if let Error::Zero { joint, .. } = likely[place] {
-                let in_all = Error::Zero { joint, log: None };
+            if let SetupError::Zero { joint, .. } = likely[place] {
+                let in_all = SetupError::Zero { joint, log: None };
                 if !likely.contains(&in_all) && !errors.contains(&in_all) {
                     likely.push(in_all);
                 }
@@ -423,9 +429,10 @@ impl<'a> Search<'a> {
 
     /// All errors that are accepted. A zero that is wrong in one log only costs as much as one
     /// error more: it must be clearly better than the same in all logs.
-    fn run(&self) -> Vec<Error> {
-        let cost = |errors: &[Error]| {
-            let alone = |error: &&Error| matches!(error, Error::Zero { log: Some(_), .. });
+    fn run(&self) -> Vec<SetupError> {
+        let cost = |errors: &[SetupError]| {
+            let alone =
+                |error: &&SetupError| matches!(error, SetupError::Zero { log: Some(_), .. });
             let more = errors.iter().filter(alone).count() as f64 * self.gain;
             Some(self.fit(errors)?.0 + more)
         };
@@ -433,15 +440,15 @@ impl<'a> Search<'a> {
     }
 
     /// Whether the zero at `place` may as well be in another log, with the opposite sign.
-    fn is_exchangeable(&self, errors: &[Error], place: usize) -> bool {
+    fn is_exchangeable(&self, errors: &[SetupError], place: usize) -> bool {
         let cost_in = |log: Option<usize>| {
             let mut errors = errors.to_vec();
-            if let Error::Zero { log: own, .. } = &mut errors[place] {
+            if let SetupError::Zero { log: own, .. } = &mut errors[place] {
                 *own = log.or(*own);
             }
             self.fit(&errors).map_or(f64::INFINITY, |(cost, _)| cost)
         };
-        let Error::Zero { log, .. } = &errors[place] else {
+        let SetupError::Zero { log, .. } = &errors[place] else {
             return false;
         };
         let own = cost_in(None);
@@ -451,11 +458,11 @@ impl<'a> Search<'a> {
 
     /// Findings about zeros and delays, and the delays of all streams.
     pub(crate) fn findings(&self) -> (Vec<Finding>, Vec<TimeOffset>) {
-        let is_zero = |error: &Error| matches!(error, Error::Zero { .. });
+        let is_zero = |error: &SetupError| matches!(error, SetupError::Zero { .. });
         let errors = self.run();
-        let zeros: Vec<Error> = errors.into_iter().filter(is_zero).collect();
+        let zeros: Vec<SetupError> = errors.into_iter().filter(is_zero).collect();
         let count = zeros.len();
-        let with = |delays: &[Error]| self.estimates(&[&zeros[..], delays].concat());
+        let with = |delays: &[SetupError]| self.estimates(&[&zeros[..], delays].concat());
         let together = with(&self.streams()).unwrap_or_else(|| vec![(0.0, f64::INFINITY); count]);
         let (of_zeros, of_streams) = together.split_at(count);
         let mut findings = self.about_zeros(&zeros, of_zeros);
@@ -486,8 +493,8 @@ impl<'a> Search<'a> {
             findings.push(late(channel, &seem, (offset.seconds, offset.deviation)));
         }
         if torques > 2 {
-            let each: Vec<Error> = (0..sensors + torques)
-                .map(|own| Error::Delay(own..own + 1))
+            let each: Vec<SetupError> = (0..sensors + torques)
+                .map(|own| SetupError::Delay(own..own + 1))
                 .collect();
             let each = with(&each).unwrap_or_default();
             let own = each
@@ -506,14 +513,16 @@ impl<'a> Search<'a> {
         (findings, offsets)
     }
 
-    fn about_zeros(&self, zeros: &[Error], estimates: &[Estimate]) -> Vec<Finding> {
+    fn about_zeros(&self, zeros: &[SetupError], estimates: &[Estimate]) -> Vec<Finding> {
         let (robot, unknowns) = (self.measurement.robot(), &self.identified.unknowns);
         let file = |log: usize| self.training[log].file.as_str();
         let mut findings = Vec::new();
         for (number, &dof) in self.dofs.iter().enumerate() {
             let own: Vec<(usize, Option<usize>, f64)> = (zeros.iter().zip(estimates).enumerate())
                 .filter_map(|(place, (error, (angle, _)))| match error {
-                    Error::Zero { joint, log } if *joint == number => Some((place, *log, *angle)),
+                    SetupError::Zero { joint, log } if *joint == number => {
+                        Some((place, *log, *angle))
+                    }
                     _ => None,
                 })
                 .collect();
@@ -576,7 +585,7 @@ fn is_known((_, deviation): &Estimate) -> bool {
 /// Per instant, the rate of change of each channel without noise; 0 where it is not known.
 fn rates(
     measurement: &MeasurementModel<'_>,
-    segment: Segment<'_>,
+    segment: LogSegment<'_>,
     identified: &Identified,
 ) -> Vec<Vec<f64>> {
     let (unknowns, instants) = (&identified.unknowns, segment.instants);

@@ -2,9 +2,9 @@
 //! ([`crate::diagnose::disturbance`] and [`crate::diagnose::load`] find them), marked in the logs
 //! so that the next fit excludes them, and reported at the end.
 
-use crate::dataset::Role;
+use crate::dataset::LogRole;
 use crate::dataset::observation::UnitSet;
-use crate::diagnose::load::Load;
+use crate::diagnose::load::LoadChange;
 use crate::diagnose::{disturbance, load};
 use crate::finding::{Finding, FindingCode};
 use crate::fit::{Identified, NoiseAndMap};
@@ -29,7 +29,7 @@ const ROUNDS: usize = 4;
 
 /// Undeclared disturbances of some logs.
 pub(crate) struct Undeclared {
-    pub loads: Vec<Load>,
+    pub loads: Vec<LoadChange>,
     /// Per log and instant.
     contacts: Vec<Vec<UnitSet>>,
 }
@@ -46,15 +46,15 @@ impl Undeclared {
 
     /// Adds a load. One that differs from another only by a slightly different time of change is
     /// merged with it: that time is known only to a segment of the log.
-    pub(crate) fn add_load(&mut self, load: Load) {
-        let edge = |load: &Load| {
+    pub(crate) fn add_load(&mut self, load: LoadChange) {
+        let edge = |load: &LoadChange| {
             if load.is_after {
                 load.span.0
             } else {
                 load.span.1
             }
         };
-        let is_same = |other: &&mut Load| {
+        let is_same = |other: &&mut LoadChange| {
             let apart = (edge(other) - edge(&load)).seconds().abs();
             (other.log, other.place, other.is_after) == (load.log, load.place, load.is_after)
                 && apart <= LONGEST_HANDOVER.max(1.5 * load.within)
@@ -95,7 +95,7 @@ impl Undeclared {
     pub(crate) fn mark<'a>(&self, logs: impl Iterator<Item = &'a mut TrainingLog>) {
         for (number, (log, contacts)) in logs.zip(&self.contacts).enumerate() {
             for (instant, contact) in log.instants.iter_mut().zip(contacts) {
-                let carries = |load: &&Load| load.log == number && load.has(instant.t);
+                let carries = |load: &&LoadChange| load.log == number && load.has(instant.t);
                 let loads = self.loads.iter().filter(carries);
                 instant.disturbed = loads.fold(*contact, |set, load| set.union(&load.units));
             }
@@ -112,7 +112,7 @@ impl Undeclared {
         let (loads, contacts) = (&self.loads, &self.contacts);
         let robot = measurement.robot();
         let training = training_logs(logs);
-        let body = |load: &Load| {
+        let body = |load: &LoadChange| {
             let NoiseAndMap {
                 prior,
                 noise,
@@ -133,12 +133,12 @@ impl Undeclared {
         let bodies: Vec<Option<(usize, load::AddedBody)>> = loads.iter().map(body).collect();
         let training = training_logs_mut(logs);
         for (number, (log, contacts)) in training.zip(contacts).enumerate() {
-            let own: Vec<(&Load, &Option<(usize, load::AddedBody)>)> = loads
+            let own: Vec<(&LoadChange, &Option<(usize, load::AddedBody)>)> = loads
                 .iter()
                 .zip(&bodies)
                 .filter(|(load, _)| load.log == number)
                 .collect();
-            let loads: Vec<&Load> = own.iter().map(|(load, _)| *load).collect();
+            let loads: Vec<&LoadChange> = own.iter().map(|(load, _)| *load).collect();
             let apparent = apparent_contacts(log, contacts, &loads);
             for (part, excluded, when) in suspected(robot, log, &apparent) {
                 log.excluded.push(excluded);
@@ -163,7 +163,7 @@ impl Undeclared {
 fn report_load<'a>(
     measurement: &MeasurementModel<'_>,
     log: &mut TrainingLog,
-    load: &Load,
+    load: &LoadChange,
     body: Option<&(usize, load::AddedBody)>,
     handovers: impl Iterator<Item = &'a ApparentContact>,
 ) {
@@ -269,7 +269,7 @@ fn units(contacts: &[UnitSet]) -> UnitSet {
 fn apparent_contacts(
     log: &TrainingLog,
     contacts: &[UnitSet],
-    loads: &[&Load],
+    loads: &[&LoadChange],
 ) -> Vec<ApparentContact> {
     let mut apparent_contacts = Vec::new();
     for unit in units(contacts).iter() {
@@ -285,8 +285,9 @@ fn apparent_contacts(
             let is_near = |(from, to): (Nanos, Nanos), seconds: f64| {
                 (from - last).seconds() <= seconds && (first - to).seconds() <= seconds
             };
-            let is_handed =
-                |load: &&Load| load.units.contains(unit) && is_near(load.span, NEAR_LOAD_CHANGE);
+            let is_handed = |load: &&LoadChange| {
+                load.units.contains(unit) && is_near(load.span, NEAR_LOAD_CHANGE)
+            };
             let load = loads.iter().position(is_handed);
             let load = load.filter(|&load| lasts <= LONGEST_HANDOVER.max(loads[load].within));
             apparent_contacts.push(ApparentContact {
@@ -344,7 +345,7 @@ pub(crate) fn report_validation(
     logs: &mut [TrainingLog],
     identified: &Identified,
 ) {
-    let is_checked = |log: &&mut TrainingLog| log.role == Role::Validate && !log.refused;
+    let is_checked = |log: &&mut TrainingLog| log.role == LogRole::Validate && !log.refused;
     let robot = measurement.robot();
     let mut undeclared = Undeclared::none(logs.iter_mut().filter(is_checked));
     let converges = (0..ROUNDS).any(|_| {
@@ -384,9 +385,9 @@ mod tests {
     use super::*;
 
     /// A load that comes at `from` \[s\], known to `within`, of a log of 100 s.
-    fn load(log: usize, place: usize, from: i64, within: f64) -> Load {
+    fn load(log: usize, place: usize, from: i64, within: f64) -> LoadChange {
         let at = |seconds: i64| Nanos::from_millis(1000 * seconds);
-        Load {
+        LoadChange {
             log,
             place,
             span: (at(from), at(100)),
@@ -399,7 +400,7 @@ mod tests {
 
     #[test]
     fn two_findings_of_one_load_change_are_merged() {
-        let of = |loads: &[Load]| {
+        let of = |loads: &[LoadChange]| {
             let mut undeclared = Undeclared::none(std::iter::empty());
             loads
                 .iter()

@@ -76,13 +76,13 @@ impl LocalLevel {
 }
 
 /// A segment of a series in blocks of equal length: the mean of each, NaN where it has no sample.
-pub(crate) type Blocks = Vec<f64>;
+pub(crate) type BlockMeans = Vec<f64>;
 
 /// Random walk and white noise in a series of block means: the most likely variance of a step and
 /// of the noise (exact likelihood of the local level model, diffuse start). The step variance is
 /// zero unless it is significant. `bound`: the greatest step variance, relative to the noise
 /// variance.
-pub(crate) fn random_walk(segments: &[Blocks], bound: f64) -> (f64, f64) {
+pub(crate) fn random_walk(segments: &[BlockMeans], bound: f64) -> (f64, f64) {
     let evaluate = |ratio: f64| -> (f64, f64) {
         let (mut logs, mut squares, mut count) = (0.0, 0.0, 0.0);
         for segment in segments {

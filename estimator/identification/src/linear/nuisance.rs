@@ -147,7 +147,7 @@ impl NuisanceFilter {
 
 /// The state of the filter at the end of a block of observations.
 #[derive(Clone, Debug)]
-pub(crate) struct Block {
+pub(crate) struct NuisanceEstimate {
     /// Estimates and covariance with the block's rows.
     pub x: DMatrix<f64>,
     pub p: DMatrix<f64>,
@@ -156,7 +156,7 @@ pub(crate) struct Block {
 }
 
 /// Smooths the estimates of all blocks in place (Rauch, Tung, Striebel).
-pub(crate) fn smooth(blocks: &mut [Block]) {
+pub(crate) fn smooth(blocks: &mut [NuisanceEstimate]) {
     for k in (1..blocks.len()).rev() {
         let (before, after) = blocks.split_at_mut(k);
         let (old, new) = (&mut before[k - 1], &after[0]);
@@ -259,7 +259,7 @@ mod tests {
 
         // With d known, all offsets.
         let mut nuisance = NuisanceFilter::new(&prior, 1);
-        let mut blocks: Vec<Block> = Vec::new();
+        let mut blocks: Vec<NuisanceEstimate> = Vec::new();
         for block in 0..count {
             if block > 0 {
                 nuisance.drift(&steps);
@@ -268,7 +268,7 @@ mod tests {
                 let mut line = [y - DVector::from_column_slice(a).dot(&d)];
                 nuisance.update(g, &mut line);
             }
-            blocks.push(Block {
+            blocks.push(NuisanceEstimate {
                 x: nuisance.estimates(),
                 p: nuisance.covariance(),
                 drift: steps.to_vec(),

@@ -1,6 +1,6 @@
 //! Names and places of the measured channels, and the attribution of residuals to channels.
 
-use crate::measurement::rows::Rows;
+use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::Unknowns;
 use crate::robot::{AXES, Robot};
 use nalgebra::DMatrix;
@@ -42,7 +42,7 @@ pub(crate) fn channel_name(
 /// them, with all other channels taken as exact: `V N^T (N V N^T)^-1`. None if no row has any of
 /// these channels.
 pub(crate) fn attribute_to(
-    rows: &Rows,
+    rows: &MeasurementRows,
     variances: &[f64],
     channels: std::ops::Range<usize>,
 ) -> Option<DMatrix<f64>> {

@@ -29,9 +29,9 @@
 
 use crate::arithmetic::dot;
 use crate::dataset::observation::{Annotated, Observation, UnitSet};
-use crate::measurement::rows::Rows;
+use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::{ExtraParameter, FRICTION, Unknowns, friction_row};
-use crate::robot::{IdentificationInput, Robot, TorqueSide};
+use crate::robot::{IdentificationInput, Robot, TorqueSide, dofs_between};
 use nalgebra::{DVector, Matrix6, Vector6};
 use proprio_dynamics::calibration::{Kind, Unknown};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
@@ -138,7 +138,7 @@ impl<'a> MeasurementModel<'a> {
             links + measurement.unknowns.extra.len(),
         );
         let mut parent: Vec<usize> = (0..nodes + channels).collect();
-        let mut rows = Rows::new(&measurement.unknowns);
+        let mut rows = MeasurementRows::new(&measurement.unknowns);
         let (mut seen, mut appears) = (vec![false; nodes], vec![false; channels]);
         for observation in observations {
             measurement.make(observation, &mut rows)?;
@@ -331,7 +331,7 @@ impl<'a> MeasurementModel<'a> {
         observation: &Annotated,
         d: &[f64],
     ) -> Result<Vec<f64>, DynamicsError> {
-        let mut rows = Rows::new(&self.unknowns);
+        let mut rows = MeasurementRows::new(&self.unknowns);
         self.make(observation, &mut rows)?;
         self.tree.update(&self.robot.model, &self.kinematics)?;
         let blocked = self.blocked(observation);
@@ -362,7 +362,7 @@ impl<'a> MeasurementModel<'a> {
     pub(crate) fn make(
         &mut self,
         observation: &Annotated,
-        rows: &mut Rows,
+        rows: &mut MeasurementRows,
     ) -> Result<(), DynamicsError> {
         rows.clear();
         self.kinematics
@@ -386,7 +386,7 @@ impl<'a> MeasurementModel<'a> {
     /// Joints whose torque can be computed from either side: both have F/T sensors and no contacts.
     /// Returns the degree of freedom and the combination of the last rows (not whitened) that gives
     /// the difference of the two torques.
-    pub(crate) fn two_routes(&self, rows: &Rows) -> Vec<(usize, DVector<f64>)> {
+    pub(crate) fn two_routes(&self, rows: &MeasurementRows) -> Vec<(usize, DVector<f64>)> {
         let robot = self.robot;
         let mut routes = Vec::new();
         for (number, subtree) in self.stacked.subtrees().iter().enumerate() {
@@ -445,7 +445,7 @@ impl<'a> MeasurementModel<'a> {
     fn wrench_rows(
         &mut self,
         observation: &Annotated,
-        rows: &mut Rows,
+        rows: &mut MeasurementRows,
     ) -> Result<(), DynamicsError> {
         for (reading, given) in self.readings.iter_mut().zip(&observation.readings) {
             *reading = if given.is_finite() {
@@ -497,7 +497,7 @@ impl<'a> MeasurementModel<'a> {
     fn torque_rows(
         &mut self,
         observation: &Annotated,
-        rows: &mut Rows,
+        rows: &mut MeasurementRows,
     ) -> Result<(), DynamicsError> {
         if !self.includes_disturbed && observation.disturbed.contains(Observation::TORQUES) {
             return Ok(());
@@ -536,17 +536,6 @@ impl<'a> MeasurementModel<'a> {
     /// the joint is on the path from the contact's link to the base. A disturbed sub-tree counts
     /// with all its links, since the link of the contact is unknown.
     fn blocked(&self, observation: &Annotated) -> Vec<bool> {
-        let model = &self.robot.model;
-        let mut blocked = vec![false; model.dof_count()];
-        let to_root = |mut link: usize| {
-            let mut joints = Vec::new();
-            while link > 0 {
-                joints.push(link - 1);
-                link = model.joints()[link - 1].parent;
-            }
-            joints
-        };
-        let base = to_root(self.kinematics.base());
         let structure = &self.robot.structure;
         let declared = observation
             .active
@@ -560,15 +549,10 @@ impl<'a> MeasurementModel<'a> {
                 .filter(|unit| *unit < structure.subtrees().len());
             touched.extend(subtrees.flat_map(|unit| structure.links_of(unit)));
         }
-        for link in touched {
-            let own = to_root(link);
-            let apart = own
-                .iter()
-                .filter(|j| !base.contains(j))
-                .chain(base.iter().filter(|j| !own.contains(j)));
-            for dof in apart.filter_map(|&joint| model.joints()[joint].dof) {
-                blocked[dof] = true;
-            }
+        let model = &self.robot.model;
+        let mut blocked = vec![false; model.dof_count()];
+        for dof in dofs_between(model, self.kinematics.base(), &touched) {
+            blocked[dof] = true;
         }
         blocked
     }

@@ -53,7 +53,7 @@ pub(crate) fn estimate_noise(
         let mut per_block = 1.0;
         if is_wrench {
             // The sum of offset and noise: a random walk, and the noise beside it.
-            let mut means: Vec<noise::Blocks> = Vec::new();
+            let mut means: Vec<noise::BlockMeans> = Vec::new();
             let (mut used, mut filled) = (0usize, 0usize);
             for (segment, left) in segments.iter().zip(&mut left) {
                 for (range, offset) in segment
@@ -80,7 +80,7 @@ pub(crate) fn estimate_noise(
             let totals = left.clone();
             let mut merged = 1;
             for _ in 0..2 {
-                let longer: Vec<noise::Blocks> =
+                let longer: Vec<noise::BlockMeans> =
                     means.iter().map(|means| merge(means, merged)).collect();
                 let count = merged as f64;
                 let fastest = drift_limits.rates[channel] * BLOCK * count;

@@ -4,10 +4,10 @@
 use crate::arithmetic::dot;
 use crate::dataset::observation::Annotated;
 use crate::linear::information::{Information, Panel};
-use crate::linear::nuisance::{Block, NuisanceFilter, smooth};
+use crate::linear::nuisance::{NuisanceEstimate, NuisanceFilter, smooth};
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
-use crate::measurement::rows::Rows;
+use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::Unknowns;
 use crate::parallel;
 use nalgebra::{DMatrix, DVector};
@@ -33,7 +33,7 @@ const AT_ONCE: usize = 32;
 
 /// Consecutive observations of one log, with their own offsets and friction.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Segment<'a> {
+pub(crate) struct LogSegment<'a> {
     pub instants: &'a [Annotated],
     /// The number of the training log; none if its seconds are not weighted.
     pub log: Option<usize>,
@@ -71,7 +71,7 @@ pub(crate) struct ReducedLog {
 /// Reduces a segment to its information about the parameters.
 pub(crate) fn reduce(
     measurement: &mut MeasurementModel<'_>,
-    segment: Segment<'_>,
+    segment: LogSegment<'_>,
     noise: &NoiseModel,
 ) -> ReducedLog {
     reduce_with(measurement, segment, noise, &[], 0, &mut |_, _, _, _| ())
@@ -79,24 +79,25 @@ pub(crate) fn reduce(
 
 /// Writes extra columns of an observation's rows, row by row, given its number in the segment and
 /// its rows.
-type Columns<'a> = dyn FnMut(&mut MeasurementModel<'_>, usize, &Rows, &mut [f64]) + 'a;
+type ExtraColumns<'a> =
+    dyn FnMut(&mut MeasurementModel<'_>, usize, &MeasurementRows, &mut [f64]) + 'a;
 
 /// As [`reduce`], without the observations flagged in `excluded` (all are used if it is empty), and
 /// with `width` extra columns after those of `d`.
 pub(crate) fn reduce_with(
     measurement: &mut MeasurementModel<'_>,
-    segment: Segment<'_>,
+    segment: LogSegment<'_>,
     noise: &NoiseModel,
     excluded: &[bool],
     width: usize,
-    columns: &mut Columns<'_>,
+    columns: &mut ExtraColumns<'_>,
 ) -> ReducedLog {
     let unknowns = measurement.unknowns().clone();
     let links = unknowns.parameters();
     let p = links + width;
     let variances = noise.inflated();
     let mut nuisance = NuisanceFilter::new(&nuisance_prior(&unknowns), p + 1);
-    let mut rows = Rows::new(&unknowns);
+    let mut rows = MeasurementRows::new(&unknowns);
     let mut information = Information::new(p);
     let mut panel = Panel::new(p, PANEL);
     let mut line = vec![0.0; p + 1];
@@ -155,8 +156,8 @@ pub(crate) struct Residuals {
     /// Blocks of observations.
     pub ranges: Vec<Range<usize>>,
     /// Per block, the smoothed nuisance parameters, a column per set.
-    pub nuisance: Vec<Block>,
-    /// How noise is shared among channels ([`Rows::add_shares`]): the mean over observations, a row
+    pub nuisance: Vec<NuisanceEstimate>,
+    /// How noise is shared among channels ([`MeasurementRows::add_shares`]): the mean over observations, a row
     /// per channel.
     pub shares: DMatrix<f64>,
     /// Per channel, the number of observations in which any row has it.
@@ -194,15 +195,15 @@ impl Residuals {
 /// filtered (not smoothed) estimates at the end of each block, a column per set.
 pub(crate) fn filter_nuisance(
     measurement: &MeasurementModel<'_>,
-    segment: Segment<'_>,
+    segment: LogSegment<'_>,
     noise: &NoiseModel,
     sets: &[DVector<f64>],
-) -> (Vec<Range<usize>>, Vec<Block>) {
+) -> (Vec<Range<usize>>, Vec<NuisanceEstimate>) {
     let unknowns = measurement.unknowns().clone();
     let k = sets.len();
     let variances = noise.offset_tracking_variances();
     let mut nuisance = NuisanceFilter::new(&nuisance_prior(&unknowns), k);
-    let make = || (measurement.clone(), Rows::new(&unknowns));
+    let make = || (measurement.clone(), MeasurementRows::new(&unknowns));
     let (mut states, mut last) = (Vec::new(), None);
     let blocks = blocks(segment.instants);
     for some in blocks.chunks(AT_ONCE * BLOCKS_PER_TASK) {
@@ -228,10 +229,8 @@ pub(crate) fn filter_nuisance(
                         );
                         rows.whiten(&own);
                         for row in 0..rows.count {
-                            lines.extend(
-                                sets.iter()
-                                    .map(|set| rows.r(row) - dot(rows.a(row), set.as_slice())),
-                            );
+                            let sets = sets.iter().map(DVector::as_slice);
+                            lines.extend(sets.map(|set| rows.without_bodies(row, set)));
                             lines.extend_from_slice(rows.g(row));
                         }
                     }
@@ -251,7 +250,7 @@ pub(crate) fn filter_nuisance(
                 let (values, g) = line.split_at_mut(k);
                 nuisance.update(g, values);
             }
-            states.push(Block {
+            states.push(NuisanceEstimate {
                 x: nuisance.estimates(),
                 p: nuisance.covariance(),
                 drift,
@@ -264,14 +263,14 @@ pub(crate) fn filter_nuisance(
 /// As [`filter_nuisance`], smoothed over the whole segment, with the residuals.
 pub(crate) fn residuals(
     measurement: &MeasurementModel<'_>,
-    segment: Segment<'_>,
+    segment: LogSegment<'_>,
     noise: &NoiseModel,
     sets: &[DVector<f64>],
 ) -> Residuals {
     let unknowns = measurement.unknowns().clone();
     let (k, channels, count) = (sets.len(), unknowns.channels(), segment.instants.len());
     let variances = noise.offset_tracking_variances();
-    let make = || (measurement.clone(), Rows::new(&unknowns));
+    let make = || (measurement.clone(), MeasurementRows::new(&unknowns));
     let (ranges, mut states) = filter_nuisance(measurement, segment, noise, sets);
     smooth(&mut states);
     let mut first = measurement.cad_of_unknowns();
@@ -314,14 +313,7 @@ pub(crate) fn residuals(
                     };
                     for (set, d) in sets.iter().enumerate() {
                         let s = state.x.column(set);
-                        give(
-                            &|row| {
-                                rows.r(row)
-                                    - dot(rows.a(row), d.as_slice())
-                                    - dot(rows.g(row), s.as_slice())
-                            },
-                            set,
-                        );
+                        give(&|row| rows.residual(row, d.as_slice(), s.as_slice()), set);
                     }
                     give(&|row| dot(rows.a(row), &first), k);
                     give(&|row| rows.r(row) + dot(rows.a(row), &cad), k + 1);
@@ -519,7 +511,7 @@ pub(crate) mod tests {
             instants.iter(),
         )
         .expect("rows");
-        let mut rows = Rows::new(measurement.unknowns());
+        let mut rows = MeasurementRows::new(measurement.unknowns());
         let mut offset = [0.0; 12];
         for observation in &mut instants {
             // r = 0 for G m + r(0) = 0: the foot's reading is chosen, the hip's follows.
@@ -559,7 +551,7 @@ pub(crate) mod tests {
             .map(|channel| if channel % 6 < 3 { 1e-10 } else { 1e-8 })
             .collect();
         let mut noise = NoiseModel::unknown(least.clone());
-        let segment = Segment {
+        let segment = LogSegment {
             instants,
             log: None,
         };
@@ -595,7 +587,7 @@ pub(crate) mod tests {
             link.and_then(|link| robot.structure.subtree_of(link))
                 .expect("a sub-tree")
         };
-        let mut rows = Rows::new(measurement.unknowns());
+        let mut rows = MeasurementRows::new(measurement.unknowns());
         for (disturbed, expected) in [
             (None, 2),
             (Some(of_link("base")), 2),
@@ -608,7 +600,7 @@ pub(crate) mod tests {
                 .into_iter()
                 .for_each(|unit| observation.disturbed.insert(unit));
             measurement.make(&observation, &mut rows).expect("rows");
-            let mut own = Rows::new(measurement.unknowns());
+            let mut own = MeasurementRows::new(measurement.unknowns());
             rows.copy_unit(Observation::TORQUES, &mut own);
             assert_eq!(own.count, expected, "rows with {disturbed:?}");
             if disturbed != Some(Observation::TORQUES) {

@@ -1,11 +1,11 @@
 //! Rows of one observation, whitened by the noise of its channels.
 
-use crate::arithmetic::{factorise, forward};
+use crate::arithmetic::{dot, factorise, forward};
 use crate::measurement::unknowns::Unknowns;
 
 /// The rows of one observation; reusable buffers.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Rows {
+pub(crate) struct MeasurementRows {
     pub count: usize,
     pub(crate) parameters: usize,
     pub(crate) nuisance: usize,
@@ -20,7 +20,7 @@ pub(crate) struct Rows {
     pub(crate) factor: Vec<f64>,
 }
 
-impl Rows {
+impl MeasurementRows {
     pub(crate) fn new(unknowns: &Unknowns) -> Self {
         Self {
             parameters: unknowns.parameters(),
@@ -79,6 +79,16 @@ impl Rows {
 
     pub(crate) fn r(&self, row: usize) -> f64 {
         self.r[row]
+    }
+
+    /// What these parameters leave of a row: `r - A d`.
+    pub(crate) fn without_bodies(&self, row: usize, d: &[f64]) -> f64 {
+        self.r(row) - dot(self.a(row), d)
+    }
+
+    /// What these parameters and nuisance parameters leave of a row: `r - A d - G s`.
+    pub(crate) fn residual(&self, row: usize, d: &[f64], s: &[f64]) -> f64 {
+        self.without_bodies(row, d) - dot(self.g(row), s)
     }
 
     pub(crate) fn g(&self, row: usize) -> &[f64] {
@@ -144,7 +154,7 @@ impl Rows {
     }
 
     /// Adds `diag(v) N^T W^-1 N` to `sum` (channels by channels, row by row): how
-    /// [`Rows::channel_noise`] shares the noise of the rows among the channels. The diagonal is the
+    /// [`MeasurementRows::channel_noise`] shares the noise of the rows among the channels. The diagonal is the
     /// share of a channel's variance that its most likely noise has, `(v - posterior variance) /
     /// v`: one if the rows separate the channel from all others, less if it appears only mixed with
     /// others.

@@ -20,7 +20,7 @@
 //! from either of two sensors).
 
 use crate::measurement::noise_model::{Seconds, second};
-use crate::measurement::reduction::{Residuals, Segment};
+use crate::measurement::reduction::{LogSegment, Residuals};
 use crate::measurement::unknowns::Unknowns;
 use std::collections::BTreeMap;
 
@@ -35,7 +35,7 @@ impl Seconds {
     /// From the residuals of training logs.
     pub(crate) fn of(
         unknowns: &Unknowns,
-        segments: &[Segment<'_>],
+        segments: &[LogSegment<'_>],
         residuals: &[Residuals],
         set: usize,
     ) -> Self {
@@ -64,7 +64,7 @@ impl Seconds {
     pub(crate) fn standardise(
         &self,
         unknowns: &Unknowns,
-        segments: &[Segment<'_>],
+        segments: &[LogSegment<'_>],
         residuals: &mut [Residuals],
     ) {
         let channels = 6 * unknowns.sensors.len();

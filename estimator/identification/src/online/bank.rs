@@ -34,13 +34,13 @@ mod evidence;
 pub(crate) mod hypothesis;
 mod unit;
 
-pub use hypothesis::{Hypothesis, Sight, View};
+pub use hypothesis::{Hypothesis, MotionReading, WrenchReading};
 
-use crate::online::solution::{Change, Doubt, OnlineError, Solution};
-use crate::prior::cad_root;
-use crate::robot::BaseMotion;
-use evidence::{Columns, Fit, Posterior, Rows, SMALL, dot};
-use hypothesis::Motion;
+use crate::online::component::ComponentLayout;
+use crate::online::solution::{DetectedChange, Doubt, OnlineError, Solution};
+use crate::robot::Robot;
+use evidence::{HypothesisFit, HypothesisPosterior, SMALL, SubtreeUnknowns, TickRows, dot};
+use hypothesis::SeenMotion;
 use nalgebra::Vector6;
 use proprio_dynamics::model::Model;
 use proprio_dynamics::regressor::{EstimateRows, LINK_PARAMETERS, StackedRegressor, Weighting};
@@ -48,7 +48,7 @@ use proprio_dynamics::spatial::{RigidInertia, Wrench};
 use proprio_dynamics::{ContactSet, FrameMotion, JointState, Kinematics, Solver, Structure};
 use proprio_topics::Nanos;
 use std::collections::VecDeque;
-use unit::{CONTACT, Unit};
+use unit::{CONTACT, SubtreeHypotheses, hypotheses};
 
 /// Deviations within which the torque of a hypothesis lies that is not refuted. At four, the
 /// promise, almost half of the room remains for the uncertainty of that torque itself.
@@ -76,7 +76,7 @@ pub(crate) const TICK: Nanos = Nanos::from_millis(100);
 pub(crate) struct Tick {
     /// Its slot in the time grid.
     pub(crate) slot: i64,
-    motion: Motion,
+    motion: SeenMotion,
     base_link: usize,
     readings: Vec<Wrench>,
     active: ContactSet,
@@ -90,7 +90,7 @@ impl Tick {
     pub(crate) fn new(dofs: usize, sensors: usize) -> Self {
         Self {
             slot: 0,
-            motion: Motion::new(dofs),
+            motion: SeenMotion::new(dofs),
             base_link: 0,
             readings: vec![Wrench::zero(); sensors],
             active: ContactSet::EMPTY,
@@ -123,19 +123,11 @@ pub(crate) fn bits(components: impl Iterator<Item = usize>) -> u64 {
     components.fold(0, |bits, component| bits | bit(component))
 }
 
-/// What a component contributes.
-pub(crate) struct Share<'a> {
-    /// The sub-trees that can be free of contacts.
-    pub(crate) subtrees: &'a [usize],
-    /// The contacts on them that come and go.
-    pub(crate) intermittent: ContactSet,
-}
-
 /// All hypotheses about a robot. See the [module](self).
 #[derive(Clone, Debug)]
 pub(crate) struct Bank {
-    place: Place,
-    units: Vec<Unit>,
+    equations: TickEquations,
+    units: Vec<SubtreeHypotheses>,
     /// The stated variances of each sensor's channels, [torque; force].
     variances: Vec<[f64; 6]>,
     waiting: Vec<Tick>,
@@ -148,48 +140,35 @@ pub(crate) struct Bank {
 
 /// The equations of the robot at a tick, as seen by a hypothesis.
 #[derive(Clone, Debug)]
-struct Place {
+struct TickEquations {
     model: Model,
     structure: Structure,
     kinematics: Kinematics,
     stacked: StackedRegressor,
     solver: Solver,
-    motion: Motion,
+    motion: SeenMotion,
 }
 
 impl Bank {
-    /// `relative` is the relative deviation of CAD parameters.
-    pub(crate) fn new(
-        model: &Model,
-        structure: &Structure,
-        base: (usize, &BaseMotion),
-        cad: &[RigidInertia],
+    /// About the sub-trees of these components. `offsets` are the configured ones.
+    pub(crate) fn new<'a>(
+        robot: &Robot,
         offsets: &[Wrench],
-        shares: &[Share<'_>],
-        relative: f64,
+        components: impl Iterator<Item = &'a ComponentLayout>,
     ) -> Result<Self, OnlineError> {
+        let (model, structure) = (&robot.model, &robot.structure);
         let stacked = StackedRegressor::new(structure);
         let mut units = Vec::new();
-        for (component, share) in shares.iter().enumerate() {
-            for &subtree in share.subtrees {
-                let own = &stacked.subtrees()[subtree];
-                let (links, sensors) = (own.links().to_vec(), own.sensors().collect::<Vec<_>>());
-                let parameters = links.iter().flat_map(|&link| cad[link].parameters());
-                let offsets = sensors
-                    .iter()
-                    .flat_map(|&sensor| offsets[sensor].torque_first());
-                let columns = Columns {
-                    reference: parameters.chain(offsets).collect(),
-                    roots: links
-                        .iter()
-                        .map(|&link| cad_root(&cad[link], relative))
-                        .collect(),
-                    links,
-                    sensors,
-                };
-                let robot = (model, structure);
-                let number = (component, subtree);
-                units.push(Unit::new(number, columns, robot, base, &share.intermittent));
+        for (component, layout) in components.enumerate() {
+            for &number in &layout.subtrees {
+                let subtree = &stacked.subtrees()[number];
+                let unknowns = SubtreeUnknowns::new(robot, subtree, offsets);
+                let contacts = &structure.subtrees()[number].contacts;
+                let contacts = contacts.intersection(&layout.intermittent);
+                let at_start = hypotheses(&unknowns, robot, &contacts);
+                units.push(SubtreeHypotheses::new(
+                    component, number, unknowns, at_start,
+                ));
             }
         }
         let stated = structure.sensors().iter().map(|cut| {
@@ -199,11 +178,11 @@ impl Bank {
         Ok(Self {
             units,
             variances: stated.collect(),
-            place: Place {
-                kinematics: Kinematics::new(model, base.0)?,
+            equations: TickEquations {
+                kinematics: Kinematics::new(model, robot.base_link)?,
                 stacked,
                 solver: Solver::new(structure),
-                motion: Motion::new(model.dof_count()),
+                motion: SeenMotion::new(model.dof_count()),
                 model: model.clone(),
                 structure: structure.clone(),
             },
@@ -233,7 +212,7 @@ impl Bank {
         let old = later.len().saturating_sub(MOST_WAITING);
         self.waiting = later.into_iter().skip(old).collect();
         let Self {
-            place,
+            equations,
             units,
             variances,
             recent,
@@ -247,23 +226,23 @@ impl Bank {
                 }
             }
             let is_learnt = |component: usize| tick.learnt & tick.moving & bit(component) != 0;
-            let mut views: Vec<View> = Vec::new();
+            let mut views: Vec<MotionReading> = Vec::new();
             for unit in units.iter().filter(|unit| is_learnt(unit.component)) {
                 views.extend(unit.fits.iter().map(|fit| fit.view));
             }
             while let Some(view) = views.pop() {
                 views.retain(|other| *other != view);
-                let Some(shifted) = place.shifted(&tick, view, units) else {
+                let Some(shifted) = equations.shifted(&tick, view, units) else {
                     continue;
                 };
-                if !place.update(&tick, view) {
+                if !equations.update(&tick, view) {
                     continue;
                 }
                 for (number, unit) in units.iter_mut().enumerate() {
                     if !is_learnt(unit.component) {
                         continue;
                     }
-                    let rows = place.rows(unit, &tick, &shifted[number], variances);
+                    let rows = equations.rows(unit, &tick, &shifted[number], variances);
                     for fit in unit.fits.iter_mut().filter(|fit| fit.view == view) {
                         fit.add(&unit.columns, &rows);
                     }
@@ -295,7 +274,7 @@ impl Bank {
         ticks: &[Tick],
     ) -> bool {
         let Self {
-            place,
+            equations,
             units,
             variances,
             latest,
@@ -307,13 +286,13 @@ impl Bank {
         for unit in units.iter().filter(|unit| unit.component == component) {
             let mut fits = unit.changes();
             for tick in &rejected {
-                if place.update(tick, View::AsStated) {
-                    let rows = place.rows(unit, tick, &[], variances);
+                if equations.update(tick, MotionReading::AsStated) {
+                    let rows = equations.rows(unit, tick, &[], variances);
                     fits.iter_mut()
                         .for_each(|fit| fit.add(&unit.columns, &rows));
                 }
             }
-            let evidence = |fit: &mut Fit| {
+            let evidence = |fit: &mut HypothesisFit| {
                 (0..WEIGHINGS).for_each(|_| fit.weigh(&unit.columns));
                 fit.branches[0].log_evidence
             };
@@ -329,13 +308,13 @@ impl Bank {
     /// Weighs all hypotheses. What is wrong with the robot, rather than with one sub-tree, must be
     /// compatible with the others, too.
     fn weigh(&mut self) {
-        self.units.iter_mut().for_each(Unit::weigh);
-        let evidence: Vec<_> = self.units.iter().map(Unit::evidence).collect();
+        self.units.iter_mut().for_each(SubtreeHypotheses::weigh);
+        let evidence: Vec<_> = self.units.iter().map(SubtreeHypotheses::evidence).collect();
         for (number, unit) in self.units.iter_mut().enumerate() {
             unit.decide(|view, sight| {
                 let others = evidence.iter().enumerate();
                 let others = others.filter(|(other, _)| *other != number);
-                let own = |(_, of_unit): (usize, &Vec<(View, Sight, f64)>)| {
+                let own = |(_, of_unit): (usize, &Vec<(MotionReading, WrenchReading, f64)>)| {
                     let same = of_unit.iter().find(|own| (own.0, own.1) == (view, sight));
                     same.map(|own| own.2)
                 };
@@ -350,19 +329,19 @@ impl Bank {
     /// known.
     pub(crate) fn doubt(&mut self, solution: &mut Solution, disturbed: u64, anew: u64) {
         let Self {
-            place,
+            equations,
             units,
             recent,
             ..
         } = self;
-        let in_use = place.in_use(solution);
+        let in_use = equations.in_use(solution);
         let mut doubts: Vec<Option<Doubt>> = vec![None; solution.doubts.len()];
         solution
             .components
             .iter_mut()
             .for_each(|own| own.leading = None);
         for unit in units.iter() {
-            let dofs = place.dofs(&unit.columns.sensors, Some(unit.subtree));
+            let dofs = equations.dofs(&unit.columns.sensors, Some(unit.subtree));
             let leading = unit.leading();
             let (is_doubtful, is_settled) = (unit.is_doubtful(), unit.is_settled());
             let of_component = &mut solution.components[unit.component].leading;
@@ -378,7 +357,7 @@ impl Bank {
             let is_begun = learnt > 0.0 && learnt < BEGUN || anew & bit(unit.component) != 0;
             let is_shown = unit.fits[0].ticks() >= SHOWN && disturbed & bit(unit.component) == 0;
             if is_doubtful || is_begun || !is_settled {
-                let beyond = place.dofs(&measured_with(unit, units), None);
+                let beyond = equations.dofs(&measured_with(unit, units), None);
                 beyond.iter().for_each(|&dof| add(dof, f64::INFINITY));
             }
             if is_doubtful || is_begun || !is_settled && !is_shown {
@@ -394,9 +373,10 @@ impl Bank {
                 continue;
             }
             for tick in recent.iter().filter(learnt) {
-                let published = place.torques(tick, &Hypothesis::AS_STATED, &in_use, &dofs);
+                let published = equations.torques(tick, &Hypothesis::AS_STATED, &in_use, &dofs);
                 for other in &alternatives {
-                    let torques = place.alternative(tick, (&unit.columns, other), &in_use, &dofs);
+                    let torques =
+                        equations.alternative(tick, (&unit.columns, other), &in_use, &dofs);
                     for (&dof, both) in dofs.iter().zip(published.iter().zip(torques)) {
                         if let (Some((published, _)), Some((torque, own))) = both {
                             add(dof, ((torque - published).abs() / COVERED).max(own));
@@ -411,30 +391,30 @@ impl Bank {
     }
 
     /// Forgets what a change of a component concerns.
-    pub(crate) fn forget(&mut self, component: usize, change: Change) {
-        let model = &self.place.model;
+    pub(crate) fn forget(&mut self, component: usize, change: DetectedChange) {
+        let model = &self.equations.model;
         let own = self
             .units
             .iter_mut()
             .filter(|unit| unit.component == component);
         own.for_each(|unit| match change {
-            Change::Anew => unit.begin_anew(),
-            Change::Offset => unit.forget(&unit.offsets()),
-            Change::Load => unit.forget(&unit.loads(model)),
+            DetectedChange::Anew => unit.begin_anew(),
+            DetectedChange::Offset => unit.forget(&unit.offsets()),
+            DetectedChange::Load => unit.forget(&unit.loads(model)),
         });
     }
 
     /// Whether a contact may have been there since the start.
     pub(crate) fn may_have_begun_in_contact(&self, component: usize) -> bool {
         let mut own = self.units.iter().filter(|unit| unit.component == component);
-        own.any(Unit::may_have_begun_in_contact)
+        own.any(SubtreeHypotheses::may_have_begun_in_contact)
     }
 }
 
-impl Place {
+impl TickEquations {
     /// Sets the regressor to a tick; false if it can not be computed.
-    fn update(&mut self, tick: &Tick, view: View) -> bool {
-        let is_updated = self.look(tick, view)
+    fn update(&mut self, tick: &Tick, view: MotionReading) -> bool {
+        let is_updated = self.set_kinematics(tick, view)
             && self
                 .stacked
                 .update(&self.kinematics, &tick.readings, &tick.active, &[])
@@ -448,12 +428,12 @@ impl Place {
     /// The rows of a unit at a tick, to which the regressor is set.
     fn rows<'a>(
         &'a self,
-        unit: &Unit,
+        unit: &SubtreeHypotheses,
         tick: &'a Tick,
         shifted: &'a [Vector6<f64>],
         variances: &'a [[f64; 6]],
-    ) -> Rows<'a> {
-        Rows {
+    ) -> TickRows<'a> {
+        TickRows {
             rows: &self.stacked.subtrees()[unit.subtree],
             structure: &self.structure,
             kinematics: &self.kinematics,
@@ -468,8 +448,8 @@ impl Place {
     fn shifted(
         &mut self,
         tick: &Tick,
-        view: View,
-        units: &[Unit],
+        view: MotionReading,
+        units: &[SubtreeHypotheses],
     ) -> Option<Vec<Vec<Vector6<f64>>>> {
         let mut shifted = vec![Vec::new(); units.len()];
         let unknowns = view.unknowns();
@@ -487,7 +467,7 @@ impl Place {
         Some(shifted)
     }
 
-    fn look(&mut self, tick: &Tick, view: View) -> bool {
+    fn set_kinematics(&mut self, tick: &Tick, view: MotionReading) -> bool {
         self.motion
             .copy_from(tick.motion.state(), &tick.motion.base);
         self.motion.see(view);
@@ -517,7 +497,7 @@ impl Place {
         let readings: Vec<Wrench> = (0..tick.readings.len())
             .map(|sensor| hypothesis.sight.reading(sensor, &tick.readings))
             .collect();
-        if !self.look(tick, hypothesis.view) {
+        if !self.set_kinematics(tick, hypothesis.view) {
             return nothing;
         }
         let Self {
@@ -549,7 +529,7 @@ impl Place {
     fn alternative(
         &mut self,
         tick: &Tick,
-        (columns, other): (&Columns, &Posterior),
+        (columns, other): (&SubtreeUnknowns, &HypothesisPosterior),
         in_use: &[f64],
         dofs: &[usize],
     ) -> Vec<Option<(f64, f64)>> {
@@ -609,7 +589,7 @@ impl Place {
     }
 
     /// The places of a sub-tree's columns among those of the robot, ten per link, six per sensor.
-    fn columns(&self, own: &Columns) -> Vec<usize> {
+    fn columns(&self, own: &SubtreeUnknowns) -> Vec<usize> {
         let first = LINK_PARAMETERS * self.structure.link_count();
         let links = own.links.iter().map(|link| LINK_PARAMETERS * link);
         let links = links.flat_map(|column| column..column + LINK_PARAMETERS);
@@ -644,7 +624,7 @@ impl Place {
 
 /// The sensors whose offsets follow from those of a unit, from sub-tree to sub-tree: no other one
 /// weighs them alone.
-fn measured_with(unit: &Unit, units: &[Unit]) -> Vec<usize> {
+fn measured_with(unit: &SubtreeHypotheses, units: &[SubtreeHypotheses]) -> Vec<usize> {
     let others = || units.iter().filter(|other| other.subtree != unit.subtree);
     let is_alone = |sensor: &usize| others().any(|other| other.columns.sensors == [*sensor]);
     let mut found = unit.columns.sensors.clone();
@@ -676,8 +656,7 @@ mod tests {
 
     /// An arm of three moving links on a sensor, that can be touched at its tip.
     struct Arm {
-        model: Model,
-        structure: Structure,
+        robot: Robot,
         tip: Frame,
     }
 
@@ -713,41 +692,25 @@ mod tests {
                 kind: ContactKind::Force,
                 position: Vec3::new(0.0, 0.0, 0.2),
             };
-            let structure =
-                Structure::new(&model, &[cut], &[contact], Structure::LENGTH_SCALE).unwrap();
-            Self {
-                model,
-                structure,
-                tip,
-            }
+            let gravity = Vec3::new(0.0, 0.0, -GRAVITY);
+            let (sensors, contacts) = ([("ft", cut)], [("tip", contact)]);
+            let mut robot =
+                Robot::standing("r", model, "l0", &gravity, &sensors, &contacts).unwrap();
+            robot.always = ContactSet::EMPTY;
+            Self { robot, tip }
         }
 
         fn bank(&self) -> Bank {
-            let upright = FrameMotion::standing(&Vec3::new(0.0, 0.0, -GRAVITY));
-            let beyond = self.structure.subtree_of(self.tip.link).unwrap();
-            let mut intermittent = ContactSet::EMPTY;
-            intermittent.insert(0);
-            let share = Share {
-                subtrees: &[beyond],
-                intermittent,
-            };
-            let base = (0, &BaseMotion::Standing(upright));
-            let (cad, offsets) = (self.model.inertias(), [Wrench::zero()]);
-            Bank::new(
-                &self.model,
-                &self.structure,
-                base,
-                cad,
-                &offsets,
-                &[share],
-                0.2,
-            )
-            .unwrap()
+            let beyond = self.robot.structure.subtree_of(self.tip.link).unwrap();
+            let stacked = StackedRegressor::new(&self.robot.structure);
+            let offsets = [Wrench::zero()];
+            let layout = ComponentLayout::new(&self.robot, &stacked, vec![beyond], &offsets);
+            Bank::new(&self.robot, &offsets, std::iter::once(&layout)).unwrap()
         }
 
         /// The readings of the truth in this slot, and what encoders and base tell of it: joint 1
         /// and the base are taken as `told`. A force acts at the tip, and the offset is another.
-        fn tick(&self, slot: i64, told: View, force: Vec3, offset: Wrench) -> Tick {
+        fn tick(&self, slot: i64, told: MotionReading, force: Vec3, offset: Wrench) -> Tick {
             let phase = 0.1 * slot as f64;
             let sines = |derivative: u8| -> Vec<f64> {
                 let sine = |joint: i32| {
@@ -757,12 +720,12 @@ mod tests {
                 };
                 (0..3).map(sine).collect()
             };
-            let mut truth = Motion::new(3);
+            let mut truth = SeenMotion::new(3);
             (truth.position, truth.velocity, truth.acceleration) = (sines(0), sines(1), sines(2));
             truth.base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -GRAVITY));
-            let mut kinematics = Kinematics::new(&self.model, 0).unwrap();
+            let mut kinematics = Kinematics::new(&self.robot.model, 0).unwrap();
             kinematics
-                .update(&self.model, truth.state(), &truth.base)
+                .update(&self.robot.model, truth.state(), &truth.base)
                 .unwrap();
             let pose = *kinematics.pose(self.tip.link);
             let point = Frame {
@@ -776,15 +739,15 @@ mod tests {
                 torque: Vec3::zeros(),
                 force: pose.rotation.transpose() * force,
             };
-            let mut dynamics = InverseDynamics::new(&self.model);
+            let mut dynamics = InverseDynamics::new(&self.robot.model);
             let external = [ExternalWrench {
                 frame: point,
                 wrench,
             }];
             dynamics
-                .update(&self.model, &kinematics, &external)
+                .update(&self.robot.model, &kinematics, &external)
                 .unwrap();
-            let cut = &self.structure.sensors()[0];
+            let cut = &self.robot.structure.sensors()[0];
             let noise = normals(slot as u64, 6);
             let noise = Wrench::from_parts(
                 [0, 1, 2].map(|i| 0.1 * noise[i]),
@@ -802,7 +765,7 @@ mod tests {
         }
 
         /// A bank that has learnt 20 s of this.
-        fn learnt(&self, told: View) -> Bank {
+        fn learnt(&self, told: MotionReading) -> Bank {
             let mut bank = self.bank();
             for second in 0..20 {
                 let slots: Vec<i64> = (10 * second..10 * second + 10).collect();
@@ -815,7 +778,7 @@ mod tests {
     }
 
     /// What a bank makes of a view that has unknowns.
-    fn estimate(bank: &Bank, is_it: impl Fn(&View) -> bool) -> View {
+    fn estimate(bank: &Bank, is_it: impl Fn(&MotionReading) -> bool) -> MotionReading {
         let unit = &bank.units[0];
         let fit = unit.fits.iter().find(|fit| is_it(&fit.view)).unwrap();
         fit.posterior(&unit.columns, 0).unwrap().hypothesis.view
@@ -824,9 +787,9 @@ mod tests {
     #[test]
     fn the_zero_and_the_gain_of_an_encoder_are_estimated() {
         for (off, is_small) in [([-0.03, -0.02], true), ([-0.15, -0.1], false)] {
-            let bank = Arm::new().learnt(View::Encoder(1, off));
-            let found = estimate(&bank, |view| matches!(view, View::Encoder(1, _)));
-            let View::Encoder(_, [offset, gain]) = found else {
+            let bank = Arm::new().learnt(MotionReading::Encoder(1, off));
+            let found = estimate(&bank, |view| matches!(view, MotionReading::Encoder(1, _)));
+            let MotionReading::Encoder(_, [offset, gain]) = found else {
                 panic!("{found:?}");
             };
             // Right is (reading - off[0]) / (1 + off[1]). The columns are those without an error.
@@ -842,9 +805,9 @@ mod tests {
     #[test]
     fn the_tilt_of_the_base_is_estimated_and_harmless_if_small() {
         for (tilt, is_small) in [(0.03, true), (0.2, false)] {
-            let bank = Arm::new().learnt(View::BaseTurned(Vec3::new(0.0, -tilt, 0.0)));
-            let is_it = |view: &View| matches!(view, View::BaseTurned(_));
-            let View::BaseTurned(turn) = estimate(&bank, is_it) else {
+            let bank = Arm::new().learnt(MotionReading::BaseTurned(Vec3::new(0.0, -tilt, 0.0)));
+            let is_it = |view: &MotionReading| matches!(view, MotionReading::BaseTurned(_));
+            let MotionReading::BaseTurned(turn) = estimate(&bank, is_it) else {
                 panic!();
             };
             assert!((turn.y - tilt).abs() < 0.05 * tilt, "{turn}");
@@ -865,9 +828,9 @@ mod tests {
         let push = (Vec3::new(8.0, 3.0, -5.0), Wrench::zero());
         let jump = Wrench::from_parts([8.0, 3.0, -5.0], [0.5, 0.2, -0.3]);
         for ((force, offset), is_contact) in [(push, true), ((Vec3::zeros(), jump), false)] {
-            let mut bank = arm.learnt(View::AsStated);
+            let mut bank = arm.learnt(MotionReading::AsStated);
             let slots: Vec<i64> = (200..230).collect();
-            let tick = |slot: &i64| arm.tick(*slot, View::AsStated, force, offset);
+            let tick = |slot: &i64| arm.tick(*slot, MotionReading::AsStated, force, offset);
             let rejected: Vec<Tick> = slots.iter().map(tick).collect();
             // They wait, for nothing is decided about them; only one second is new.
             bank.learn(&rejected[..20], &[(199, Vec::new())]);

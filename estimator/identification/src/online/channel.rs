@@ -56,7 +56,7 @@ const GREATEST: f64 = 0.9;
 
 /// One filter of the offset, and its log-likelihood.
 #[derive(Clone, Copy, Debug, Default)]
-struct Filter {
+struct OffsetFilter {
     offset: LocalLevel,
     likelihood: f64,
 }
@@ -80,14 +80,14 @@ pub(crate) struct SecondMean {
 
 /// Estimator of one channel's noise and drift rate.
 #[derive(Clone, Debug)]
-pub(crate) struct Channel {
+pub(crate) struct NoiseTracker {
     /// The stated variance of an observation.
     stated: f64,
     /// The time between observations \[s\].
     period: f64,
     /// Time of the last second \[s\]; None: the filters restart with the next.
     last: Option<f64>,
-    filters: [[Filter; RATES.len()]; LEVELS],
+    filters: [[OffsetFilter; RATES.len()]; LEVELS],
     /// Normalised innovation of the likeliest filter; the mean product of two consecutive ones, and
     /// the mean square.
     innovation: f64,
@@ -102,13 +102,13 @@ pub(crate) struct Channel {
     candidate: Option<f64>,
 }
 
-impl Channel {
+impl NoiseTracker {
     pub(crate) fn new(stated: f64, period: f64) -> Self {
         Self {
             stated,
             period,
             last: None,
-            filters: [[Filter::default(); RATES.len()]; LEVELS],
+            filters: [[OffsetFilter::default(); RATES.len()]; LEVELS],
             innovation: f64::NAN,
             products: (CORRELATED.0 * CORRELATED.1, CORRELATED.1),
             scatter: None,
@@ -186,7 +186,7 @@ impl Channel {
 
     /// Takes in the scatter of a second; None if a push fills the second. One beside such a second
     /// does not count: there the push begins or ends.
-    fn take_scatter(&mut self, second: Option<&Residuals>) {
+    fn take_scatter(&mut self, second: Option<&SecondResiduals>) {
         let confirmed = second.and(self.candidate).unwrap_or(0.0);
         let was_free = std::mem::replace(&mut self.was_free, second.is_some());
         self.candidate = second
@@ -232,7 +232,7 @@ impl Channel {
     }
 }
 
-impl Filter {
+impl OffsetFilter {
     /// Takes in a mean with its variance, `dt` seconds after the last one, in which the offset's
     /// variance grew by `walked`; `disturbed` is the density of disturbances. Returns the
     /// normalised innovation, and the probability that it is noise.
@@ -259,7 +259,7 @@ impl Filter {
 
 /// The residuals of one axis in a second.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Residuals {
+pub(crate) struct SecondResiduals {
     /// Their mean, and the mean square about it.
     pub mean: f64,
     pub scatter: f64,
@@ -267,7 +267,7 @@ pub(crate) struct Residuals {
     pub is_likely_noise: bool,
 }
 
-impl Residuals {
+impl SecondResiduals {
     pub(crate) const NONE: Self = Self {
         mean: f64::NAN,
         scatter: f64::NAN,
@@ -277,7 +277,7 @@ impl Residuals {
 
 /// Takes in the residuals of a sensor in one second, NaN where it has none. The mean of a second
 /// that a push fills for the greater part has a larger square than the scatter has.
-pub(crate) fn take_scatters(axes: &mut [Channel], second: &[Residuals]) {
+pub(crate) fn take_scatters(axes: &mut [NoiseTracker], second: &[SecondResiduals]) {
     let excess = (axes.iter().zip(second))
         .map(|(axis, own)| (own.mean * own.mean - own.scatter) / axis.stated)
         .filter(|excess| excess.is_finite())
@@ -303,8 +303,8 @@ mod tests {
         rate: f64,
         seed: u64,
         acts: impl Fn(usize) -> f64,
-    ) -> Channel {
-        let mut channel = Channel::new(STATED, PERIOD);
+    ) -> NoiseTracker {
+        let mut channel = NoiseTracker::new(STATED, PERIOD);
         let deviates = normals(seed, 2 * seconds);
         let deviation = (factor * STATED * PERIOD).sqrt();
         let mut offset = 11.0;
@@ -350,7 +350,7 @@ mod tests {
 
     #[test]
     fn the_initial_noise_is_large_and_falls_quickly() {
-        let (noise, walk) = Channel::new(STATED, PERIOD).noise();
+        let (noise, walk) = NoiseTracker::new(STATED, PERIOD).noise();
         assert!(noise > 1e3 * STATED && walk > (STATED * PERIOD).sqrt());
         // The estimate falls within some seconds.
         assert!(after(10, 1.0, 0.01, 1, |_| 0.0).noise().0 < 30.0 * STATED);
@@ -392,7 +392,7 @@ mod tests {
     /// Motion overrides the noise estimate at rest within a few seconds.
     #[test]
     fn rest_says_little_of_the_noise_in_motion() {
-        let mut channel = Channel::new(STATED, PERIOD);
+        let mut channel = NoiseTracker::new(STATED, PERIOD);
         let deviates = normals(7, 70);
         for (second, deviate) in deviates.iter().enumerate() {
             let is_moving = second >= 60;
@@ -415,7 +415,7 @@ mod tests {
 
     #[test]
     fn the_uncertainty_of_the_bodies_is_no_noise() {
-        let mut sure = Channel::new(STATED, PERIOD);
+        let mut sure = NoiseTracker::new(STATED, PERIOD);
         let mut unsure = sure.clone();
         for (second, deviate) in normals(8, 60).iter().enumerate() {
             for (channel, of_bodies) in [(&mut sure, 0.0), (&mut unsure, 0.04)] {
@@ -448,7 +448,7 @@ mod tests {
             is_moving: true,
         };
         let deviates = normals(9, 200);
-        let mut channels = [(); 3].map(|()| Channel::new(STATED, PERIOD));
+        let mut channels = [(); 3].map(|()| NoiseTracker::new(STATED, PERIOD));
         for (number, deviate) in deviates.iter().enumerate() {
             let (t, is_later) = (number as f64, number >= 100);
             let mean = 0.008 * deviate + if is_later { 5.0 } else { 0.0 };
@@ -476,8 +476,8 @@ mod tests {
         assert!((70.0..130.0).contains(&(loud / STATED)), "{loud}");
     }
 
-    fn residuals((mean, scatter): (f64, f64)) -> Residuals {
-        Residuals {
+    fn residuals((mean, scatter): (f64, f64)) -> SecondResiduals {
+        SecondResiduals {
             mean,
             scatter,
             is_likely_noise: true,
@@ -487,7 +487,7 @@ mod tests {
     /// The worst scatter after seconds of a mean and a scatter, on three axes of which the second
     /// is quiet and the third is not measured.
     fn worst(seconds: &[(f64, f64)]) -> f64 {
-        let mut axes = [(); 3].map(|()| Channel::new(STATED, PERIOD));
+        let mut axes = [(); 3].map(|()| NoiseTracker::new(STATED, PERIOD));
         for second in seconds {
             let all = [*second, (0.0, STATED), (f64::NAN, f64::NAN)];
             take_scatters(&mut axes, &all.map(residuals));
@@ -497,7 +497,7 @@ mod tests {
 
     #[test]
     fn what_one_axis_shows_as_a_push_counts_as_noise_on_none() {
-        let mut axes = [(); 2].map(|()| Channel::new(STATED, PERIOD));
+        let mut axes = [(); 2].map(|()| NoiseTracker::new(STATED, PERIOD));
         for _ in 0..3 {
             take_scatters(&mut axes, &[(20.0, 1.0), (0.0, 100.0)].map(residuals));
         }

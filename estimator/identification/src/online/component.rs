@@ -3,17 +3,18 @@
 use crate::arithmetic::{add_multiple, dot, factorise, forward};
 use crate::linear::information::{Information, Panel};
 use crate::linear::simd::{self, VECTORS};
-use crate::online::channel::Channel;
-use crate::online::rows::{Kinds, ObservationRows, Rows, spread};
-use crate::online::solution::{BLOCK, Change, ComponentSolution, Counts, Observation, Paused};
-use crate::robot::ChannelRole;
+use crate::online::channel::NoiseTracker;
+use crate::online::rows::{ComponentColumns, RowBuffer, WhitenedRows, spread};
+use crate::online::solution::{
+    BLOCK, ComponentSolution, DetectedChange, ObservationCounts, OnlineObservation, Paused,
+};
+use crate::robot::{ChannelRole, Robot, dofs_between};
 use crate::statistics::chi_square;
 use nalgebra::DMatrix;
-use proprio_dynamics::model::Model;
 use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::regressor::StackedRegressor;
 use proprio_dynamics::spatial::{RigidInertia, Vec3, Wrench};
-use proprio_dynamics::{ContactSet, DofSet, LinkSet};
+use proprio_dynamics::{ContactSet, DofSet};
 use proprio_topics::{Nanos, Reason};
 use pulp::{Arch, Simd, WithSimd};
 use std::sync::Arc;
@@ -53,21 +54,31 @@ impl Limb {
     }
 }
 
-/// Sub-trees that are linked by sensors, and the information about them.
-#[derive(Clone, Debug)]
-pub(crate) struct Component {
+/// What a component is about. It does not change.
+#[derive(Debug)]
+pub(crate) struct ComponentLayout {
     pub(crate) subtrees: Vec<usize>,
     pub(crate) links: Vec<usize>,
     pub(crate) sensors: Vec<usize>,
     /// Joints whose motion its rows depend on, by the link where kinematics start.
-    pub(crate) dofs: Vec<DofSet>,
+    dofs: Vec<DofSet>,
     /// Contacts on its links that come and go.
     pub(crate) intermittent: ContactSet,
     /// CAD and configured offsets, `[s | d]`.
     pub(crate) reference: Vec<f64>,
-    pub(crate) kinds: Arc<Kinds>,
+    pub(crate) columns: ComponentColumns,
     /// Columns of the links at the ends of its limbs.
     pub(crate) outermost: Vec<usize>,
+    /// The links that carry the sensors.
+    carriers: Vec<usize>,
+    /// The configured standard deviations of the channels.
+    pub(crate) deviations: Vec<f64>,
+}
+
+/// Sub-trees that are linked by sensors, and the information about them.
+#[derive(Clone, Debug)]
+pub(crate) struct Component {
+    pub(crate) layout: Arc<ComponentLayout>,
     pub(crate) information: Information,
     pub(crate) panel: Panel,
     /// For a large component, the information of its limbs since the last merge.
@@ -80,19 +91,17 @@ pub(crate) struct Component {
     pub(crate) variances: Vec<f64>,
     /// The variances with which the rows for the next job are whitened.
     pub(crate) whitened: Vec<f64>,
-    /// The configured variances.
-    pub(crate) least: Vec<f64>,
     /// Standard deviations of the offsets' drift in a second.
     pub(crate) drift_rates: Vec<f64>,
     /// Columns of the offsets.
     pub(crate) offsets: Vec<usize>,
     /// Work space for the standard deviations of one drift step.
     pub(crate) deviations: Vec<f64>,
-    pub(crate) gathered: Rows,
-    pub(crate) pending: Rows,
+    pub(crate) gathered: RowBuffer,
+    pub(crate) pending: RowBuffer,
     /// For the next job: absorbed rows, rejected rows.
-    pub(crate) learnt: Rows,
-    pub(crate) rejected_rows: Rows,
+    pub(crate) learnt: RowBuffer,
+    pub(crate) rejected_rows: RowBuffer,
     pub(crate) block_from: Nanos,
     pub(crate) last_drift: Nanos,
     pub(crate) active: ContactSet,
@@ -100,9 +109,8 @@ pub(crate) struct Component {
     /// Whether a second block failed the gate, too.
     pub(crate) is_persistent: bool,
     pub(crate) clean: u32,
-    /// The links that carry the sensors; the direction of the proper acceleration of each when the
-    /// present disturbance began; the least cosine to it since.
-    pub(crate) carriers: Vec<usize>,
+    /// The direction of the proper acceleration of each sensor's carrier when the present
+    /// disturbance began; the least cosine to it since.
     pub(crate) directions: Vec<Vec3>,
     pub(crate) cosines: Vec<f64>,
     /// Whether the solution in use may judge rows.
@@ -114,31 +122,25 @@ pub(crate) struct Component {
     pub(crate) paused: Paused,
     /// The last instant without a fault.
     seen: Nanos,
-    pub(crate) last_change: Option<Change>,
-    pub(crate) counts: Counts,
+    pub(crate) last_change: Option<DetectedChange>,
+    pub(crate) counts: ObservationCounts,
     /// Amount of absorbed data: seconds in motion, rows.
     pub(crate) motion: f64,
     pub(crate) rows: u64,
     /// The rows of the present observation.
-    pub(crate) current_rows: ObservationRows,
+    pub(crate) current_rows: WhitenedRows,
     pub(crate) row: Vec<f64>,
-    pub(crate) scratch: Scratch,
+    pub(crate) scratch: GateBuffers,
 }
 
-impl Component {
-    #[allow(clippy::too_many_arguments, reason = "one caller, which has them all")]
+impl ComponentLayout {
     pub(crate) fn new(
-        model: &Model,
+        robot: &Robot,
         stacked: &StackedRegressor,
         mut subtrees: Vec<usize>,
-        cad: &[RigidInertia],
         offsets: &[Wrench],
-        always: &ContactSet,
-        per_job: usize,
-        per_block: usize,
-        period: f64,
     ) -> Self {
-        let structure = stacked.structure();
+        let (model, structure) = (&robot.model, stacked.structure());
         let mut links: Vec<usize> = subtrees
             .iter()
             .flat_map(|&k| structure.links_of(k))
@@ -151,173 +153,152 @@ impl Component {
             list.sort_unstable();
             list.dedup();
         }
-        let offset_count = 6 * sensors.len();
-        let unknowns = offset_count + LINK_PARAMETERS * links.len();
-        let place = |list: &[usize], of: usize| list.binary_search(&of).unwrap_or(0);
+        let unknowns = 6 * sensors.len() + LINK_PARAMETERS * links.len();
         if unknowns >= LARGE {
             // Whitened rows also have the unknowns of earlier rows, so the trunk's come last.
-            let size = |&k: &usize| {
-                (
-                    stacked.subtrees()[k].sensors().len(),
-                    stacked.subtrees()[k].links().len(),
-                )
-            };
-            subtrees.sort_by_key(size);
+            let subtree = |k: usize| &stacked.subtrees()[k];
+            subtrees.sort_by_key(|&k| (subtree(k).sensors().len(), subtree(k).links().len()));
         }
-        let columns: Vec<Vec<usize>> = subtrees
+        let dofs = |base: usize| dofs_between(model, base, &links).collect();
+        let has_child = |link: &usize| model.joints().iter().any(|joint| joint.parent == *link);
+        let outermost = (links
             .iter()
-            .map(|&k| {
-                let subtree = &stacked.subtrees()[k];
-                let of_links = subtree.links().iter().flat_map(|&link| {
-                    let first = offset_count + LINK_PARAMETERS * place(&links, link);
-                    first..first + LINK_PARAMETERS
-                });
-                let of_sensors = subtree.sensors().flat_map(|sensor| {
-                    let first = 6 * place(&sensors, sensor);
-                    first..first + 6
-                });
-                of_links.chain(of_sensors).collect()
-            })
-            .collect();
-        let to_root = |mut link: usize| {
-            let mut above = LinkSet::default();
-            while link > 0 {
-                above.insert(link);
-                link = model.joints()[link - 1].parent;
-            }
-            above
-        };
-        let to_root: Vec<LinkSet> = (0..model.link_count()).map(to_root).collect();
-        // From a base to a link: joints on the paths of both to the root are not crossed.
-        let crossed = |base: &LinkSet| -> DofSet {
-            let moved = links.iter().fold(LinkSet::default(), |moved, &link| {
-                let (there, back) = (
-                    to_root[link].difference(base),
-                    base.difference(&to_root[link]),
-                );
-                moved.union(&there).union(&back)
-            });
-            let dofs = moved.iter().filter_map(|link| model.joints()[link - 1].dof);
-            dofs.collect()
-        };
-        let dofs = to_root.iter().map(crossed).collect();
-        let parents: Vec<usize> = model.joints().iter().map(|joint| joint.parent).collect();
-        let outermost = (links.iter().enumerate())
-            .filter(|(_, link)| !parents.contains(link))
-            .flat_map(|(place, _)| {
-                offset_count + LINK_PARAMETERS * place..offset_count + LINK_PARAMETERS * (place + 1)
-            })
-            .collect();
-        let mut reference: Vec<f64> = sensors
-            .iter()
-            .flat_map(|&s| offsets[s].torque_first())
-            .collect();
-        reference.extend(links.iter().flat_map(|&link| cad[link].parameters()));
-        let noise: Vec<f64> = (sensors.iter())
-            .flat_map(|&s| {
-                let noise = structure.sensors()[s].noise();
-                Wrench::from_parts(noise.force, noise.torque).torque_first()
-            })
-            .collect();
-        let intermittent = (subtrees.iter())
-            .fold(ContactSet::default(), |set, &k| {
-                set.union(&structure.subtrees()[k].contacts)
-            })
-            .difference(always);
-        let kinds = Arc::new(Kinds::new(
-            stacked,
-            &subtrees,
-            &columns,
-            (offset_count, unknowns),
-        ));
-        let (mut limbs, mut limb_of) = (Vec::new(), Vec::new());
-        for kind in kinds.iter() {
-            let is_limb = unknowns >= LARGE && 2 * kind.columns.len() <= unknowns;
-            limb_of.push(is_limb.then_some(limbs.len()));
-            if is_limb {
-                limbs.push(Limb::new(kind.columns.clone(), 6 * per_block));
-            }
-        }
-        let most = kinds.most();
-        let channels = channels(&noise, period);
+            .zip((6 * sensors.len()..).step_by(LINK_PARAMETERS)))
+        .filter(|(link, _)| !has_child(link))
+        .flat_map(|(_, first)| first..first + LINK_PARAMETERS);
+        let of_sensors = sensors.iter().flat_map(|&s| offsets[s].torque_first());
+        let of_links = (links.iter()).flat_map(|&link| model.inertias()[link].parameters());
+        let deviations = sensors.iter().flat_map(|&s| {
+            let noise = structure.sensors()[s].noise();
+            Wrench::from_parts(noise.force, noise.torque).torque_first()
+        });
+        let contacts = subtrees.iter().map(|&k| &structure.subtrees()[k].contacts);
         Self {
-            drift_interval: if limbs.is_empty() { 0.0 } else { GATHERED },
-            drift_time: 0.0,
-            limbs,
-            limb_of,
-            dofs,
-            intermittent,
-            reference,
-            outermost,
-            information: Information::new(unknowns),
-            panel: Panel::new(unknowns, most * per_block),
-            variances: channels.iter().map(|channel| channel.noise().0).collect(),
-            least: noise.iter().map(|sigma| sigma * sigma).collect(),
-            drift_rates: channels.iter().map(|channel| channel.noise().1).collect(),
-            whitened: channels.iter().map(|channel| channel.noise().0).collect(),
-            offsets: (0..offset_count).collect(),
-            deviations: vec![0.0; offset_count],
-            gathered: Rows::new(&kinds, per_block),
-            pending: Rows::new(&kinds, per_block),
-            learnt: Rows::new(&kinds, per_job),
-            rejected_rows: Rows::new(&kinds, per_job),
-            block_from: Nanos::MIN,
-            last_drift: Nanos::MIN,
-            active: ContactSet::default(),
-            is_disturbed: false,
-            is_persistent: false,
-            clean: 0,
+            dofs: (0..model.link_count()).map(dofs).collect(),
+            intermittent: contacts
+                .fold(ContactSet::default(), |all, own| all.union(own))
+                .difference(&robot.always),
+            reference: of_sensors.chain(of_links).collect(),
+            columns: ComponentColumns::new(stacked, &subtrees, &sensors, &links),
+            outermost: outermost.collect(),
             carriers: sensors
                 .iter()
                 .map(|&s| structure.sensors()[s].joint() + 1)
                 .collect(),
-            directions: vec![Vec3::zeros(); sensors.len()],
-            cosines: vec![1.0; sensors.len()],
-            may_judge: false,
-            waits: false,
-            is_outdated: false,
-            paused: Paused::No,
-            seen: Nanos::ZERO,
-            last_change: None,
-            counts: Counts::default(),
-            motion: 0.0,
-            rows: 0,
-            current_rows: ObservationRows::new(&kinds),
-            row: vec![0.0; unknowns],
-            scratch: Scratch {
-                covariance: vec![0.0; most * most],
-                mean: vec![0.0; unknowns + 1],
-                projected: vec![0.0; most * (unknowns + offset_count)],
-                innovations: vec![0.0; most],
-            },
-            kinds,
+            deviations: deviations.collect(),
             subtrees,
             links,
             sensors,
         }
     }
 
-    /// The initial solution.
+    /// Number of offsets, `s`.
+    pub(crate) fn offset_count(&self) -> usize {
+        6 * self.sensors.len()
+    }
+
+    /// Number of the links' parameters, `d`.
+    pub(crate) fn parameters(&self) -> usize {
+        LINK_PARAMETERS * self.links.len()
+    }
+
+    /// Estimators of the noise of each channel.
+    pub(crate) fn trackers(&self, period: f64) -> Vec<NoiseTracker> {
+        let stated = self.deviations.iter();
+        stated
+            .map(|sigma| NoiseTracker::new(sigma * sigma, period))
+            .collect()
+    }
+}
+
+impl Component {
+    /// With room for this many observations per job and per block.
+    pub(crate) fn new(
+        layout: ComponentLayout,
+        per_job: usize,
+        per_block: usize,
+        period: f64,
+    ) -> Self {
+        let (columns, unknowns) = (&layout.columns, layout.reference.len());
+        let (offset_count, most) = (layout.offset_count(), columns.most());
+        let (mut limbs, mut limb_of) = (Vec::new(), Vec::new());
+        for own in columns.iter() {
+            let is_limb = unknowns >= LARGE && 2 * own.columns.len() <= unknowns;
+            limb_of.push(is_limb.then_some(limbs.len()));
+            if is_limb {
+                limbs.push(Limb::new(own.columns.clone(), 6 * per_block));
+            }
+        }
+        let noise: Vec<(f64, f64)> = (layout.trackers(period).iter())
+            .map(NoiseTracker::noise)
+            .collect();
+        let variances: Vec<f64> = noise.iter().map(|(variance, _)| *variance).collect();
+        Self {
+            drift_interval: if limbs.is_empty() { 0.0 } else { GATHERED },
+            drift_time: 0.0,
+            limbs,
+            limb_of,
+            information: Information::new(unknowns),
+            panel: Panel::new(unknowns, most * per_block),
+            whitened: variances.clone(),
+            variances,
+            drift_rates: noise.iter().map(|(_, rate)| *rate).collect(),
+            offsets: (0..offset_count).collect(),
+            deviations: vec![0.0; offset_count],
+            gathered: RowBuffer::new(columns, per_block),
+            pending: RowBuffer::new(columns, per_block),
+            learnt: RowBuffer::new(columns, per_job),
+            rejected_rows: RowBuffer::new(columns, per_job),
+            block_from: Nanos::MIN,
+            last_drift: Nanos::MIN,
+            active: ContactSet::default(),
+            is_disturbed: false,
+            is_persistent: false,
+            clean: 0,
+            directions: vec![Vec3::zeros(); layout.sensors.len()],
+            cosines: vec![1.0; layout.sensors.len()],
+            may_judge: false,
+            waits: false,
+            is_outdated: false,
+            paused: Paused::No,
+            seen: Nanos::ZERO,
+            last_change: None,
+            counts: ObservationCounts::default(),
+            motion: 0.0,
+            rows: 0,
+            current_rows: WhitenedRows::new(columns),
+            row: vec![0.0; unknowns],
+            scratch: GateBuffers {
+                covariance: vec![0.0; most * most],
+                mean: vec![0.0; unknowns + 1],
+                projected: vec![0.0; most * (unknowns + offset_count)],
+                innovations: vec![0.0; most],
+            },
+            layout: Arc::new(layout),
+        }
+    }
+
+    /// The initial solution: CAD, and these offsets.
     pub(crate) fn unknown(&self, cad: &[RigidInertia], offsets: &[Wrench]) -> ComponentSolution {
+        let ComponentLayout {
+            links,
+            sensors,
+            deviations,
+            ..
+        } = &*self.layout;
+        let noise = deviations.chunks_exact(6);
+        let drift = self.drift_rates.chunks_exact(6);
         ComponentSolution {
-            leading: None,
-            links: self.links.clone(),
-            bodies: self.links.iter().map(|&link| cad[link]).collect(),
-            sensors: self.sensors.clone(),
-            offsets: self.sensors.iter().map(|&sensor| offsets[sensor]).collect(),
-            root: DMatrix::zeros(
-                0,
-                LINK_PARAMETERS * self.links.len() + 6 * self.sensors.len(),
-            ),
-            drift: self
-                .drift_rates
-                .chunks_exact(6)
-                .map(|six| std::array::from_fn(|i| six[i]))
+            links: links.clone(),
+            bodies: links.iter().map(|&link| cad[link]).collect(),
+            sensors: sensors.clone(),
+            offsets: sensors.iter().map(|&sensor| offsets[sensor]).collect(),
+            root: DMatrix::zeros(0, self.layout.reference.len()),
+            drift: drift.map(|six| std::array::from_fn(|i| six[i])).collect(),
+            noise: noise
+                .map(|six| std::array::from_fn(|i| six[i] * six[i]))
                 .collect(),
-            noise: (self.least.chunks_exact(6))
-                .map(|six| std::array::from_fn(|i| six[i]))
-                .collect(),
-            worst: vec![[0.0; 6]; self.sensors.len()],
+            worst: vec![[0.0; 6]; sensors.len()],
             tau: f64::NAN,
             ..ComponentSolution::default()
         }
@@ -336,14 +317,14 @@ impl Component {
         self.paused = Paused::No;
         // A contact may be there since: that is to be seen by another motion.
         (self.motion, self.rows) = (0.0, 0);
-        self.last_change = Some(Change::Offset);
+        self.last_change = Some(DetectedChange::Offset);
         self.counts.changes += 1;
         self.counts.offset_changes += 1;
     }
 
     pub(crate) fn observe(
         &mut self,
-        seen: &Observation<'_>,
+        seen: &OnlineObservation<'_>,
         stacked: &StackedRegressor,
         known: &ComponentSolution,
         slot: i64,
@@ -356,7 +337,7 @@ impl Component {
         if self.block_from == Nanos::MIN {
             (self.block_from, self.last_drift) = (t, t);
         }
-        let intermittent = self.intermittent.intersection(seen.active);
+        let intermittent = self.layout.intermittent.intersection(seen.active);
         if intermittent != self.active {
             // A declaration may be a little late, and its end a little early.
             self.counts.contact += self.gathered.observations() + self.pending.observations();
@@ -369,10 +350,10 @@ impl Component {
             self.close(t, known);
             self.block_from = t;
         }
-        let of_sensors = (self.sensors.iter())
+        let of_sensors = (self.layout.sensors.iter())
             .filter_map(|&s| Some((*seen.sensors.get(s)?, ChannelRole::Sensor(s))));
         let base = seen.kinematics.base();
-        let of_joints = (self.dofs[base].iter())
+        let of_joints = (self.layout.dofs[base].iter())
             .filter_map(|dof| Some((*seen.joints.get(dof)?, ChannelRole::Joint(dof))));
         let mut faults = std::iter::once((seen.base, ChannelRole::Base))
             .chain(of_sensors)
@@ -394,7 +375,8 @@ impl Component {
             return;
         }
         self.seen = t;
-        let made = (self.current_rows).make(&self.kinds, stacked, &self.reference, &self.variances);
+        let (columns, reference) = (&self.layout.columns, &self.layout.reference);
+        let made = (self.current_rows).make(columns, stacked, reference, &self.variances);
         if made == 0 {
             self.paused = Paused::Contact;
             self.counts.contact += 1;
@@ -407,6 +389,7 @@ impl Component {
         };
         if self.is_disturbed {
             let tilts = self
+                .layout
                 .carriers
                 .iter()
                 .zip(&mut self.directions)
@@ -425,9 +408,9 @@ impl Component {
     }
 
     /// Whether something moves that its rows depend on.
-    pub(crate) fn is_moved(&self, seen: &Observation<'_>) -> bool {
+    pub(crate) fn is_moved(&self, seen: &OnlineObservation<'_>) -> bool {
         let base = seen.kinematics.base();
-        seen.is_base_moved || !seen.moved.intersection(&self.dofs[base]).is_empty()
+        seen.is_base_moved || !seen.moved.intersection(&self.layout.dofs[base]).is_empty()
     }
 
     /// Ends a block: gate, drift of the offsets, then rows are absorbed or rejected.
@@ -501,7 +484,8 @@ impl Component {
     pub(crate) fn absorb(&mut self) {
         // The rows are finite, and there is room.
         for ((kind, rows), limb) in self
-            .kinds
+            .layout
+            .columns
             .iter()
             .zip(self.pending.iter())
             .zip(&self.limb_of)
@@ -537,7 +521,7 @@ impl Component {
     /// Whether the mean innovation of the gathered block exceeds what noise, the uncertainty of the
     /// solution in use, and the drift of the offsets up to `t` since its data explain.
     pub(crate) fn exceeds_gate(&mut self, known: &ComponentSolution, t: Nanos) -> bool {
-        let unknowns = self.kinds.unknowns();
+        let unknowns = self.layout.columns.unknowns();
         let (offset_count, root_time) = (
             self.offsets.len(),
             (t - known.data).seconds().max(0.0).sqrt(),
@@ -546,14 +530,14 @@ impl Component {
         if known.estimate.len() != unknowns || known.spread.shape() != (unknowns, unknowns) {
             return false;
         }
-        let Scratch {
+        let GateBuffers {
             mean,
             projected,
             covariance,
             innovations,
         } = &mut self.scratch;
         let mut m = 0;
-        for (kind, rows) in self.kinds.iter().zip(self.gathered.iter()) {
+        for (kind, rows) in self.layout.columns.iter().zip(self.gathered.iter()) {
             // The observations of a block have equally many rows with the same meaning: their sum
             // over the root of their number has unit noise.
             let Some(first) = rows.slots().first() else {
@@ -588,7 +572,7 @@ impl Component {
                     walk[channel] = value * self.drift_rates[channel] * root_time;
                 }
                 // U a: the columns of U are [d | s].
-                Arch::new().dispatch(Project {
+                Arch::new().dispatch(RootProjection {
                     root: &known.spread,
                     offset_count,
                     columns: &kind.columns,
@@ -616,7 +600,7 @@ impl Component {
 }
 
 /// `U a` of a row over some unknowns of `[s | d]`, `U` over `[d | s]`.
-pub(crate) struct Project<'a> {
+pub(crate) struct RootProjection<'a> {
     pub(crate) root: &'a DMatrix<f64>,
     pub(crate) offset_count: usize,
     pub(crate) columns: &'a [usize],
@@ -624,7 +608,7 @@ pub(crate) struct Project<'a> {
     pub(crate) to: &'a mut [f64],
 }
 
-impl WithSimd for Project<'_> {
+impl WithSimd for RootProjection<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -658,17 +642,9 @@ pub(crate) fn reordered(column: usize, offset_count: usize, parameters: usize) -
     }
 }
 
-/// Channels with these stated deviations.
-pub(crate) fn channels(stated: &[f64], period: f64) -> Vec<Channel> {
-    stated
-        .iter()
-        .map(|sigma| Channel::new(sigma * sigma, period))
-        .collect()
-}
-
 /// Work space of the gate.
 #[derive(Clone, Debug)]
-pub(crate) struct Scratch {
+pub(crate) struct GateBuffers {
     pub(crate) covariance: Vec<f64>,
     pub(crate) mean: Vec<f64>,
     pub(crate) projected: Vec<f64>,

@@ -3,16 +3,15 @@
 
 use crate::linear::information::{Information, Panel};
 use crate::online::bank::{self, Bank, LATEST, Tick};
-use crate::online::channel::{Channel, Residuals, SecondMean, take_scatters};
-use crate::online::component::{Component, channels};
-use crate::online::parameters::Parameters;
-use crate::online::rows::{self, Kinds, Rows, spread};
+use crate::online::channel::{NoiseTracker, SecondMean, SecondResiduals, take_scatters};
+use crate::online::component::{Component, ComponentLayout};
+use crate::online::parameters::ParameterEstimate;
+use crate::online::rows::{RowBuffer, SubtreeRows, spread};
 use crate::online::selection::{self, ModelSelection};
-use crate::online::solution::{Change, ComponentSolution, SOLVE, Solution};
+use crate::online::solution::{ComponentSolution, DetectedChange, SOLVE, Solution};
 use crate::prior::{Posterior, Prior, PriorError};
 use nalgebra::{DMatrix, DMatrixView, DVector};
 use proprio_dynamics::calibration::UNKNOWN_OFFSET;
-use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::spatial::Wrench;
 use proprio_topics::Nanos;
 use std::sync::Arc;
@@ -45,15 +44,11 @@ pub(crate) const LONGEST: usize = 100_000;
 
 /// A component's part of a job.
 #[derive(Clone, Debug)]
-pub(crate) struct Part {
-    pub(crate) kinds: Arc<Kinds>,
-    pub(crate) links: Vec<usize>,
-    pub(crate) sensors: Vec<usize>,
+pub(crate) struct ComponentJob {
+    pub(crate) layout: Arc<ComponentLayout>,
     pub(crate) information: Information,
-    pub(crate) reference: Vec<f64>,
-    pub(crate) outermost: Vec<usize>,
-    pub(crate) learnt: Rows,
-    pub(crate) rejected_rows: Rows,
+    pub(crate) learnt: RowBuffer,
+    pub(crate) rejected_rows: RowBuffer,
     pub(crate) is_disturbed: bool,
     /// Whether a sensor's offset was forgotten since the solution in use.
     pub(crate) has_new_zero: bool,
@@ -63,7 +58,7 @@ pub(crate) struct Part {
     pub(crate) cosines: Vec<f64>,
     /// Inflated variances of the channels.
     pub(crate) variances: Vec<f64>,
-    pub(crate) channels: Vec<Channel>,
+    pub(crate) channels: Vec<NoiseTracker>,
     /// The sensitivities of the previous second's means to the bodies, a column per channel, and
     /// the parameters used for them.
     pub(crate) before: Option<(DMatrix<f64>, Vec<f64>)>,
@@ -82,8 +77,8 @@ pub(crate) struct Part {
     /// the parameters in use and their candidates.
     pub(crate) estimate: Vec<f64>,
     pub(crate) spread: DMatrix<f64>,
-    pub(crate) newest: Parameters,
-    pub(crate) selection: ModelSelection<Parameters>,
+    pub(crate) newest: ParameterEstimate,
+    pub(crate) selection: ModelSelection<ParameterEstimate>,
     /// Whether the parameters in use must be replaced.
     pub(crate) is_replaced: bool,
     /// The information in the rejected rows, and the time over which they were collected \[s\].
@@ -91,22 +86,22 @@ pub(crate) struct Part {
     pub(crate) rejected_time: f64,
     /// Their slots.
     pub(crate) rejected_slots: Vec<i64>,
-    pub(crate) change: Option<(Change, Information)>,
+    pub(crate) change: Option<(DetectedChange, Information)>,
 }
 
 /// Per block of a tenth of a second: its time and the mean of each channel.
-pub(crate) type Blocks = Vec<(f64, Vec<f64>)>;
+pub(crate) type BlockMeans = Vec<(f64, Vec<f64>)>;
 
 /// The range of observations of some rows.
-pub(crate) struct Span {
+pub(crate) struct SlotRange {
     pub(crate) first: i64,
     pub(crate) count: usize,
 }
 
-impl Span {
+impl SlotRange {
     /// None if there are no rows, or if they have unexplained gaps.
-    pub(crate) fn of<'a>(rows: impl Iterator<Item = &'a Rows>) -> Option<Self> {
-        let ends = |rows: &'a Rows| rows.iter().flat_map(rows::OfKind::slots).copied();
+    pub(crate) fn of<'a>(rows: impl Iterator<Item = &'a RowBuffer>) -> Option<Self> {
+        let ends = |rows: &'a RowBuffer| rows.iter().flat_map(SubtreeRows::slots).copied();
         let (first, last) = rows
             .flat_map(ends)
             .fold((i64::MAX, i64::MIN), |(a, b), slot| {
@@ -123,7 +118,7 @@ impl Span {
     }
 }
 
-impl Part {
+impl ComponentJob {
     pub(crate) fn new(
         component: &Component,
         last_valid: ComponentSolution,
@@ -132,12 +127,8 @@ impl Part {
         relative: f64,
     ) -> Self {
         Self {
-            kinds: component.kinds.clone(),
-            links: component.links.clone(),
-            sensors: component.sensors.clone(),
+            layout: component.layout.clone(),
             information: component.information.clone(),
-            reference: component.reference.clone(),
-            outermost: component.outermost.clone(),
             learnt: component.learnt.clone_room(),
             rejected_rows: component.rejected_rows.clone_room(),
             is_disturbed: false,
@@ -145,10 +136,7 @@ impl Part {
             is_moving: false,
             cosines: component.cosines.clone(),
             variances: component.variances.clone(),
-            channels: channels(
-                &component.least.iter().map(|v| v.sqrt()).collect::<Vec<_>>(),
-                period.seconds(),
-            ),
+            channels: component.layout.trackers(period.seconds()),
             before: None,
             whitened: component.variances.clone(),
             drift_rates: component.drift_rates.clone(),
@@ -159,10 +147,10 @@ impl Part {
             rows: 0,
             estimate: Vec::new(),
             spread: DMatrix::zeros(0, 0),
-            newest: Parameters::default(),
+            newest: ParameterEstimate::default(),
             selection: ModelSelection::new(
                 component.variances.len(),
-                Parameters::of_cad(&last_valid.bodies, relative),
+                ParameterEstimate::of_cad(&last_valid.bodies, relative),
             ),
             is_replaced: false,
             last_valid,
@@ -185,7 +173,10 @@ impl Part {
         let is_replaced = std::mem::take(&mut self.is_replaced);
         self.change = None;
         let weighed = if may_end {
-            self.change = Some((Change::Anew, Information::new(self.information.unknowns())));
+            self.change = Some((
+                DetectedChange::Anew,
+                Information::new(self.information.unknowns()),
+            ));
             self.is_replaced = true;
             Ok(())
         } else {
@@ -216,8 +207,7 @@ impl Part {
 
     /// Solves for the most probable bodies and offsets.
     pub(crate) fn solve(&mut self, prior: &Prior) -> Result<(), PriorError> {
-        let (offset_count, parameters) =
-            (6 * self.sensors.len(), LINK_PARAMETERS * self.links.len());
+        let (offset_count, parameters) = (self.layout.offset_count(), self.layout.parameters());
         let unknowns = offset_count + parameters;
         let posterior = self.posterior(prior, &self.information)?;
         // One iteration of the evidence per second: it converges while data come in. The last
@@ -238,7 +228,7 @@ impl Part {
         self.estimate.extend_from_slice(offsets);
         self.estimate.extend_from_slice(bodies);
         self.spread = fit.covariance_root().transpose();
-        self.newest = Parameters {
+        self.newest = ParameterEstimate {
             change: bodies.to_vec(),
             root: self.spread.columns(0, parameters).into_owned(),
             tau: fit.tau,
@@ -252,10 +242,10 @@ impl Part {
     pub(crate) fn judge_candidates(&mut self) {
         // At rest all parameters predict equally well.
         let is_any = self.learnt.is_moving() && !self.estimate.is_empty();
-        let Some(span) = Span::of([&self.learnt].into_iter()).filter(|_| is_any) else {
+        let Some(span) = SlotRange::of([&self.learnt].into_iter()).filter(|_| is_any) else {
             return;
         };
-        let residuals: Vec<Blocks> = self
+        let residuals: Vec<BlockMeans> = self
             .selection
             .all()
             .map(|own| self.blocks(&span, &own.change))
@@ -265,15 +255,15 @@ impl Part {
                 .take(*t, residuals.iter().map(|own| own[number].1.as_slice()));
         }
         // The parameters in use stay if the mixture fails, which needs numbers that are not finite.
-        let between = |old: &Parameters, new: &Parameters, share| {
-            Parameters::between(old, new, share).unwrap_or_else(|_| old.clone())
+        let between = |old: &ParameterEstimate, new: &ParameterEstimate, share| {
+            ParameterEstimate::between(old, new, share).unwrap_or_else(|_| old.clone())
         };
         self.selection.decide(between);
     }
 
     /// The mean residual of each channel in each block of this second's rows, for these parameters:
     /// time, and per channel.
-    pub(crate) fn blocks(&self, span: &Span, change: &[f64]) -> Blocks {
+    pub(crate) fn blocks(&self, span: &SlotRange, change: &[f64]) -> BlockMeans {
         let offset_count = self.variances.len();
         let unknowns: Vec<f64> = self
             .estimate
@@ -305,7 +295,7 @@ impl Part {
     /// Writes the solution in use: the parameters, the offsets that fit them best, and the
     /// uncertainty of both.
     pub(crate) fn write_solution(&self, solution: &mut ComponentSolution) {
-        let Parameters {
+        let ParameterEstimate {
             change,
             root,
             bodies,
@@ -363,7 +353,7 @@ impl Part {
             *worst = std::array::from_fn(|i| six[i].worst());
         }
         for (place, offset) in solution.offsets.iter_mut().enumerate() {
-            let six = |i: usize| self.reference[6 * place + i] + offsets[6 * place + i];
+            let six = |i: usize| self.layout.reference[6 * place + i] + offsets[6 * place + i];
             *offset = Wrench::from_torque_first(std::array::from_fn(six));
         }
     }
@@ -372,11 +362,11 @@ impl Part {
     /// residuals are mapped back to channels (Gauss, Markov).
     pub(crate) fn update_noise(&mut self) {
         let (offset_count, unknowns) = (self.variances.len(), self.information.unknowns());
-        let mut seconds = vec![Residuals::NONE; offset_count];
+        let mut seconds = vec![SecondResiduals::NONE; offset_count];
         let rows = [&self.learnt, &self.rejected_rows];
         let is_solved =
             self.estimate.len() == unknowns && self.newest.root.ncols() + offset_count == unknowns;
-        let Some(span) = Span::of(rows.into_iter()).filter(|_| is_solved) else {
+        let Some(span) = SlotRange::of(rows.into_iter()).filter(|_| is_solved) else {
             return self.take_seconds(&seconds);
         };
         let observations = span.count;
@@ -435,7 +425,7 @@ impl Part {
                     scatter,
                     is_moving: self.is_moving,
                 });
-                seconds[channel] = Residuals {
+                seconds[channel] = SecondResiduals {
                     mean,
                     scatter,
                     is_likely_noise,
@@ -447,7 +437,7 @@ impl Part {
     }
 
     /// Takes in the residuals of each channel in this second.
-    fn take_seconds(&mut self, seconds: &[Residuals]) {
+    fn take_seconds(&mut self, seconds: &[SecondResiduals]) {
         let sensors = self.channels.chunks_exact_mut(6);
         for (six, seconds) in sensors.zip(seconds.chunks_exact(6)) {
             take_scatters(six, seconds);
@@ -459,8 +449,8 @@ impl Part {
     /// visible part of one unit of its own noise, summed over observations.
     pub(crate) fn series(
         &self,
-        rows: &[&Rows],
-        span: &Span,
+        rows: &[&RowBuffer],
+        span: &SlotRange,
         unknowns: &[f64],
     ) -> (Vec<f64>, Vec<f64>) {
         let offset_count = self.variances.len();
@@ -469,7 +459,7 @@ impl Part {
             vec![0.0; offset_count],
         );
         for rows in rows {
-            for (kind, rows) in self.kinds.iter().zip(rows.iter()) {
+            for (kind, rows) in self.layout.columns.iter().zip(rows.iter()) {
                 for (row, right, slot) in rows.iter() {
                     let residual = kind.residual(row, right, unknowns);
                     let Some(place) = span.place(slot) else {
@@ -491,11 +481,11 @@ impl Part {
 
     /// The sensitivity of each channel's share, summed over observations, to the bodies: its column
     /// of rows^T x weights.
-    pub(crate) fn sensitivities(&self, rows: &[&Rows]) -> DMatrix<f64> {
+    pub(crate) fn sensitivities(&self, rows: &[&RowBuffer]) -> DMatrix<f64> {
         let (offset_count, unknowns) = (self.variances.len(), self.information.unknowns());
         let mut sensitivities = DMatrix::zeros(unknowns - offset_count, offset_count);
         for rows in rows {
-            for (kind, rows) in self.kinds.iter().zip(rows.iter()) {
+            for (kind, rows) in self.layout.columns.iter().zip(rows.iter()) {
                 let (width, count) = (kind.columns.len() + 1, rows.slots().len());
                 let all = DMatrixView::from_slice(rows.values(), width, count);
                 let weights = DMatrix::from_fn(count, kind.offsets, |row, place| {
@@ -538,7 +528,7 @@ impl Part {
             Panel::new(unknowns, self.rejected_rows.len()),
             vec![0.0; unknowns],
         );
-        for (kind, rows) in self.kinds.iter().zip(self.rejected_rows.iter()) {
+        for (kind, rows) in self.layout.columns.iter().zip(self.rejected_rows.iter()) {
             for (row, right, _) in rows.iter() {
                 spread(kind, row, &mut dense);
                 let _ = panel.push_row(&dense, right);
@@ -566,7 +556,11 @@ impl Part {
         }
         let all: Vec<usize> = (0..unknowns).collect();
         let (mut best, mut least) = (None, EXPLAINED * self.rejected_information.rows() as f64);
-        for (change, columns) in [(Change::Offset, &tilted), (Change::Load, &self.outermost)] {
+        let outermost = &self.layout.outermost;
+        for (change, columns) in [
+            (DetectedChange::Offset, &tilted),
+            (DetectedChange::Load, outermost),
+        ] {
             let mut fresh = self.information.clone();
             if columns.is_empty() || fresh.marginalise(columns).is_err() {
                 continue;
@@ -580,10 +574,10 @@ impl Part {
         }
         // A load looks like a steady force, so only its inertia tells it from a push.
         if let Some((change, information)) = best
-            && (change == Change::Load || !is_rather_a_contact(&self.rejected_slots))
+            && (change == DetectedChange::Load || !is_rather_a_contact(&self.rejected_slots))
         {
             // The parameters in use do not include the load; an offset jump does not affect them.
-            self.is_replaced = change == Change::Load;
+            self.is_replaced = change == DetectedChange::Load;
             self.change = Some((change, information));
         }
         // A load that is being picked up fits no hypothesis yet. Unexplained rows are dropped, and
@@ -617,8 +611,7 @@ impl Part {
         prior: &Prior,
         information: &Information,
     ) -> Result<Posterior, PriorError> {
-        let (offset_count, parameters) =
-            (6 * self.sensors.len(), LINK_PARAMETERS * self.links.len());
+        let (offset_count, parameters) = (self.layout.offset_count(), self.layout.parameters());
         let (root, right) = information.to_triangle();
         // [s | d] -> [d | s]
         let order: Vec<usize> = (offset_count..offset_count + parameters)
@@ -629,7 +622,7 @@ impl Part {
             .collect();
         Posterior::new(
             prior,
-            &self.links,
+            &self.layout.links,
             &root.select_columns(&order),
             &right,
             &precision,
@@ -640,10 +633,10 @@ impl Part {
 /// A snapshot of the information, to be solved in any thread. The result depends on the snapshot
 /// alone.
 #[derive(Debug)]
-pub struct Job {
+pub struct SolutionJob {
     pub(crate) prior: Arc<Prior>,
     pub(crate) data: Nanos,
-    pub(crate) parts: Vec<Part>,
+    pub(crate) components: Vec<ComponentJob>,
     pub(crate) solution: Solution,
     pub(crate) bank: Bank,
     /// The first `tick_count` are new.
@@ -651,14 +644,17 @@ pub struct Job {
     pub(crate) tick_count: usize,
 }
 
-impl Job {
+impl SolutionJob {
     /// Solves: prior with its weight by evidence, physical bodies, covariance, noise, changes.
     /// Takes one or two milliseconds for a single limb, a tenth of a second for 426 linked
     /// unknowns, longer if bodies have changed much, and allocates.
     pub fn run(&mut self) {
         self.solution.data = self.data;
-        for (number, (part, solution)) in
-            (self.parts.iter_mut().zip(&mut self.solution.components)).enumerate()
+        for (number, (part, solution)) in (self
+            .components
+            .iter_mut()
+            .zip(&mut self.solution.components))
+        .enumerate()
         {
             let may_end = part.is_disturbed && self.bank.may_have_begun_in_contact(number);
             let (bank, ticks) = (&mut self.bank, &self.ticks[..self.tick_count]);
@@ -671,11 +667,11 @@ impl Job {
     /// Weighs what may be other than stated.
     fn weigh_hypotheses(&mut self) {
         let mut decided = Vec::new();
-        for part in &self.parts {
+        for part in &self.components {
             let mut slots: Vec<i64> = part
                 .learnt
                 .iter()
-                .flat_map(rows::OfKind::slots)
+                .flat_map(SubtreeRows::slots)
                 .copied()
                 .collect();
             slots.sort_unstable();
@@ -684,16 +680,16 @@ impl Job {
         }
         let ticks = &self.ticks[..self.tick_count];
         self.bank.learn(ticks, &decided);
-        for (number, part) in self.parts.iter().enumerate() {
+        for (number, part) in self.components.iter().enumerate() {
             if let Some((change, _)) = part.change {
                 self.bank.forget(number, change);
             } else if part.has_new_zero {
                 // A contact may be there since: that again is to be refuted.
-                self.bank.forget(number, Change::Anew);
+                self.bank.forget(number, DetectedChange::Anew);
             }
         }
-        let those = |is: fn(&Part) -> bool| {
-            let those = (self.parts.iter().enumerate()).filter(|(_, part)| is(part));
+        let those = |is: fn(&ComponentJob) -> bool| {
+            let those = (self.components.iter().enumerate()).filter(|(_, part)| is(part));
             bank::bits(those.map(|(number, _)| number))
         };
         let disturbed = those(|part| part.is_disturbed);
@@ -708,6 +704,6 @@ impl Job {
 
     /// For each component why its solution failed, if it did. The earlier solution stays in use.
     pub fn failures(&self) -> impl Iterator<Item = Option<&PriorError>> {
-        self.parts.iter().map(|part| part.failure.as_ref())
+        self.components.iter().map(|part| part.failure.as_ref())
     }
 }

@@ -8,7 +8,7 @@ use proprio_dynamics::spatial::RigidInertia;
 
 /// A set of parameters: in use, or a candidate.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Parameters {
+pub(crate) struct ParameterEstimate {
     /// `d = phi - phi_CAD`.
     pub(crate) change: Vec<f64>,
     /// A root `U` of their covariance `U^T U`.
@@ -18,7 +18,7 @@ pub(crate) struct Parameters {
     pub(crate) effective: f64,
 }
 
-impl Parameters {
+impl ParameterEstimate {
     /// CAD's parameters, with this relative standard deviation.
     pub(crate) fn of_cad(bodies: &[RigidInertia], relative: f64) -> Self {
         let count = LINK_PARAMETERS * bodies.len();
@@ -38,7 +38,7 @@ impl Parameters {
     }
 }
 
-impl Parameters {
+impl ParameterEstimate {
     /// The mixture of both sets with the weights `1 - k` and `k`, `k = share`: its mean and
     /// covariance.
     ///

@@ -5,11 +5,11 @@
 //! proportional to that.
 
 use crate::arithmetic::{dot, factorise};
-use proprio_dynamics::regressor::StackedRegressor;
+use proprio_dynamics::regressor::{LINK_PARAMETERS, StackedRegressor};
 
 /// The rows of one sub-tree.
 #[derive(Clone, Debug)]
-pub(crate) struct Kind {
+pub(crate) struct SubtreeColumns {
     /// The unknowns of these rows after whitening, ascending: the sub-tree's own, and those of
     /// earlier sub-trees that noise of common sensors links to it.
     pub(crate) columns: Vec<usize>,
@@ -22,7 +22,7 @@ pub(crate) struct Kind {
     within: Vec<Vec<usize>>,
 }
 
-impl Kind {
+impl SubtreeColumns {
     /// The residual of a row for these unknowns, `[s | d]`.
     pub(crate) fn residual(&self, row: &[f64], right: f64, unknowns: &[f64]) -> f64 {
         let own = self.columns.iter().map(|&column| unknowns[column]);
@@ -32,22 +32,37 @@ impl Kind {
 
 /// The kinds of a component's rows, over `[s | d]`.
 #[derive(Clone, Debug)]
-pub(crate) struct Kinds {
-    all: Vec<Kind>,
+pub(crate) struct ComponentColumns {
+    all: Vec<SubtreeColumns>,
     unknowns: usize,
     /// Number of offsets, `s`.
     offset_count: usize,
 }
 
-impl Kinds {
-    /// For these sub-trees, whose regressors have these columns.
+impl ComponentColumns {
+    /// For these sub-trees with these sensors and links.
     pub(crate) fn new(
         stacked: &StackedRegressor,
         subtrees: &[usize],
-        columns: &[Vec<usize>],
-        (offset_count, unknowns): (usize, usize),
+        sensors: &[usize],
+        links: &[usize],
     ) -> Self {
-        let mut all: Vec<Kind> = Vec::new();
+        let offset_count = 6 * sensors.len();
+        let place = |list: &[usize], of: usize| list.binary_search(&of).unwrap_or(0);
+        // The columns of a sub-tree's regressor.
+        let columns = subtrees.iter().map(|&subtree| {
+            let subtree = &stacked.subtrees()[subtree];
+            let of_links = subtree.links().iter().flat_map(|&link| {
+                let first = offset_count + LINK_PARAMETERS * place(links, link);
+                first..first + LINK_PARAMETERS
+            });
+            let of_sensors = subtree.sensors().flat_map(|sensor| {
+                let first = 6 * place(sensors, sensor);
+                first..first + 6
+            });
+            of_links.chain(of_sensors).collect::<Vec<usize>>()
+        });
+        let mut all: Vec<SubtreeColumns> = Vec::new();
         // Linked sub-trees have the number of the last of them.
         let mut group: Vec<usize> = Vec::new();
         for (number, (&subtree, own)) in subtrees.iter().zip(columns).enumerate() {
@@ -70,7 +85,7 @@ impl Kinds {
             let mut joined_columns: Vec<usize> = of_joined
                 .flat_map(|(kind, _)| kind.columns.iter().copied())
                 .collect();
-            joined_columns.extend(own);
+            joined_columns.extend(&own);
             joined_columns.sort_unstable();
             joined_columns.dedup();
             let places = |of: &[usize]| {
@@ -85,13 +100,13 @@ impl Kinds {
                     true => places(&kind.columns),
                     false => Vec::new(),
                 });
-            let kind = Kind {
+            let kind = SubtreeColumns {
                 offsets: joined_columns
                     .iter()
                     .filter(|column| **column < offset_count)
                     .count(),
                 subtree,
-                own: places(own),
+                own: places(&own),
                 within: within.collect(),
                 columns: joined_columns,
             };
@@ -99,12 +114,12 @@ impl Kinds {
         }
         Self {
             all,
-            unknowns,
+            unknowns: offset_count + LINK_PARAMETERS * links.len(),
             offset_count,
         }
     }
 
-    pub(crate) fn iter(&self) -> impl Iterator<Item = &Kind> {
+    pub(crate) fn iter(&self) -> impl Iterator<Item = &SubtreeColumns> {
         self.all.iter()
     }
 
@@ -119,7 +134,7 @@ impl Kinds {
 }
 
 /// Expands a row to all unknowns, without its right side.
-pub(crate) fn spread(kind: &Kind, row: &[f64], to: &mut [f64]) {
+pub(crate) fn spread(kind: &SubtreeColumns, row: &[f64], to: &mut [f64]) {
     to.fill(0.0);
     for (&column, &value) in kind.columns.iter().zip(row) {
         to[column] = value;
@@ -128,7 +143,7 @@ pub(crate) fn spread(kind: &Kind, row: &[f64], to: &mut [f64]) {
 
 /// The rows of one observation; reusable buffers.
 #[derive(Clone, Debug)]
-pub(crate) struct ObservationRows {
+pub(crate) struct WhitenedRows {
     values: Vec<f64>,
     /// Per row its kind, and its start.
     places: Vec<(usize, usize)>,
@@ -138,8 +153,8 @@ pub(crate) struct ObservationRows {
     covariance: Vec<f64>,
 }
 
-impl ObservationRows {
-    pub(crate) fn new(kinds: &Kinds) -> Self {
+impl WhitenedRows {
+    pub(crate) fn new(kinds: &ComponentColumns) -> Self {
         let most = kinds.most();
         Self {
             values: Vec::with_capacity(
@@ -160,7 +175,7 @@ impl ObservationRows {
     /// the variance of each offset's channel. Returns their number.
     pub(crate) fn make(
         &mut self,
-        kinds: &Kinds,
+        kinds: &ComponentColumns,
         stacked: &StackedRegressor,
         reference: &[f64],
         variances: &[f64],
@@ -251,8 +266,8 @@ impl ObservationRows {
 
 /// The rows of several observations.
 #[derive(Clone, Debug)]
-pub(crate) struct Rows {
-    kinds: Vec<OfKind>,
+pub(crate) struct RowBuffer {
+    kinds: Vec<SubtreeRows>,
     observations: u64,
     /// Duration of gathering [s].
     pub(crate) span: f64,
@@ -263,7 +278,7 @@ pub(crate) struct Rows {
 
 /// The rows of one sub-tree.
 #[derive(Clone, Debug)]
-pub(crate) struct OfKind {
+pub(crate) struct SubtreeRows {
     width: usize,
     /// Capacity in rows.
     room: usize,
@@ -272,7 +287,7 @@ pub(crate) struct OfKind {
     slots: Vec<i64>,
 }
 
-impl OfKind {
+impl SubtreeRows {
     /// All rows, each with its right side at its end.
     pub(crate) fn values(&self) -> &[f64] {
         &self.values
@@ -296,12 +311,12 @@ impl OfKind {
     }
 }
 
-impl Rows {
+impl RowBuffer {
     /// With room for this number of observations.
-    pub(crate) fn new(kinds: &Kinds, observations: usize) -> Self {
-        let of_kind = |kind: &Kind| {
+    pub(crate) fn new(kinds: &ComponentColumns, observations: usize) -> Self {
+        let of_kind = |kind: &SubtreeColumns| {
             let (width, room) = (kind.columns.len() + 1, 6 * observations);
-            OfKind {
+            SubtreeRows {
                 width,
                 room,
                 values: Vec::with_capacity(width * room),
@@ -350,7 +365,7 @@ impl Rows {
     }
 
     /// Adds the rows of an observation, as far as there is room.
-    pub(crate) fn push(&mut self, slot: i64, observation: &ObservationRows) {
+    pub(crate) fn push(&mut self, slot: i64, observation: &WhitenedRows) {
         self.observations += u64::from(!observation.places.is_empty());
         for &(kind, start) in &observation.places {
             let kind = &mut self.kinds[kind];
@@ -378,7 +393,7 @@ impl Rows {
     }
 
     /// Kind by kind.
-    pub(crate) fn iter(&self) -> impl Iterator<Item = &OfKind> {
+    pub(crate) fn iter(&self) -> impl Iterator<Item = &SubtreeRows> {
         self.kinds.iter()
     }
 }

@@ -50,13 +50,13 @@ pub(crate) struct ModelSelection<P> {
     /// Time of each block \[s\].
     times: Vec<f64>,
     /// The first is in use; then candidates, the oldest first.
-    candidates: Vec<Candidate<P>>,
+    candidates: Vec<TrialParameters<P>>,
 }
 
 /// Parameters, the first block after their entry, and the residual of each channel in the blocks
 /// since; NaN where the channel was not seen.
 #[derive(Clone, Debug)]
-struct Candidate<P> {
+struct TrialParameters<P> {
     parameters: P,
     first: usize,
     residuals: Vec<f64>,
@@ -77,7 +77,7 @@ impl<P> ModelSelection<P> {
     /// Puts parameters in use without a trial, and removes all candidates.
     pub(crate) fn replace_all(&mut self, parameters: P) {
         self.times.clear();
-        self.candidates = vec![Candidate {
+        self.candidates = vec![TrialParameters {
             parameters,
             first: 0,
             residuals: Vec::new(),
@@ -98,7 +98,8 @@ impl<P> ModelSelection<P> {
 
     /// Adds a candidate, if the last one entered long enough ago.
     pub(crate) fn enter(&mut self, parameters: impl FnOnce() -> P) {
-        let age = |candidate: &Candidate<P>| BLOCK * (self.times.len() - candidate.first) as f64;
+        let age =
+            |candidate: &TrialParameters<P>| BLOCK * (self.times.len() - candidate.first) as f64;
         if self.candidates[1..]
             .last()
             .is_some_and(|last| age(last) < CANDIDATE_INTERVAL)
@@ -116,7 +117,7 @@ impl<P> ModelSelection<P> {
                 .for_each(|place| drop(self.candidates.remove(place)));
         }
         let first = self.times.len();
-        self.candidates.push(Candidate {
+        self.candidates.push(TrialParameters {
             parameters: parameters(),
             first,
             residuals: Vec::new(),
@@ -148,7 +149,7 @@ impl<P> ModelSelection<P> {
                 }
             }
         }
-        let is_old = |candidate: &Candidate<P>, end: usize| {
+        let is_old = |candidate: &TrialParameters<P>, end: usize| {
             BLOCK * (end - candidate.first) as f64 > MAX_MOTION
         };
         let (end, mut place) = (self.times.len(), 0);

@@ -35,7 +35,7 @@ pub enum OnlineError {
 
 /// The observed quantities at one time.
 #[derive(Clone, Copy, Debug)]
-pub struct Observation<'a> {
+pub struct OnlineObservation<'a> {
     /// Time; later than that of the last observation.
     pub t: Nanos,
     /// Poses and motions of all links.
@@ -131,7 +131,7 @@ impl std::fmt::Display for Paused {
 /// A change that was found, and its consequence.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum Change {
+pub enum DetectedChange {
     /// The sensors' offsets have jumped, and are re-initialised.
     Offset,
     /// The load of the outermost links has changed, and their parameters are re-initialised.
@@ -140,7 +140,7 @@ pub enum Change {
     Anew,
 }
 
-impl std::fmt::Display for Change {
+impl std::fmt::Display for DetectedChange {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
             Self::Offset => "an F/T offset has jumped: offsets are re-initialised",
@@ -154,7 +154,7 @@ impl std::fmt::Display for Change {
 
 /// Counts of a component's observations.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Counts {
+pub struct ObservationCounts {
     /// Absorbed observations.
     pub learnt: u64,
     /// Absorbed observations of blocks without motion: they determine a weight once, and offsets.

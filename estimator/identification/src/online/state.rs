@@ -17,12 +17,12 @@
 //! prior twice. It depends on the calibration of the sensors: with a gain 7 % higher everything
 //! would have been 7 % heavier.
 
-use proprio_dynamics::regressor::LINK_PARAMETERS;
 use std::fmt::Write as _;
 
 use crate::linear::information::{Information, Panel};
 use crate::online::Online;
-use crate::online::job::{Job, Part};
+use crate::online::component::ComponentLayout;
+use crate::online::job::{ComponentJob, SolutionJob};
 use proprio_dynamics::Structure;
 use proprio_dynamics::calibration::Calibration;
 
@@ -94,18 +94,13 @@ fn hash(bytes: impl Iterator<Item = u8>) -> u64 {
     })
 }
 
-fn model(parts: &[Part]) -> String {
-    let of = |part: &Part| {
-        let numbers = part
-            .links
-            .iter()
-            .chain(&part.sensors)
-            .map(|number| *number as u64);
-        let cad = part
-            .reference
-            .iter()
-            .skip(6 * part.sensors.len())
-            .map(|x| x.to_bits());
+fn model(parts: &[ComponentJob]) -> String {
+    let of = |part: &ComponentJob| {
+        let layout = &part.layout;
+        let numbers = layout.links.iter().chain(&layout.sensors);
+        let numbers = numbers.map(|number| *number as u64);
+        let cad = layout.reference.iter().skip(layout.offset_count());
+        let cad = cad.map(|x| x.to_bits());
         numbers
             .chain(cad)
             .flat_map(u64::to_le_bytes)
@@ -139,15 +134,15 @@ fn numbers(line: Option<&str>, word: &str, count: usize) -> Result<Vec<f64>, Sta
     Ok(numbers)
 }
 
-impl Job {
+impl SolutionJob {
     /// The state at the job's snapshot as text, for [`Online::resume`].
     #[must_use]
     pub fn state(&self, robot: &str, sensors: &SensorFingerprint) -> String {
-        let (model, sensors) = (model(&self.parts), &sensors.0);
+        let (model, sensors) = (model(&self.components), &sensors.0);
         let mut text =
             format!("{TITLE} {SCHEMA}\nrobot {robot}\nmodel {model}\nsensors {sensors}\n");
-        for part in &self.parts {
-            let parameters = part.information.trailing(6 * part.sensors.len());
+        for part in &self.components {
+            let parameters = part.information.trailing(part.layout.offset_count());
             let _ = write!(text, "component {}", parameters.unknowns());
             let is_learnt = part.selection.in_use().effective > 0.0;
             put(
@@ -166,8 +161,71 @@ impl Job {
     }
 }
 
+/// What a state holds of a component.
+struct SavedComponent {
+    tau: f64,
+    is_learnt: bool,
+    variances: Vec<f64>,
+    information: Information,
+}
+
+impl SavedComponent {
+    /// Reads the lines of a component with this layout.
+    fn read<'a>(
+        lines: &mut impl Iterator<Item = &'a str>,
+        layout: &ComponentLayout,
+    ) -> Result<Self, StateError> {
+        let (offset_count, parameters) = (layout.offset_count(), layout.parameters());
+        let [tau, is_learnt] = numbers(lines.next(), &format!("component {parameters}"), 2)?[..]
+        else {
+            return Err(StateError::Damaged("the weight is missing"));
+        };
+        let variances = numbers(lines.next(), "noise", offset_count)?;
+        let mut information = Information::new(offset_count + parameters);
+        let mut panel = Panel::new(offset_count + parameters, parameters);
+        for k in 0..parameters {
+            let from = numbers(lines.next(), "row", parameters - k + 1)?;
+            let (a, z) = from.split_at(parameters - k);
+            let mut row = vec![0.0; offset_count + k];
+            row.extend_from_slice(a);
+            let pushed = panel.push_row(&row, z.iter().sum());
+            pushed.map_err(|_| StateError::Damaged("a number is too large"))?;
+        }
+        // Both have the same unknowns.
+        let _ = information.absorb(&mut panel);
+        if !(tau > 0.0 && variances.iter().all(|v| *v > 0.0)) {
+            return Err(StateError::Damaged("a variance is not positive"));
+        }
+        Ok(Self {
+            tau,
+            is_learnt: is_learnt > 0.0,
+            variances,
+            information,
+        })
+    }
+}
+
+/// The lines after the title of an undamaged state.
+fn checked(text: &str) -> Result<std::str::Lines<'_>, StateError> {
+    let mut lines = text.lines();
+    let title = lines.next().and_then(|line| line.strip_prefix(TITLE));
+    match title.map(str::trim) {
+        Some(SCHEMA) => {}
+        Some(schema) if !schema.is_empty() => {
+            return Err(StateError::Schema(schema.to_owned()));
+        }
+        _ => return Err(StateError::Damaged("wrong title")),
+    }
+    let (body, sum) = text.trim_end().rsplit_once("\nsum ").unwrap_or((text, ""));
+    let own = hash(body.bytes().chain([b'\n']));
+    if u64::from_str_radix(sum, 16) != Ok(own) {
+        return Err(StateError::Damaged("wrong checksum"));
+    }
+    Ok(lines)
+}
+
 impl Online {
-    /// Resumes a state of [`Job::state`], before the first observation. A solution is in use at
+    /// Resumes a state of [`SolutionJob::state`], before the first observation. A solution is in use at
     /// once, with unknown offsets. Solves, and allocates.
     ///
     /// # Errors
@@ -181,23 +239,10 @@ impl Online {
         let Some(job) = &mut self.job else {
             return Err(StateError::Damaged("a job is running"));
         };
-        let mut lines = text.lines();
-        let title = lines.next().and_then(|line| line.strip_prefix(TITLE));
-        match title.map(str::trim) {
-            Some(SCHEMA) => {}
-            Some(schema) if !schema.is_empty() => {
-                return Err(StateError::Schema(schema.to_owned()));
-            }
-            _ => return Err(StateError::Damaged("wrong title")),
-        }
-        let (body, sum) = text.trim_end().rsplit_once("\nsum ").unwrap_or((text, ""));
-        let own = hash(body.bytes().chain([b'\n']));
-        if u64::from_str_radix(sum, 16) != Ok(own) {
-            return Err(StateError::Damaged("wrong checksum"));
-        }
+        let mut lines = checked(text)?;
         for (word, what, expected) in [
             ("robot", "robot", robot.to_owned()),
-            ("model", "model", model(&job.parts)),
+            ("model", "model", model(&job.components)),
             ("sensors", SENSORS, sensors.0.clone()),
         ] {
             let found = lines
@@ -215,47 +260,22 @@ impl Online {
                 });
             }
         }
-        let mut read = Vec::new();
-        for part in &job.parts {
-            let (offset_count, parameters) =
-                (6 * part.sensors.len(), LINK_PARAMETERS * part.links.len());
-            let [tau, is_learnt] =
-                numbers(lines.next(), &format!("component {parameters}"), 2)?[..]
-            else {
-                return Err(StateError::Damaged("the weight is missing"));
-            };
-            let variances = numbers(lines.next(), "noise", offset_count)?;
-            let mut information = Information::new(offset_count + parameters);
-            let mut panel = Panel::new(offset_count + parameters, parameters);
-            for k in 0..parameters {
-                let from = numbers(lines.next(), "row", parameters - k + 1)?;
-                let (a, z) = from.split_at(parameters - k);
-                let mut row = vec![0.0; offset_count + k];
-                row.extend_from_slice(a);
-                let pushed = panel.push_row(&row, z.iter().sum());
-                pushed.map_err(|_| StateError::Damaged("a number is too large"))?;
-            }
-            // Both have the same unknowns.
-            let _ = information.absorb(&mut panel);
-            if !(tau > 0.0 && variances.iter().all(|v| *v > 0.0)) {
-                return Err(StateError::Damaged("a variance is not positive"));
-            }
-            read.push(((tau, is_learnt > 0.0), variances, information));
-        }
-        for ((part, component), ((tau, is_learnt), variances, information)) in
-            job.parts.iter_mut().zip(&mut self.components).zip(read)
-        {
-            part.tau = tau;
-            part.is_replaced = is_learnt;
-            part.variances.copy_from_slice(&variances);
-            component.variances = variances;
-            let _ = part.information.copy_from(&information);
-            component.information = information;
+        let saved = (job.components.iter())
+            .map(|part| SavedComponent::read(&mut lines, &part.layout))
+            .collect::<Result<Vec<_>, _>>()?;
+        let components = job.components.iter_mut().zip(&mut self.components);
+        for ((part, component), saved) in components.zip(saved) {
+            part.tau = saved.tau;
+            part.is_replaced = saved.is_learnt;
+            part.variances.copy_from_slice(&saved.variances);
+            component.variances = saved.variances;
+            let _ = part.information.copy_from(&saved.information);
+            component.information = saved.information;
         }
         job.run();
         for ((own, found), part) in (self.solution.components.iter_mut())
             .zip(&job.solution.components)
-            .zip(&job.parts)
+            .zip(&job.components)
         {
             if part.failure.is_none() {
                 own.clone_from(found);

@@ -3,7 +3,7 @@
 
 mod newton;
 
-use crate::prior::posterior::newton::{Chart, Descent, Newton, State, block};
+use crate::prior::posterior::newton::{Chart, Descent, Iterate, Newton, block};
 use nalgebra::{DMatrix, DVector, Matrix4};
 
 use crate::linear::blocked;
@@ -163,7 +163,7 @@ impl Posterior {
     ///
     /// # Errors
     /// `tau` is not positive, or an extra parameter without prior is not determined.
-    pub fn fit(&self, tau: f64) -> Result<Fit, PriorError> {
+    pub fn fit(&self, tau: f64) -> Result<MapEstimate, PriorError> {
         if !(tau.is_finite() && tau > 0.0) {
             return Err(PriorError::Number {
                 what: "the scale tau",
@@ -176,11 +176,16 @@ impl Posterior {
         Ok(self.finish(state, end, tau))
     }
 
-    /// As [`Posterior::fit`], starting from a guess in the form of [`Fit::x`], down to this squared
+    /// As [`Posterior::fit`], starting from a guess in the form of [`MapEstimate::x`], down to this squared
     /// Newton decrement. The cost may exceed its minimum by half of the decrement; at one standard
     /// deviation it exceeds it by one half. Starts from CAD if the guess is not physical, or a step
     /// from it leaves the feasible set.
-    pub(crate) fn fit_from(&self, x: &[f64], tau: f64, decrement: f64) -> Result<Fit, PriorError> {
+    pub(crate) fn fit_from(
+        &self,
+        x: &[f64],
+        tau: f64,
+        decrement: f64,
+    ) -> Result<MapEstimate, PriorError> {
         if !(tau.is_finite() && tau > 0.0) {
             return self.fit(tau);
         }
@@ -212,12 +217,12 @@ impl Posterior {
         Some(u)
     }
 
-    /// The fit for the weight that the data choose: iterates [`Fit::next_tau`] from
+    /// The fit for the weight that the data choose: iterates [`MapEstimate::next_tau`] from
     /// [`GREATEST_TAU`] to convergence.
     ///
     /// # Errors
     /// As for [`Posterior::fit`].
-    pub fn maximise_evidence(&self) -> Result<Fit, PriorError> {
+    pub fn maximise_evidence(&self) -> Result<MapEstimate, PriorError> {
         let mut fit = self.fit(GREATEST_TAU)?;
         for _ in 0..100 {
             let tau = fit.next_tau();
@@ -232,8 +237,8 @@ impl Posterior {
         Ok(fit)
     }
 
-    pub(crate) fn start(&self) -> State {
-        State {
+    pub(crate) fn start(&self) -> Iterate {
+        Iterate {
             chart: self.chart.clone(),
             y: DVector::zeros(self.chart.scale.len()),
             centred: Some(f64::INFINITY),
@@ -249,7 +254,7 @@ impl Posterior {
     /// CAD's, a Newton step to CAD overshoots at any weight. So such a guess is replaced by CAD.
     pub(crate) fn descend(
         &self,
-        state: &mut State,
+        state: &mut Iterate,
         weight: f64,
         tolerance: f64,
     ) -> Result<Descent, PriorError> {
@@ -301,7 +306,7 @@ impl Posterior {
     }
 
     /// A Newton step from the state. The state's chart is rebuilt first if it is strained.
-    fn newton(&self, state: &mut State, weight: f64) -> Result<Newton, PriorError> {
+    fn newton(&self, state: &mut Iterate, weight: f64) -> Result<Newton, PriorError> {
         let (links, count) = (self.centres.len(), self.data.ncols());
         let mut u = state.chart.coordinates(&state.y);
         if state.chart.is_strained(&u) {
@@ -381,7 +386,7 @@ impl Posterior {
     }
 
     /// Rebuilds the chart about the state.
-    fn move_chart(&self, state: &mut State, u: &DVector<f64>) {
+    fn move_chart(&self, state: &mut Iterate, u: &DVector<f64>) {
         let chart = &state.chart;
         let links = self.centres.len();
         let mut local = self.data.clone();
@@ -403,8 +408,8 @@ impl Posterior {
         state.y.fill(0.0);
     }
 
-    pub(crate) fn finish(&self, state: State, descent: Descent, tau: f64) -> Fit {
-        let State { chart, y, .. } = state;
+    pub(crate) fn finish(&self, state: Iterate, descent: Descent, tau: f64) -> MapEstimate {
+        let Iterate { chart, y, .. } = state;
         let u = chart.coordinates(&y);
         let links = self.centres.len();
         let mut x = DVector::zeros(u.len());
@@ -446,7 +451,7 @@ impl Posterior {
         let residual_square = self.residual_square + chart.excess(&y);
         let centres = self.centres.iter().zip(&chart.stretch);
         let maps = centres.map(|(centre, l)| centre.parameters * congruence(l));
-        Fit {
+        MapEstimate {
             x,
             bodies,
             tau,
@@ -470,7 +475,7 @@ impl Posterior {
 /// Unknowns are in the order of the columns of [`Posterior::new`]. The posterior is Gaussian to
 /// second order about this maximum (Laplace), with the curvature that the prior has there.
 #[derive(Clone, Debug)]
-pub struct Fit {
+pub struct MapEstimate {
     /// `[d | s]`: parameters minus CAD as given [kg, kg m, kg m^2], ten per link; the extra
     /// parameters.
     pub x: DVector<f64>,
@@ -501,7 +506,7 @@ pub struct Fit {
     inverse: DMatrix<f64>,
 }
 
-impl Fit {
+impl MapEstimate {
     /// One iteration of the evidence: the weight for which this divergence, of this number of
     /// parameters, is the expected one (see [The weight](super#the-weight)). At most
     /// [`GREATEST_TAU`].

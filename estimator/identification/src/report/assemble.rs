@@ -4,13 +4,15 @@
 use crate::finding::{Finding, FindingCode};
 use crate::fit::{Identified, per_column};
 use crate::measurement::model::MeasurementModel;
+use crate::measurement::unknowns::Unknowns;
 use crate::report::calibration::{calibrations, channels};
+use crate::report::comparison::Judged;
 use crate::report::log::log_outcome;
 use crate::report::outcome::both;
 use crate::report::outcome::{
     CovarianceRoot, LogOutcome, Outcome, Predicted, TimeOffset, Verdict, WeakDirection,
 };
-use crate::report::prediction::{self, Candidate};
+use crate::report::prediction::{self, JudgedParameters};
 use crate::report::uncertainty::{
     base_parameters, cad_root, covariance, expression, links, rotors, rotors_not_separable,
     scaled_information, shrunk, subspace, unseen,
@@ -102,28 +104,8 @@ pub(crate) fn outcome(
         let (r, _) = identified.information.to_triangle();
         shrunk(&narrow, &cad_root(unknowns, &r, &spread), &kept)
     };
-    let svd = scaled.svd(false, true);
-    let mut order: Vec<usize> = (0..svd.singular_values.len()).collect();
-    order.sort_by(|&a, &b| svd.singular_values[b].total_cmp(&svd.singular_values[a]));
-    let singular: Vec<f64> = order.iter().map(|&i| svd.singular_values[i]).collect();
-    let greatest = singular.first().copied().unwrap_or(0.0);
-    let rank = singular
-        .iter()
-        .filter(|s| **s > 1e-8 * greatest && greatest > 0.0)
-        .count();
+    let spectrum = Spectrum::new(robot, unknowns, scaled, &spread);
     let subspace = subspace(robot, training, identified);
-    let directions = svd.v_t.unwrap_or_else(|| DMatrix::zeros(0, p));
-    let weakest = order[..rank].iter().rev().take(5).map(|&i| {
-        let direction = directions.row(i).transpose();
-        let value = svd.singular_values[i];
-        let (expression, links) = expression(robot, unknowns, &spread, &direction);
-        WeakDirection {
-            expression,
-            links,
-            relative: value / greatest,
-            prior_share: 1.0 / (1.0 + value * value),
-        }
-    });
     let (base_parameters, mut not_separable, structural_rank) =
         base_parameters(robot, identified, &root, subspace.as_ref());
     let sums = rotors_not_separable(robot, identified, &spread);
@@ -150,13 +132,19 @@ pub(crate) fn outcome(
     let sets = [identified.cad.clone(), identified.d.clone()];
     let instants = training.iter().flat_map(|log| &log.instants);
     let friction = prediction::friction(&measurement, instants, &sets);
-    let candidates = [0, 1].map(|set| Candidate {
+    let candidates = [0, 1].map(|set| JudgedParameters {
         course: vec![(Nanos::ZERO, sets[set].clone())],
         friction: friction[set].clone(),
     });
+    let judged = Judged {
+        identified,
+        sets,
+        candidates,
+        root: &root,
+    };
     let logs = logs
         .iter()
-        .map(|log| log_outcome(&mut measurement, log, identified, &sets, &candidates, &root))
+        .map(|log| log_outcome(&mut measurement, log, &judged))
         .collect();
     Outcome {
         robot: robot.name.clone(),
@@ -171,22 +159,72 @@ pub(crate) fn outcome(
         rotors: rotors(robot, identified, &root),
         calibrations,
         unknowns: p,
-        rank,
+        rank: spectrum.rank,
         structural_rank,
         effective: identified.fit.effective,
-        condition: if rank > 0 {
-            greatest / singular[rank - 1]
-        } else {
-            f64::NAN
-        },
-        singular_values: singular,
-        weakest: weakest.collect(),
+        condition: spectrum.condition(),
+        singular_values: spectrum.singular_values,
+        weakest: spectrum.weakest,
         not_separable,
         base_parameters,
         channels: channels(robot, identified, training),
         time_offsets,
         logs,
         findings,
+    }
+}
+
+/// What the logs tell of the links' parameters in units of the prior's spread.
+struct Spectrum {
+    /// Descending.
+    singular_values: Vec<f64>,
+    rank: usize,
+    weakest: Vec<WeakDirection>,
+}
+
+impl Spectrum {
+    /// Most weak directions that are named.
+    const WEAKEST: usize = 5;
+
+    fn new(
+        robot: &Robot,
+        unknowns: &Unknowns,
+        scaled: DMatrix<f64>,
+        spread: &[DMatrix<f64>],
+    ) -> Self {
+        let svd = scaled.svd(false, true);
+        let mut order: Vec<usize> = (0..svd.singular_values.len()).collect();
+        order.sort_by(|&a, &b| svd.singular_values[b].total_cmp(&svd.singular_values[a]));
+        let singular_values: Vec<f64> = order.iter().map(|&i| svd.singular_values[i]).collect();
+        let greatest = singular_values.first().copied().unwrap_or(0.0);
+        let is_seen = |s: &&f64| **s > 1e-8 * greatest && greatest > 0.0;
+        let rank = singular_values.iter().filter(is_seen).count();
+        let directions = svd
+            .v_t
+            .unwrap_or_else(|| DMatrix::zeros(0, unknowns.inertial()));
+        let weakest = order[..rank].iter().rev().take(Self::WEAKEST).map(|&i| {
+            let direction = directions.row(i).transpose();
+            let value = svd.singular_values[i];
+            let (expression, links) = expression(robot, unknowns, spread, &direction);
+            WeakDirection {
+                expression,
+                links,
+                relative: value / greatest,
+                prior_share: 1.0 / (1.0 + value * value),
+            }
+        });
+        Self {
+            weakest: weakest.collect(),
+            singular_values,
+            rank,
+        }
+    }
+
+    fn condition(&self) -> f64 {
+        match self.rank.checked_sub(1) {
+            Some(last) => self.singular_values[0] / self.singular_values[last],
+            None => f64::NAN,
+        }
     }
 }
 

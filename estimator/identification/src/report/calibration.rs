@@ -9,7 +9,7 @@ use crate::report::outcome::{CalibrationOutcome, ChannelNoise};
 use crate::robot::{AXES, Robot};
 use crate::training::TrainingLog;
 use nalgebra::{DMatrix, Matrix6};
-use proprio_dynamics::calibration::{Gain, Kind, Unknown, swapped};
+use proprio_dynamics::calibration::{Calibration, Gain, Kind, Unknown, swapped};
 use proprio_dynamics::spatial::Wrench;
 
 /// Posterior over prior standard deviation above which a parameter counts as not excited.
@@ -25,147 +25,186 @@ pub(crate) fn calibrations(
     identified: &Identified,
     root: &DMatrix<f64>,
 ) -> (Vec<CalibrationOutcome>, Vec<Finding>) {
-    let unknowns = &identified.unknowns;
     let (mut outcomes, mut findings) = (Vec::new(), Vec::new());
     if identified.calibrated.is_empty() {
         return (outcomes, findings);
     }
-    let precision = &unknowns.precision;
-    for &sensor in &unknowns.sensors {
-        let name = sensor_name(robot, sensor);
-        let own: Vec<(usize, Unknown, f64)> = (unknowns
-            .extra
-            .iter()
-            .zip(unknowns.inertial()..)
-            .zip(precision))
-        .filter_map(|((extra, column), precision)| match *extra {
-            ExtraParameter::Calibration(other, unknown) if other == sensor => {
-                Some((column, unknown, precision.sqrt().recip()))
-            }
-            _ => None,
-        })
-        .collect();
-        let (mut e, mut kelvin) = (Matrix6::zeros(), [0.0; 6]);
-        for (column, unknown, _) in &own {
-            match *unknown {
-                Unknown::Gain { channel, of } => e[(channel, of)] = identified.d[*column],
-                Unknown::Temperature { channel } => kelvin[channel] = identified.d[*column],
-            }
-        }
-        let is_gain = |unknown: &Unknown| matches!(unknown, Unknown::Gain { .. });
-        let kind = Kind {
-            gain: if own.iter().any(|(_, unknown, _)| is_gain(unknown)) {
-                identified.calibrated.gain
-            } else {
-                Gain::None
-            },
-            temperature: own.iter().any(|(_, unknown, _)| !is_gain(unknown)),
-        };
-        if robot.calibrated.temperature && !kind.temperature {
+    for &sensor in &identified.unknowns.sensors {
+        let own = SensorErrors::new(robot, identified, root, sensor);
+        if robot.calibrated.temperature && !own.kind.temperature {
+            let name = &own.name;
             findings.push(Finding::warning(
                 FindingCode::NoTemperature,
-                &name,
+                name,
                 format!(
                     "{name}: its temperature coefficients are not identified: no log has its \
                      temperature (column wrench/{name}/temperature), or it never changed"
                 ),
             ));
         }
-        if kind.is_empty() {
+        if own.kind.is_empty() {
             continue;
         }
-        let more = Wrench::from_torque_first(kelvin);
-        let reference = measurement.reference(sensor).filter(|_| kind.temperature);
-        let deviation: Vec<f64> = own
-            .iter()
-            .map(|(column, ..)| root.row(*column).norm())
-            .collect();
-        let prior: Vec<f64> = own.iter().map(|(.., prior)| *prior).collect();
-        // Parameters that the logs hardly excite, with the axes' names of samples.
-        let mut not_excited: Vec<String> = Vec::new();
-        for ((_, unknown, prior), deviation) in own.iter().zip(&deviation) {
-            let word = |channel: usize| AXES[swapped(channel)];
-            if *deviation > NOT_EXCITED * prior {
-                not_excited.push(match *unknown {
-                    Unknown::Gain { channel, of } if channel == of => {
-                        format!("the gain of {}", word(channel))
-                    }
-                    Unknown::Gain { channel, of } => format!("{} of {}", word(channel), word(of)),
-                    Unknown::Temperature { channel } => format!("{} by temperature", word(channel)),
-                });
-            }
-        }
-        if !not_excited.is_empty() {
-            let (count, more) = (
-                not_excited.len(),
-                if not_excited.len() > MAX_NAMED {
-                    ", ..."
-                } else {
-                    ""
-                },
-            );
-            not_excited.truncate(MAX_NAMED);
-            findings.push(Finding::note(
-                FindingCode::CalibrationNotObservable,
-                &name,
-                format!(
-                    "{name}: {} of the {} calibration parameters are not excited by the motion and \
-                     stay close to the factory calibration: {}. Record motion that loads these \
-                     channels more",
-                    count,
-                    own.len(),
-                    not_excited.join(", ") + more
-                ),
-            ));
-        }
-        // A common gain of all forces is not separable from a common scale of all masses beyond.
-        let is_force_gain = |unknown: &Unknown| match unknown {
-            Unknown::Gain { channel, of } => channel == of && *channel >= 3,
-            Unknown::Temperature { .. } => false,
-        };
-        let forces = own.iter().filter(|(_, unknown, _)| is_force_gain(unknown));
-        let forces: Vec<usize> = forces.map(|(column, ..)| *column).collect();
-        if forces.len() == 3 {
-            let common: f64 = forces
-                .iter()
-                .map(|&column| identified.d[column])
-                .sum::<f64>()
-                / 3.0;
-            let sum = forces.iter().map(|&column| root.row(column).into_owned());
-            let spread = sum
-                .reduce(|a, b| a + b)
-                .map_or(f64::NAN, |sum| sum.norm() / 3.0);
-            let before = robot.gain_std / 3.0_f64.sqrt();
-            if spread > 0.5 * before {
-                findings.push(Finding::note(
-                    FindingCode::GainMassNotSeparable,
-                    &name,
-                    format!(
-                        "{name}: the common gain of its forces, {:+.1} +- {:.1} %, is not \
-                         separable from the masses beyond it; only the priors decide between them \
-                         (identification.gain_std for the factory calibration, the estimated \
-                         error of CAD for the masses). Hang a known mass on the sensor, or weigh a \
-                         link and correct the URDF",
-                        100.0 * common,
-                        100.0 * spread
-                    ),
-                ));
-            }
-        }
-        outcomes.push(CalibrationOutcome {
-            sensor: name,
-            configured: robot.calibrations[sensor],
-            identified: robot.calibrations[sensor].then(&e, &more, reference),
-            kind,
-            error: own
-                .iter()
-                .map(|(column, ..)| identified.d[*column])
-                .collect(),
-            deviation,
-            prior,
-        });
+        findings.extend(own.not_excited());
+        findings.extend(own.not_separable(robot, root));
+        let reference = measurement.reference(sensor);
+        let configured = robot.calibrations[sensor];
+        outcomes.push(own.outcome(configured, reference));
     }
     (outcomes, findings)
+}
+
+/// An error of a sensor's calibration.
+struct CalibrationError {
+    column: usize,
+    unknown: Unknown,
+    value: f64,
+    deviation: f64,
+    /// Its deviation before any log.
+    prior: f64,
+}
+
+impl CalibrationError {
+    fn is_gain(&self) -> bool {
+        matches!(self.unknown, Unknown::Gain { .. })
+    }
+
+    /// Whether it is the gain of a force by itself.
+    fn is_force_gain(&self) -> bool {
+        matches!(self.unknown, Unknown::Gain { channel, of } if channel == of && channel >= 3)
+    }
+
+    /// In words, with the axes' names of samples.
+    fn describe(&self) -> String {
+        let word = |channel: usize| AXES[swapped(channel)];
+        match self.unknown {
+            Unknown::Gain { channel, of } if channel == of => {
+                format!("the gain of {}", word(channel))
+            }
+            Unknown::Gain { channel, of } => format!("{} of {}", word(channel), word(of)),
+            Unknown::Temperature { channel } => format!("{} by temperature", word(channel)),
+        }
+    }
+}
+
+/// The identified errors of one sensor's calibration.
+struct SensorErrors {
+    name: String,
+    kind: Kind,
+    errors: Vec<CalibrationError>,
+}
+
+impl SensorErrors {
+    fn new(robot: &Robot, identified: &Identified, root: &DMatrix<f64>, sensor: usize) -> Self {
+        let unknowns = &identified.unknowns;
+        let extra = unknowns.extra.iter().zip(unknowns.inertial()..);
+        let errors: Vec<CalibrationError> = (extra.zip(&unknowns.precision))
+            .filter_map(|((extra, column), precision)| match *extra {
+                ExtraParameter::Calibration(other, unknown) if other == sensor => {
+                    Some(CalibrationError {
+                        column,
+                        unknown,
+                        value: identified.d[column],
+                        deviation: root.row(column).norm(),
+                        prior: precision.sqrt().recip(),
+                    })
+                }
+                _ => None,
+            })
+            .collect();
+        let kind = Kind {
+            gain: if errors.iter().any(CalibrationError::is_gain) {
+                identified.calibrated.gain
+            } else {
+                Gain::None
+            },
+            temperature: !errors.iter().all(CalibrationError::is_gain),
+        };
+        Self {
+            name: sensor_name(robot, sensor),
+            kind,
+            errors,
+        }
+    }
+
+    /// A note of the parameters that the logs hardly excite.
+    fn not_excited(&self) -> Option<Finding> {
+        let is_weak = |own: &&CalibrationError| own.deviation > NOT_EXCITED * own.prior;
+        let weak: Vec<&CalibrationError> = self.errors.iter().filter(is_weak).collect();
+        if weak.is_empty() {
+            return None;
+        }
+        let named = weak.iter().take(MAX_NAMED).map(|own| own.describe());
+        let more = if weak.len() > MAX_NAMED { ", ..." } else { "" };
+        let name = &self.name;
+        Some(Finding::note(
+            FindingCode::CalibrationNotObservable,
+            name,
+            format!(
+                "{name}: {} of the {} calibration parameters are not excited by the motion and \
+                 stay close to the factory calibration: {}. Record motion that loads these \
+                 channels more",
+                weak.len(),
+                self.errors.len(),
+                named.collect::<Vec<_>>().join(", ") + more
+            ),
+        ))
+    }
+
+    /// A note if a common gain of all forces is not separable from a common scale of all masses
+    /// beyond.
+    fn not_separable(&self, robot: &Robot, root: &DMatrix<f64>) -> Option<Finding> {
+        let forces = self.errors.iter().filter(|own| own.is_force_gain());
+        let forces: Vec<&CalibrationError> = forces.collect();
+        if forces.len() != 3 {
+            return None;
+        }
+        let common: f64 = forces.iter().map(|own| own.value).sum::<f64>() / 3.0;
+        let rows = forces.iter().map(|own| root.row(own.column).into_owned());
+        let spread = rows
+            .reduce(|a, b| a + b)
+            .map_or(f64::NAN, |sum| sum.norm() / 3.0);
+        let before = robot.gain_std / 3.0_f64.sqrt();
+        let name = &self.name;
+        (spread > 0.5 * before).then(|| {
+            Finding::note(
+                FindingCode::GainMassNotSeparable,
+                name,
+                format!(
+                    "{name}: the common gain of its forces, {:+.1} +- {:.1} %, is not separable \
+                     from the masses beyond it; only the priors decide between them \
+                     (identification.gain_std for the factory calibration, the estimated error of \
+                     CAD for the masses). Hang a known mass on the sensor, or weigh a link and \
+                     correct the URDF",
+                    100.0 * common,
+                    100.0 * spread
+                ),
+            )
+        })
+    }
+
+    /// `reference`: the temperature at which the sensor is as configured.
+    fn outcome(self, configured: Calibration, reference: Option<f64>) -> CalibrationOutcome {
+        let (mut gain, mut per_kelvin) = (Matrix6::zeros(), [0.0; 6]);
+        for own in &self.errors {
+            match own.unknown {
+                Unknown::Gain { channel, of } => gain[(channel, of)] = own.value,
+                Unknown::Temperature { channel } => per_kelvin[channel] = own.value,
+            }
+        }
+        let per_kelvin = Wrench::from_torque_first(per_kelvin);
+        let reference = reference.filter(|_| self.kind.temperature);
+        let each = |value: fn(&CalibrationError) -> f64| self.errors.iter().map(value).collect();
+        CalibrationOutcome {
+            configured,
+            identified: configured.then(&gain, &per_kelvin, reference),
+            kind: self.kind,
+            error: each(|own| own.value),
+            deviation: each(|own| own.deviation),
+            prior: each(|own| own.prior),
+            sensor: self.name,
+        }
+    }
 }
 
 pub(crate) fn channels(

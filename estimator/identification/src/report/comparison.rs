@@ -1,27 +1,44 @@
 //! Residuals of a log's readings with CAD, with CAD and fitted offsets, and with the identified
 //! parameters.
 
-use crate::arithmetic::dot;
 use crate::dataset::observation::Annotated;
 use crate::fit::Identified;
-use crate::linear::nuisance::Block;
+use crate::linear::nuisance::NuisanceEstimate;
 use crate::measurement::channels::{attribute_to, channel_of};
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::{OFFSET_VARIANCE, Residuals};
-use crate::measurement::rows::Rows;
+use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::Unknowns;
 use crate::parallel;
 use crate::report::outcome::ModelComparison;
+use crate::report::prediction::JudgedParameters;
 use crate::robot::Robot;
 use nalgebra::{DMatrix, DVector};
 
 /// A joint that moves by less is still \[rad\].
 pub(crate) const STILL: f64 = 0.01;
 
-/// A degree of freedom; the residuals of its torque with CAD, with CAD and friction fitted to the
-/// log, with identified parameters and friction fitted, with CAD and the training logs' friction,
-/// with identified parameters and the training logs' friction; the measured torque.
-pub(crate) type TorqueSeries = (usize, [Vec<f64>; 5], Vec<f64>);
+/// What a log is compared with: two sets of parameters.
+pub(crate) struct Judged<'a> {
+    pub identified: &'a Identified,
+    /// CAD, the identified parameters.
+    pub sets: [DVector<f64>; 2],
+    /// The same with the friction of the training logs.
+    pub candidates: [JudgedParameters; 2],
+    /// A root of the identified parameters' covariance.
+    pub root: &'a DMatrix<f64>,
+}
+
+/// A measured torque and its residuals.
+pub(crate) struct TorqueSeries {
+    /// The degree of freedom.
+    pub dof: usize,
+    /// The residuals with CAD, with CAD and friction fitted to the log, with identified parameters
+    /// and friction fitted, with CAD and the training logs' friction, with identified parameters
+    /// and the training logs' friction.
+    pub errors: [Vec<f64>; 5],
+    pub measured: Vec<f64>,
+}
 
 /// An offset with this variance or more has not been observed.
 pub(crate) const UNREAD: f64 = 0.9 * OFFSET_VARIANCE;
@@ -42,7 +59,7 @@ pub(crate) fn three<T: Copy>(values: [T; 3]) -> ModelComparison<T> {
 pub(crate) fn cases<'a>(
     sets: &'a [DVector<f64>; 2],
     configured: &'a [f64],
-    block: &'a Block,
+    block: &'a NuisanceEstimate,
 ) -> [(&'a DVector<f64>, &'a [f64]); 3] {
     let (fitted, own) = block.x.as_slice().split_at(block.x.nrows());
     [(&sets[0], configured), (&sets[0], fitted), (&sets[1], own)]
@@ -55,7 +72,7 @@ pub(crate) fn cases<'a>(
 /// ([`Residuals`]). For a comparison, no part of a sensor's error may be attributed to another one:
 /// the whole residual is attributed to the compared sensor ([`attribute_to`]). Of two sensors with
 /// a link between them, each is compared with the other.
-pub(crate) struct Compared {
+pub(crate) struct SensorComparison {
     /// Per channel and instant: the reading less its fitted offset; NaN where there is no
     /// prediction.
     pub load: Vec<Vec<f64>>,
@@ -67,7 +84,7 @@ pub(crate) struct Compared {
     pub rows: Vec<Vec<usize>>,
 }
 
-impl Compared {
+impl SensorComparison {
     /// `sets`: CAD, the identified parameters; `left`: of these two.
     pub(crate) fn new(
         measurement: &MeasurementModel<'_>,
@@ -85,7 +102,7 @@ impl Compared {
         let mut held = vec![vec![0; instants.len()]; unknowns.sensors.len()];
         let parts = parallel::map_with(
             residuals.ranges.len().div_ceil(BLOCKS_PER_TASK),
-            || (measurement.clone(), Rows::new(&unknowns)),
+            || (measurement.clone(), MeasurementRows::new(&unknowns)),
             |(measurement, rows), part| {
                 let blocks = part * BLOCKS_PER_TASK
                     ..residuals.ranges.len().min((part + 1) * BLOCKS_PER_TASK);
@@ -104,7 +121,7 @@ impl Compared {
                         }
                         let residuals = cases.map(|(d, s)| {
                             DVector::from_fn(rows.count, |row, _| {
-                                rows.r(row) - dot(rows.a(row), d.as_slice()) - dot(rows.g(row), s)
+                                rows.residual(row, d.as_slice(), s)
                             })
                         });
                         for (place, &sensor) in unknowns.sensors.iter().enumerate() {
@@ -189,7 +206,7 @@ pub(crate) fn predicted_deviations(
     root: &DMatrix<f64>,
 ) -> Vec<f64> {
     let unknowns = measurement.unknowns().clone();
-    let mut rows = Rows::new(&unknowns);
+    let mut rows = MeasurementRows::new(&unknowns);
     let mut out = vec![f64::NAN; unknowns.channels()];
     if measurement.make(instant, &mut rows).is_err() {
         return out;

@@ -1,13 +1,11 @@
 //! Curves of readings and predictions for a report.
 
 use crate::dataset::observation::Annotated;
-use crate::fit::Identified;
 use crate::measurement::channels::{channel_of, sensor_name};
 use crate::measurement::model::MeasurementModel;
-use crate::report::comparison::{Compared, TorqueSeries, predicted_deviations};
+use crate::report::comparison::{Judged, SensorComparison, TorqueSeries, predicted_deviations};
 use crate::report::outcome::Curve;
 use crate::robot::AXES;
-use nalgebra::DMatrix;
 
 /// Most points of a curve.
 pub(crate) const POINTS: usize = 2000;
@@ -22,10 +20,9 @@ pub(crate) fn curves(
     measurement: &mut MeasurementModel<'_>,
     instants: &[Annotated],
     times: &[f64],
-    compared: &Compared,
-    identified: &Identified,
-    root: &DMatrix<f64>,
+    compared: &SensorComparison,
     torques: &[TorqueSeries],
+    judged: &Judged<'_>,
 ) -> Vec<Curve> {
     let robot = measurement.robot();
     let unknowns = measurement.unknowns().clone();
@@ -38,6 +35,7 @@ pub(crate) fn curves(
     let mut deviations: Vec<Vec<f64>> = Vec::new();
     for (number, &i) in points.iter().enumerate() {
         if number % 10 == 0 {
+            let (identified, root) = (judged.identified, judged.root);
             deviations.push(predicted_deviations(
                 measurement,
                 &instants[i],
@@ -55,7 +53,12 @@ pub(crate) fn curves(
     let pick =
         |values: &dyn Fn(usize) -> f64| points.iter().map(|&i| values(i)).collect::<Vec<f64>>();
     let mut out = Vec::new();
-    for (dof, errors, measured) in torques {
+    for TorqueSeries {
+        dof,
+        errors,
+        measured,
+    } in torques
+    {
         let place = unknowns.joints.binary_search(dof).ok();
         out.push(Curve {
             name: robot.model.dof_name(*dof).to_owned(),

@@ -6,18 +6,18 @@ use crate::finding::{Finding, FindingCode};
 use crate::fit::Identified;
 use crate::measurement::channels::{channel_of, sensor_name};
 use crate::measurement::model::MeasurementModel;
-use crate::measurement::reduction::{Residuals, Segment, reduce, residuals};
-use crate::measurement::rows::Rows;
+use crate::measurement::reduction::{LogSegment, Residuals, reduce, residuals};
+use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::{FRICTION, Unknowns, friction_row};
 use crate::report::comparison::{
-    Compared, STILL, TorqueSeries, cases, configured_nuisance, covered, three,
+    Judged, STILL, SensorComparison, TorqueSeries, cases, configured_nuisance, covered, three,
 };
 use crate::report::curves::{curves, mean};
 use crate::report::outcome::{
     FrictionOutcome, JointOutcome, LogOutcome, OffsetOutcome, Predicted, SensorOutcome,
     TwoRouteOutcome, both,
 };
-use crate::report::prediction::{Candidate, PredictionError};
+use crate::report::prediction::PredictionError;
 use crate::robot::{AXES, Robot};
 use crate::training::{MIN_FOLD, TrainingLog};
 use nalgebra::{DMatrix, DVector};
@@ -27,6 +27,23 @@ use proprio_topics::Nanos;
 /// Time at both ends of a log that is not used to compare torques, because derivatives are less
 /// certain there \[s\].
 const EDGE: f64 = 0.3;
+
+impl TorqueSeries {
+    /// The same without both ends of the log; `times` since its first stamp.
+    fn inner(&self, times: &[f64]) -> Self {
+        let ends = times.first().zip(times.last());
+        let is_inner = |t: f64| ends.is_some_and(|(a, b)| (a + EDGE..=b - EDGE).contains(&t));
+        let keep = |values: &Vec<f64>| {
+            let inner = values.iter().zip(times).filter(|(_, t)| is_inner(**t));
+            inner.map(|(x, _)| *x).collect()
+        };
+        Self {
+            dof: self.dof,
+            errors: self.errors.each_ref().map(keep),
+            measured: keep(&self.measured),
+        }
+    }
+}
 
 /// Residuals of a joint's torque with the friction of the training logs for one set of parameters,
 /// instead of the friction fitted to the log.
@@ -56,31 +73,29 @@ pub(crate) fn with_friction_of_training(
 pub(crate) fn log_outcome(
     measurement: &mut MeasurementModel<'_>,
     log: &TrainingLog,
-    identified: &Identified,
-    sets: &[DVector<f64>; 2],
-    candidates: &[Candidate; 2],
-    root: &DMatrix<f64>,
+    judged: &Judged<'_>,
 ) -> LogOutcome {
+    let Judged {
+        identified,
+        sets,
+        root,
+        ..
+    } = judged;
     let robot = measurement.robot();
     let unknowns = &identified.unknowns;
     let usable = !log.instants.is_empty() && !log.refused;
     let instants = if usable { log.instants.as_slice() } else { &[] };
-    let residuals = residuals(
-        measurement,
-        Segment {
-            instants,
-            log: None,
-        },
-        &identified.noise,
-        sets,
-    );
+    let segment = LogSegment {
+        instants,
+        log: None,
+    };
+    let residuals = residuals(measurement, segment, &identified.noise, sets);
     let times: Vec<f64> = instants
         .iter()
         .map(|i| (i.t - log.span.0).seconds())
         .collect();
     let wrenches = 6 * unknowns.sensors.len();
-    let compared = Compared::new(measurement, instants, &residuals, identified, sets);
-    let undisturbed = undisturbed(measurement, log, identified, sets);
+    let compared = SensorComparison::new(measurement, instants, &residuals, identified, sets);
     let torques = residuals.noise[1].iter().skip(wrenches);
     let errors: Vec<&[f64]> = compared.errors[2]
         .iter()
@@ -88,117 +103,113 @@ pub(crate) fn log_outcome(
         .map(Vec::as_slice)
         .collect();
     let coverage = covered(measurement, instants, &errors, identified, root);
-
     // Torques: an input of the identification, or a reference for F/T sensors.
-    let mut joints = Vec::new();
-    let mut torques_predicted = Vec::new();
-    let mut torque_series: Vec<TorqueSeries> = Vec::new();
-    if unknowns.joints.is_empty() {
-        let dofs = robot.model.dof_count();
-        let mut errors = [vec![Vec::new(); dofs], vec![Vec::new(); dofs]];
-        if instants
-            .iter()
-            .any(|i| i.torque.iter().any(|x| x.is_finite()))
-        {
-            for (set, errors) in sets.iter().zip(&mut errors) {
-                for instant in instants {
-                    let row = measurement
-                        .torque_errors(instant, set.as_slice())
-                        .unwrap_or_else(|_| vec![f64::NAN; dofs]);
-                    errors.iter_mut().zip(row).for_each(|(e, x)| e.push(x));
-                }
-            }
-            for (dof, cad) in errors[0].iter().enumerate() {
-                if cad.iter().any(|x| x.is_finite()) {
-                    let measured = instants.iter().map(|i| i.torque[dof]).collect();
-                    let own = errors[1][dof].clone();
-                    let series = [cad.clone(), cad.clone(), own.clone(), cad.clone(), own];
-                    torque_series.push((dof, series, measured));
-                }
-            }
-        }
+    let torques = if unknowns.joints.is_empty() {
+        reference_torques(measurement, instants, sets)
     } else {
-        for (place, &dof) in unknowns.joints.iter().enumerate() {
-            let channel = wrenches + place;
-            let measured: Vec<f64> = instants.iter().map(|i| i.torque[dof]).collect();
-            let raw = residuals.measured[channel]
-                .iter()
-                .zip(&residuals.predicted[channel])
-                .map(|(m, p)| m - p)
-                .collect();
-            let [cad, own] = [0, 1].map(|set| {
-                with_friction_of_training(
-                    unknowns,
-                    instants,
-                    &residuals,
-                    (set, &candidates[set].friction),
-                    place,
-                )
-            });
-            let [cad_fitted, own_fitted] = [0, 1].map(|set| residuals.noise[set][channel].clone());
-            torque_series.push((dof, [raw, cad_fitted, own_fitted, cad, own], measured));
-        }
-    }
-    let ends = times.first().zip(times.last());
-    let is_inner = |t: f64| ends.is_some_and(|(a, b)| (a + EDGE..=b - EDGE).contains(&t));
-    let keep = |values: &[f64]| -> Vec<f64> {
-        let inner = values.iter().zip(&times).filter(|(_, t)| is_inner(**t));
-        inner.map(|(x, _)| *x).collect()
+        input_torques(instants, &residuals, judged)
     };
-    let mut torque_share = Vec::new();
-    for (dof, errors, measured) in &torque_series {
-        let errors = errors.each_ref().map(|errors| keep(errors));
-        let measured = keep(measured);
-        let [cad, fitted, own, ..] = &errors;
-        let place = unknowns.joints.binary_search(dof).ok();
-        let of_training = both([3, 4].map(|set| rms(errors[set].iter().copied())));
-        torques_predicted.push((robot.model.dof_name(*dof).to_owned(), of_training));
-        joints.push(JointOutcome {
-            name: robot.model.dof_name(*dof).to_owned(),
-            rms_nm: three([cad, fitted, own].map(|x| rms(x.iter().copied()))),
-            measured_rms_nm: rms(measured.iter().copied()),
-            coverage: place.map_or(f64::NAN, |place| coverage[wrenches + place]),
+    let inner: Vec<TorqueSeries> = torques.iter().map(|own| own.inner(&times)).collect();
+    let undisturbed = undisturbed(measurement, log, identified, sets);
+    let findings = unknowns
+        .sensors
+        .iter()
+        .enumerate()
+        .filter_map(|(place, &sensor)| {
+            unexplained(
+                robot,
+                sensor,
+                undisturbed.as_ref().unwrap_or(&compared),
+                place,
+            )
         });
-        torque_share.push((errors, measured));
+    let deviations = nuisance_deviations(measurement, instants, identified, root);
+    LogOutcome {
+        file: log.file.clone(),
+        role: log.role,
+        span: log.span,
+        used: instants.len() as u64,
+        excluded: log.excluded.clone(),
+        onset: onset(instants),
+        predicted: predicted(robot, instants, judged, &inner),
+        joints: joint_outcomes(robot, unknowns, &inner, &coverage),
+        sensors: sensor_outcomes(robot, unknowns, &compared, &coverage),
+        two_route: two_route(measurement, instants, &residuals, sets),
+        offsets: offsets(robot, unknowns, identified, &residuals, &deviations),
+        friction: friction(robot, unknowns, &residuals, &deviations),
+        findings: log.findings.iter().cloned().chain(findings).collect(),
+        curves: curves(measurement, instants, &times, &compared, &torques, judged),
     }
+}
 
-    let mut sensors = Vec::new();
-    let mut findings = Vec::new();
-    for (place, &sensor) in unknowns.sensors.iter().enumerate() {
-        let name = sensor_name(robot, sensor);
-        let mut values = [[f64::NAN; 6]; 3];
-        findings.extend(unexplained(
-            robot,
-            sensor,
-            &name,
-            undisturbed.as_ref().unwrap_or(&compared),
-            place,
-        ));
-        for axis in 0..6 {
-            let channel = channel_of(place, axis);
-            let errors = compared.errors.each_ref().map(|set| &set[channel]);
-            for (value, errors) in values.iter_mut().zip(errors) {
-                value[axis] = rms(errors.iter().copied());
-            }
-        }
-        sensors.push(SensorOutcome {
-            name,
-            rms: three(values),
-            coverage: std::array::from_fn(|axis| coverage[channel_of(place, axis)]),
-        });
+/// Residuals of torques that nothing is identified from: no friction is fitted to them.
+fn reference_torques(
+    measurement: &mut MeasurementModel<'_>,
+    instants: &[Annotated],
+    sets: &[DVector<f64>; 2],
+) -> Vec<TorqueSeries> {
+    let dofs = measurement.robot().model.dof_count();
+    let is_measured = |i: &Annotated| i.torque.iter().any(|x| x.is_finite());
+    if !instants.iter().any(is_measured) {
+        return Vec::new();
     }
-    let relative = |set: usize| {
-        let (mut above, mut below) = (0.0, 0.0);
-        for (errors, measured) in &torque_share {
-            for (e, m) in errors[set].iter().zip(measured) {
-                if e.is_finite() && m.is_finite() {
-                    above += e * e;
-                    below += m * m;
-                }
-            }
+    let mut errors = [vec![Vec::new(); dofs], vec![Vec::new(); dofs]];
+    for (set, errors) in sets.iter().zip(&mut errors) {
+        for instant in instants {
+            let row = measurement
+                .torque_errors(instant, set.as_slice())
+                .unwrap_or_else(|_| vec![f64::NAN; dofs]);
+            errors.iter_mut().zip(row).for_each(|(e, x)| e.push(x));
         }
-        (above / below).sqrt()
+    }
+    let [cad, own] = errors;
+    let pairs = cad.into_iter().zip(own).enumerate();
+    let compared = pairs.filter(|(_, (cad, _))| cad.iter().any(|x| x.is_finite()));
+    compared
+        .map(|(dof, (cad, own))| TorqueSeries {
+            dof,
+            errors: [cad.clone(), cad.clone(), own.clone(), cad, own],
+            measured: instants.iter().map(|i| i.torque[dof]).collect(),
+        })
+        .collect()
+}
+
+/// Residuals of torques that are an input of the identification.
+fn input_torques(
+    instants: &[Annotated],
+    residuals: &Residuals,
+    judged: &Judged<'_>,
+) -> Vec<TorqueSeries> {
+    let unknowns = &judged.identified.unknowns;
+    let series = |(place, &dof): (usize, &usize)| {
+        let channel = 6 * unknowns.sensors.len() + place;
+        let raw = residuals.measured[channel]
+            .iter()
+            .zip(&residuals.predicted[channel])
+            .map(|(m, p)| m - p)
+            .collect();
+        let [cad, own] = [0, 1].map(|set| {
+            let friction = (set, judged.candidates[set].friction.as_slice());
+            with_friction_of_training(unknowns, instants, residuals, friction, place)
+        });
+        let [cad_fitted, own_fitted] = [0, 1].map(|set| residuals.noise[set][channel].clone());
+        TorqueSeries {
+            dof,
+            errors: [raw, cad_fitted, own_fitted, cad, own],
+            measured: instants.iter().map(|i| i.torque[dof]).collect(),
+        }
     };
+    unknowns.joints.iter().enumerate().map(series).collect()
+}
+
+/// The prediction errors by which parameters are judged; `torques` without the ends of the log.
+fn predicted(
+    robot: &Robot,
+    instants: &[Annotated],
+    judged: &Judged<'_>,
+    torques: &[TorqueSeries],
+) -> Predicted {
+    let identified = judged.identified;
     let prediction_error = PredictionError::of_record(
         robot,
         &identified.inputs,
@@ -208,37 +219,68 @@ pub(crate) fn log_outcome(
     // No error is expected: rows of the same instants were computed before.
     let mut predicted = prediction_error.map_or_else(
         |_| Predicted::default(),
-        |prediction_error| prediction_error.predicted(unknowns, candidates),
+        |errors| errors.predicted(&identified.unknowns, &judged.candidates),
     );
-    predicted.joints = torques_predicted;
-    if !torque_share.is_empty() {
+    let of_joint = |own: &TorqueSeries| {
+        let of_training = both([3, 4].map(|set| rms(own.errors[set].iter().copied())));
+        (robot.model.dof_name(own.dof).to_owned(), of_training)
+    };
+    predicted.joints = torques.iter().map(of_joint).collect();
+    let relative = |set: usize| {
+        let (mut above, mut below) = (0.0, 0.0);
+        for TorqueSeries {
+            errors, measured, ..
+        } in torques
+        {
+            for (e, m) in errors[set].iter().zip(measured) {
+                if e.is_finite() && m.is_finite() {
+                    above += e * e;
+                    below += m * m;
+                }
+            }
+        }
+        (above / below).sqrt()
+    };
+    if !torques.is_empty() {
         predicted.relative_error = both([3, 4].map(relative));
     }
-    let deviations = nuisance_deviations(measurement, instants, identified, root);
-    LogOutcome {
-        file: log.file.clone(),
-        role: log.role,
-        span: log.span,
-        used: instants.len() as u64,
-        excluded: log.excluded.clone(),
-        onset: onset(instants),
-        predicted,
-        joints,
-        sensors,
-        two_route: two_route(measurement, instants, &residuals, sets),
-        offsets: offsets(robot, unknowns, identified, &residuals, &deviations),
-        friction: friction(robot, unknowns, &residuals, &deviations),
-        findings: log.findings.iter().cloned().chain(findings).collect(),
-        curves: curves(
-            measurement,
-            instants,
-            &times,
-            &compared,
-            identified,
-            root,
-            &torque_series,
-        ),
-    }
+    predicted
+}
+
+/// The figures of each torque, without the ends of the log.
+fn joint_outcomes(
+    robot: &Robot,
+    unknowns: &Unknowns,
+    torques: &[TorqueSeries],
+    coverage: &[f64],
+) -> Vec<JointOutcome> {
+    let outcome = |own: &TorqueSeries| {
+        let place = unknowns.joints.binary_search(&own.dof).ok();
+        let channel = place.map(|place| 6 * unknowns.sensors.len() + place);
+        JointOutcome {
+            name: robot.model.dof_name(own.dof).to_owned(),
+            rms_nm: three([0, 1, 2].map(|set| rms(own.errors[set].iter().copied()))),
+            measured_rms_nm: rms(own.measured.iter().copied()),
+            coverage: channel.map_or(f64::NAN, |channel| coverage[channel]),
+        }
+    };
+    torques.iter().map(outcome).collect()
+}
+
+fn sensor_outcomes(
+    robot: &Robot,
+    unknowns: &Unknowns,
+    compared: &SensorComparison,
+    coverage: &[f64],
+) -> Vec<SensorOutcome> {
+    let outcome = |(place, &sensor): (usize, &usize)| SensorOutcome {
+        name: sensor_name(robot, sensor),
+        rms: three(compared.errors.each_ref().map(|errors| {
+            std::array::from_fn(|axis| rms(errors[channel_of(place, axis)].iter().copied()))
+        })),
+        coverage: std::array::from_fn(|axis| coverage[channel_of(place, axis)]),
+    };
+    unknowns.sensors.iter().enumerate().map(outcome).collect()
 }
 
 /// A validation log compared as a training log: without undeclared disturbances and their effect on
@@ -248,7 +290,7 @@ pub(crate) fn undisturbed(
     log: &TrainingLog,
     identified: &Identified,
     sets: &[DVector<f64>; 2],
-) -> Option<Compared> {
+) -> Option<SensorComparison> {
     if log.disturbed.iter().all(UnitSet::is_empty) {
         return None;
     }
@@ -256,12 +298,12 @@ pub(crate) fn undisturbed(
     for (instant, units) in instants.iter_mut().zip(&log.disturbed) {
         instant.disturbed = *units;
     }
-    let segment = Segment {
+    let segment = LogSegment {
         instants: &instants,
         log: None,
     };
     let residuals = residuals(measurement, segment, &identified.noise, sets);
-    Some(Compared::new(
+    Some(SensorComparison::new(
         measurement,
         &instants,
         &residuals,
@@ -279,8 +321,7 @@ pub(crate) fn undisturbed(
 pub(crate) fn unexplained(
     robot: &Robot,
     sensor: usize,
-    name: &str,
-    compared: &Compared,
+    compared: &SensorComparison,
     place: usize,
 ) -> Option<Finding> {
     /// Residuals above this multiple of the stated noise are reported ...
@@ -336,7 +377,7 @@ pub(crate) fn unexplained(
     if axes.is_empty() {
         return None;
     }
-    let share = (residual / all).sqrt();
+    let (share, name) = ((residual / all).sqrt(), sensor_name(robot, sensor));
     let hint = if opposite.is_empty() {
         String::new()
     } else {
@@ -384,7 +425,7 @@ pub(crate) fn two_route(
     let dofs = robot.model.dof_count();
     let configured = configured_nuisance(robot, &unknowns);
     let mut series = vec![[const { Vec::new() }; 3]; dofs];
-    let mut rows = Rows::new(&unknowns);
+    let mut rows = MeasurementRows::new(&unknowns);
     for (range, block) in residuals.ranges.iter().zip(&residuals.nuisance) {
         let cases = cases(sets, &configured, block);
         for instant in &instants[range.clone()] {
@@ -393,16 +434,10 @@ pub(crate) fn two_route(
             }
             for (dof, along) in measurement.two_routes(&rows) {
                 for (series, (d, nuisance)) in series[dof].iter_mut().zip(cases) {
-                    let residuals = |row: usize| {
-                        rows.r(row) - dot(rows.a(row), d.as_slice()) - dot(rows.g(row), nuisance)
-                    };
-                    series.push(
-                        along
-                            .iter()
-                            .enumerate()
-                            .map(|(row, weight)| weight * residuals(row))
-                            .sum(),
-                    );
+                    let weights = along.iter().enumerate();
+                    let terms = weights
+                        .map(|(row, weight)| weight * rows.residual(row, d.as_slice(), nuisance));
+                    series.push(terms.sum());
                 }
             }
         }
@@ -430,7 +465,7 @@ pub(crate) fn nuisance_deviations(
 ) -> Vec<f64> {
     // From the last instants only: an offset drifts, and a filter that starts there without prior
     // knowledge overestimates the uncertainty.
-    let segment = Segment {
+    let segment = LogSegment {
         instants: &instants[instants
             .len()
             .saturating_sub(crate::training::SEGMENT_INSTANTS)..],
@@ -512,12 +547,12 @@ mod tests {
             .collect();
         load[instants..].fill(f64::NAN);
         let error = load.iter().map(|load| 0.1 * load).collect();
-        let compared = Compared {
+        let compared = SensorComparison {
             rows: vec![vec![6; load.len()]],
             load: vec![load; 6],
             errors: [Vec::new(), Vec::new(), vec![error; 6]],
         };
-        unexplained(&robot, 0, "ft", &compared, 0)
+        unexplained(&robot, 0, &compared, 0)
     }
 
     #[test]

@@ -7,7 +7,7 @@
 //! logs, `[fx fy fz tx ty tz]` [N, Nm]; ten parameters of a link are `[m, h_x, h_y, h_z, I_xx,
 //! I_xy, I_xz, I_yy, I_yz, I_zz]` about its origin ([`proprio_dynamics::spatial`]).
 
-use crate::dataset::Role;
+use crate::dataset::LogRole;
 use crate::finding::Finding;
 use crate::training::Excluded;
 use nalgebra::DMatrix;
@@ -346,7 +346,7 @@ pub struct LogOutcome {
     /// Its file name.
     pub file: String,
     /// Its role: training or validation.
-    pub role: Role,
+    pub role: LogRole,
     /// First and last stamp.
     pub span: (Nanos, Nanos),
     /// Observations used.

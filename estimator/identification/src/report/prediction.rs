@@ -23,7 +23,7 @@ use crate::dataset::observation::{Annotated, Observation};
 use crate::measurement::channels::{attribute_to, channel_of, sensor_name};
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::OFFSET_VARIANCE;
-use crate::measurement::rows::Rows;
+use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::{ExtraParameter, FRICTION, Unknowns};
 use crate::parallel;
 use crate::report::outcome::{Both, InForce, Predicted, both};
@@ -43,7 +43,7 @@ const BATCH: usize = 256;
 
 /// Parameters to be judged, with their friction.
 #[derive(Clone, Debug)]
-pub(crate) struct Candidate {
+pub(crate) struct JudgedParameters {
     /// Parameters less CAD's, in the columns of a layout, with the instant from which they are
     /// used.
     pub course: Vec<(Nanos, DVector<f64>)>,
@@ -53,7 +53,7 @@ pub(crate) struct Candidate {
 
 /// Residuals of a candidate in a log, at the used instants; NaN where there is no prediction.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Errors {
+pub(crate) struct PredictionErrors {
     /// Per channel of the layout, readings with constant offsets, and torques.
     pub channels: Vec<Vec<f64>>,
     /// Per F/T channel, with linear drifts; empty if not requested.
@@ -64,7 +64,7 @@ pub(crate) struct Errors {
 
 /// Which offsets are fitted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Free {
+pub(crate) enum FittedOffsets {
     Constants,
     /// Once constants only, once with linear drifts.
     WithDrifts,
@@ -77,23 +77,23 @@ pub(crate) struct PredictionError<'a> {
 }
 
 /// The candidates in the columns of the log's own layout.
-struct Plan {
+struct JudgedSets {
     /// All parameters that any of them uses at any time.
-    sets: Vec<Set>,
+    sets: Vec<ParameterSet>,
     /// Distinct gains: per sensor, the matrix from errors of the wrench to errors of the reading.
     gains: Vec<Vec<Matrix6<f64>>>,
-    courses: Vec<Course>,
+    courses: Vec<ParameterCourse>,
 }
 
 /// The parameters that a candidate uses over time.
-struct Course {
+struct ParameterCourse {
     /// Number of the set used from each instant on.
     sets: Vec<(Nanos, usize)>,
     /// Of each joint.
     friction: Vec<[f64; FRICTION]>,
 }
 
-struct Set {
+struct ParameterSet {
     d: DVector<f64>,
     /// Number of its gains.
     gains: usize,
@@ -138,7 +138,7 @@ pub fn predicted(
     let own = course
         .iter()
         .map(|in_force| (in_force.since, beside(cad, &unknowns, in_force)));
-    let candidates = [of_cad, own.collect()].map(|course| Candidate {
+    let candidates = [of_cad, own.collect()].map(|course| JudgedParameters {
         course,
         friction: Vec::new(),
     });
@@ -183,8 +183,8 @@ fn beside(cad: &Robot, unknowns: &Unknowns, in_force: &InForce) -> DVector<f64> 
 }
 
 /// One comparison at an instant.
-struct Comparison {
-    of: Of,
+struct ComparedRow {
+    of: ComparedQuantity,
     /// Residual of each set, without offsets.
     residuals: Vec<f64>,
     /// Coefficients of the offsets, for each of the distinct gains.
@@ -193,7 +193,7 @@ struct Comparison {
 
 /// What is compared.
 #[derive(Clone, Copy)]
-enum Of {
+enum ComparedQuantity {
     Channel(usize),
     Route(usize),
 }
@@ -234,9 +234,13 @@ impl<'a> PredictionError<'a> {
     }
 
     /// The figures of F/T readings; none of joint torques.
-    pub(crate) fn predicted(&self, unknowns: &Unknowns, candidates: &[Candidate; 2]) -> Predicted {
+    pub(crate) fn predicted(
+        &self,
+        unknowns: &Unknowns,
+        candidates: &[JudgedParameters; 2],
+    ) -> Predicted {
         let robot = self.measurement.robot();
-        let errors = self.errors(unknowns, candidates, Free::WithDrifts);
+        let errors = self.errors(unknowns, candidates, FittedOffsets::WithDrifts);
         let unknowns = self.unknowns();
         let (mut squares, mut all) = ([[0.0; 2]; 2], 0.0);
         for channel in 0..6 * unknowns.sensors.len() {
@@ -251,7 +255,7 @@ impl<'a> PredictionError<'a> {
             all += weighted(&self.load(channel, &errors[0]));
         }
         let relative = |which: usize| both(squares.map(|of| (of[which] / all).sqrt()));
-        let series = |of: &dyn Fn(&Errors) -> f64| both([of(&errors[0]), of(&errors[1])]);
+        let series = |of: &dyn Fn(&PredictionErrors) -> f64| both([of(&errors[0]), of(&errors[1])]);
         let of_channel =
             |channel: usize| series(&|errors| rms(errors.channels[channel].iter().copied()));
         let of_sensor = |place: usize| {
@@ -275,7 +279,7 @@ impl<'a> PredictionError<'a> {
     }
 
     /// Readings of a channel of F/T sensors, less their mean over the log, where errors are known.
-    pub(crate) fn load(&self, channel: usize, errors: &Errors) -> Vec<f64> {
+    pub(crate) fn load(&self, channel: usize, errors: &PredictionErrors) -> Vec<f64> {
         let sensor = self.unknowns().sensors[channel / 6];
         let pairs = self.instants.iter().zip(&errors.channels[channel]);
         let read = pairs.filter(|(_, error)| error.is_finite());
@@ -290,15 +294,19 @@ impl<'a> PredictionError<'a> {
     pub(crate) fn errors(
         &self,
         unknowns: &Unknowns,
-        candidates: &[Candidate],
-        free: Free,
-    ) -> Vec<Errors> {
+        candidates: &[JudgedParameters],
+        free: FittedOffsets,
+    ) -> Vec<PredictionErrors> {
         let own = self.unknowns();
         let (offsets, channels) = (6 * own.sensors.len(), own.channels());
-        let drifts = if free == Free::WithDrifts { offsets } else { 0 };
+        let drifts = if free == FittedOffsets::WithDrifts {
+            offsets
+        } else {
+            0
+        };
         let width = offsets + drifts;
         let dofs = self.measurement.robot().model.dof_count();
-        let plan = Plan::new(unknowns, own, candidates);
+        let plan = JudgedSets::new(unknowns, own, candidates);
         let all: Vec<usize> = (0..plan.sets.len()).collect();
         // First the offsets of each set in the whole log; then the residuals of the sets in use.
         let zero = || {
@@ -306,8 +314,10 @@ impl<'a> PredictionError<'a> {
             (normals, vec![DVector::zeros(width); plan.sets.len()])
         };
         let sums = self.map_instants(zero, |(normals, rights), made| {
-            for Comparison { of, residuals, h } in comparisons(made, &plan, &all) {
-                let Of::Channel(channel) = of else { continue };
+            for ComparedRow { of, residuals, h } in comparisons(made, &plan, &all) {
+                let ComparedQuantity::Channel(channel) = of else {
+                    continue;
+                };
                 let square = own.scale(channel).powi(2);
                 let lines: Vec<Vec<f64>> = h.iter().map(|h| line(h, made.late, drifts)).collect();
                 for (normal, line) in normals.iter_mut().zip(&lines) {
@@ -346,15 +356,15 @@ impl<'a> PredictionError<'a> {
             values.resize(start + candidates.len() * width, f64::NAN);
             let out = &mut values[start..];
             let in_force = plan.in_force(made.instant.t);
-            for Comparison { of, residuals, h } in comparisons(made, &plan, &in_force) {
+            for ComparedRow { of, residuals, h } in comparisons(made, &plan, &in_force) {
                 for ((out, residuals), &set) in
                     out.chunks_exact_mut(width).zip(residuals).zip(&in_force)
                 {
                     let ([constant, drifting], h) = (&fitted[set], &h[plan.sets[set].gains]);
                     let remains = residuals - dot(h, constant.as_slice());
                     match of {
-                        Of::Route(dof) => out[channels + drifts + dof] = remains,
-                        Of::Channel(channel) => {
+                        ComparedQuantity::Route(dof) => out[channels + drifts + dof] = remains,
+                        ComparedQuantity::Channel(channel) => {
                             out[channel] = remains;
                             if channel < drifts {
                                 let line = line(h, made.late, drifts);
@@ -369,14 +379,14 @@ impl<'a> PredictionError<'a> {
                 (0..made.rows.count).filter_map(|row| Some((row, made.rows.joint(row, offsets)?)))
             {
                 let share = &made.rows.g(row)[offsets + FRICTION * joint..][..FRICTION];
-                for ((out, &set), Course { friction, .. }) in out
+                for ((out, &set), ParameterCourse { friction, .. }) in out
                     .chunks_exact_mut(width)
                     .zip(&in_force)
                     .zip(&plan.courses)
                 {
                     let d = plan.sets[set].d.as_slice();
                     out[offsets + joint] =
-                        made.rows.r(row) - dot(made.rows.a(row), d) - dot(share, &friction[joint]);
+                        made.rows.without_bodies(row, d) - dot(share, &friction[joint]);
                 }
             }
         });
@@ -389,7 +399,7 @@ impl<'a> PredictionError<'a> {
                 .collect()
         };
         (0..candidates.len())
-            .map(|which| Errors {
+            .map(|which| PredictionErrors {
                 channels: (0..channels)
                     .map(|channel| column(which, channel))
                     .collect(),
@@ -408,7 +418,7 @@ impl<'a> PredictionError<'a> {
     fn map_instants<T: Send>(
         &self,
         make: impl Fn() -> T + Sync,
-        each: impl Fn(&mut T, &Made<'_, '_>) + Sync,
+        each: impl Fn(&mut T, &InstantRows<'_, '_>) + Sync,
     ) -> Vec<T> {
         let trusted = stated_variances(self.measurement.robot(), self.unknowns());
         let (Some(first), Some(last)) = (self.instants.first(), self.instants.last()) else {
@@ -417,7 +427,12 @@ impl<'a> PredictionError<'a> {
         let half = 0.5 * (last.t - first.t).seconds().max(f64::MIN_POSITIVE);
         parallel::map_with(
             self.instants.len().div_ceil(BATCH),
-            || (self.measurement.clone(), Rows::new(self.unknowns())),
+            || {
+                (
+                    self.measurement.clone(),
+                    MeasurementRows::new(self.unknowns()),
+                )
+            },
             |(measurement, rows), part| {
                 let mut own = make();
                 let end = self.instants.len().min(BATCH * (part + 1));
@@ -425,7 +440,7 @@ impl<'a> PredictionError<'a> {
                     if measurement.make(instant, rows).is_err() {
                         rows.clear();
                     }
-                    let made = Made {
+                    let made = InstantRows {
                         late: (instant.t - first.t).seconds() / half - 1.0,
                         instant,
                         measurement,
@@ -441,27 +456,23 @@ impl<'a> PredictionError<'a> {
 }
 
 /// An instant and its rows.
-struct Made<'a, 'b> {
+struct InstantRows<'a, 'b> {
     instant: &'a Annotated,
     /// From -1 at the log's beginning to 1 at its end.
     late: f64,
     measurement: &'a MeasurementModel<'b>,
-    rows: &'a Rows,
+    rows: &'a MeasurementRows,
     trusted: &'a [f64],
 }
 
 /// The comparisons at an instant, for these sets: readings, and torques from two sides.
-fn comparisons(made: &Made<'_, '_>, plan: &Plan, sets: &[usize]) -> Vec<Comparison> {
+fn comparisons(made: &InstantRows<'_, '_>, plan: &JudgedSets, sets: &[usize]) -> Vec<ComparedRow> {
     let (rows, unknowns) = (made.rows, made.measurement.unknowns());
     let offsets = 6 * unknowns.sensors.len();
     let residuals: Vec<DVector<f64>> = sets
         .iter()
         .map(|&set| &plan.sets[set].d)
-        .map(|d| {
-            DVector::from_fn(rows.count, |row, _| {
-                rows.r(row) - dot(rows.a(row), d.as_slice())
-            })
-        })
+        .map(|d| DVector::from_fn(rows.count, |row, _| rows.without_bodies(row, d.as_slice())))
         .collect();
     let g = DMatrix::from_fn(rows.count, offsets, |row, column| rows.g(row)[column]);
     let mut compared = Vec::new();
@@ -477,8 +488,8 @@ fn comparisons(made: &Made<'_, '_>, plan: &Plan, sets: &[usize]) -> Vec<Comparis
             .map(|(residuals, &set)| &maps[plan.sets[set].gains] * residuals)
             .collect();
         for k in (0..6).filter(|k| rows.has(6 * place + k)) {
-            compared.push(Comparison {
-                of: Of::Channel(6 * place + k),
+            compared.push(ComparedRow {
+                of: ComparedQuantity::Channel(6 * place + k),
                 residuals: errors.iter().map(|error| error[k]).collect(),
                 h: h.iter()
                     .map(|h| h.row(k).iter().copied().collect())
@@ -487,8 +498,8 @@ fn comparisons(made: &Made<'_, '_>, plan: &Plan, sets: &[usize]) -> Vec<Comparis
         }
     }
     for (dof, along) in made.measurement.two_routes(rows) {
-        compared.push(Comparison {
-            of: Of::Route(dof),
+        compared.push(ComparedRow {
+            of: ComparedQuantity::Route(dof),
             residuals: residuals
                 .iter()
                 .map(|residuals| along.dot(residuals))
@@ -499,14 +510,14 @@ fn comparisons(made: &Made<'_, '_>, plan: &Plan, sets: &[usize]) -> Vec<Comparis
     compared
 }
 
-impl Plan {
-    fn new(from: &Unknowns, to: &Unknowns, candidates: &[Candidate]) -> Self {
+impl JudgedSets {
+    fn new(from: &Unknowns, to: &Unknowns, candidates: &[JudgedParameters]) -> Self {
         let mut plan = Self {
             sets: Vec::new(),
             gains: Vec::new(),
             courses: Vec::new(),
         };
-        for Candidate { course, friction } in candidates {
+        for JudgedParameters { course, friction } in candidates {
             let mut own: Vec<(Nanos, usize)> = Vec::new();
             for (since, d) in course {
                 let d = in_columns_of(from, d, to);
@@ -520,13 +531,13 @@ impl Plan {
                     plan.gains.push(gains);
                 }
                 own.push((*since, plan.sets.len()));
-                plan.sets.push(Set { d, gains: number });
+                plan.sets.push(ParameterSet { d, gains: number });
             }
             let of_joint = |dof: &usize| {
                 let place = from.joints.binary_search(dof).ok();
                 place.map_or([0.0; FRICTION], |place| friction[place])
             };
-            plan.courses.push(Course {
+            plan.courses.push(ParameterCourse {
                 sets: own,
                 friction: to.joints.iter().map(of_joint).collect(),
             });
@@ -536,7 +547,7 @@ impl Plan {
 
     /// The set that each candidate uses at an instant; the first one before its start.
     fn in_force(&self, t: Nanos) -> Vec<usize> {
-        let of_course = |Course { sets, .. }: &Course| {
+        let of_course = |ParameterCourse { sets, .. }: &ParameterCourse| {
             let at = sets.partition_point(|(since, _)| *since <= t);
             sets[at.saturating_sub(1)].1
         };
@@ -624,7 +635,7 @@ pub(crate) fn friction<'b>(
     let instants: Vec<&Annotated> = instants.collect();
     let parts = parallel::map_with(
         instants.len().div_ceil(BATCH),
-        || (measurement.clone(), Rows::new(unknowns)),
+        || (measurement.clone(), MeasurementRows::new(unknowns)),
         |(measurement, rows), part| {
             let mut sums = zero();
             let end = instants.len().min(BATCH * (part + 1));
@@ -642,7 +653,7 @@ pub(crate) fn friction<'b>(
                     let (normal, rights) = &mut sums[joint];
                     *normal += g * g.transpose();
                     for (right, d) in rights.iter_mut().zip(sets) {
-                        *right += g * (rows.r(row) - dot(rows.a(row), d.as_slice()));
+                        *right += g * rows.without_bodies(row, d.as_slice());
                     }
                 }
             }

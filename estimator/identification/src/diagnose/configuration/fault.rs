@@ -29,7 +29,7 @@ const CORRELATED: f64 = 0.7;
 
 /// A reading beside its prediction, both without what offsets and friction explain.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Compared {
+pub(super) struct TorqueComparison {
     /// RMS of the prediction.
     pub(super) predicted: f64,
     /// RMS of the reading relative to it.
@@ -37,7 +37,7 @@ pub(super) struct Compared {
     correlation: f64,
 }
 
-impl Compared {
+impl TorqueComparison {
     /// A reading, given as a combination of columns, with CAD's prediction of it: their squares and
     /// products in so many rows, the residual last. None if there are too few, or no prediction.
     pub(super) fn new(gram: &DMatrix<f64>, rows: f64, reading: &DVector<f64>) -> Option<Self> {
@@ -59,7 +59,7 @@ impl Compared {
 
 /// An error of a unit or sign, with the ratio of reading and prediction.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Fault {
+pub(super) enum ReadingFault {
     Sign,
     Unit(f64),
     /// Possible, but unusual.
@@ -68,28 +68,31 @@ pub(super) enum Fault {
 
 /// The fault of each of these joint torques. `slides`: whether the joint is prismatic. Forces are
 /// compared with forces, torques with torques.
-pub(super) fn torque_faults(compared: &[Option<Compared>], slides: &[bool]) -> Vec<Option<Fault>> {
+pub(super) fn torque_faults(
+    compared: &[Option<TorqueComparison>],
+    slides: &[bool],
+) -> Vec<Option<ReadingFault>> {
     let all = || compared.iter().zip(slides);
     all()
         .map(|(own, kind)| {
             let alike = all().filter(|(_, other)| *other == kind);
             let predicted = alike.filter_map(|(other, _)| Some(other.as_ref()?.predicted));
             let greatest = predicted.fold(0.0, f64::max);
-            let Compared {
+            let TorqueComparison {
                 predicted,
                 ratio,
                 correlation,
             } = (*own)?;
             let beyond = ratio * predicted / greatest;
             if beyond > BEYOND {
-                Some(Fault::Unit(beyond))
+                Some(ReadingFault::Unit(beyond))
             } else if predicted <= SLIGHT * greatest {
                 None
             } else if ratio > FACTOR && correlation.abs() > CORRELATED || ratio < 1.0 / FACTOR {
-                Some(Fault::Unit(ratio))
+                Some(ReadingFault::Unit(ratio))
             } else {
                 let is_opposite = 4.0 * correlation * ratio < -(1.0 + ratio * ratio);
-                is_opposite.then_some(Fault::Sign)
+                is_opposite.then_some(ReadingFault::Sign)
             }
         })
         .collect()
@@ -97,21 +100,24 @@ pub(super) fn torque_faults(compared: &[Option<Compared>], slides: &[bool]) -> V
 
 /// The fault of a sensor from its torques and forces, each with the largest change that the robot
 /// can cause.
-pub(super) fn wrench_fault(both: &[Option<(Compared, f64)>; 2]) -> Option<Fault> {
+pub(super) fn wrench_fault(both: &[Option<(TorqueComparison, f64)>; 2]) -> Option<ReadingFault> {
     let both = || both.iter().flatten();
-    let is_alike = |own: &Compared| own.correlation.abs() > CORRELATED;
-    let is_large = |own: &Compared, most: f64| {
+    let is_alike = |own: &TorqueComparison| own.correlation.abs() > CORRELATED;
+    let is_large = |own: &TorqueComparison, most: f64| {
         own.ratio > FACTOR && is_alike(own) && own.ratio * own.predicted > most
     };
-    let is_odd =
-        |own: &Compared| !(1.0 / ODD..=ODD).contains(&own.ratio) && own.correlation > CORRELATED;
+    let is_odd = |own: &TorqueComparison| {
+        !(1.0 / ODD..=ODD).contains(&own.ratio) && own.correlation > CORRELATED
+    };
     let (first, _) = both().next()?;
     if let Some((own, _)) = both().find(|(own, most)| is_large(own, *most)) {
-        Some(Fault::Unit(own.ratio))
+        Some(ReadingFault::Unit(own.ratio))
     } else if both().all(|(own, _)| own.ratio < 1.0 / SMALL && is_alike(own)) {
-        Some(Fault::Unit(first.ratio))
+        Some(ReadingFault::Unit(first.ratio))
     } else {
-        both().any(|(own, _)| is_odd(own)).then_some(Fault::Odd)
+        both()
+            .any(|(own, _)| is_odd(own))
+            .then_some(ReadingFault::Odd)
     }
 }
 
@@ -124,7 +130,7 @@ fn times(ratio: f64) -> String {
     }
 }
 
-impl Fault {
+impl ReadingFault {
     /// Why a joint's torque is left out, and the finding.
     pub(super) fn of_torque(self, robot: &Robot, dof: usize) -> (String, Finding) {
         let joint = robot.model.dof_name(dof);
@@ -202,7 +208,7 @@ mod tests {
 
     /// A reading of `scale` times the prediction, which is wrong by `wrong` times another motion;
     /// with noise.
-    fn compared(size: f64, scale: f64, wrong: f64, noise: f64) -> Compared {
+    fn compared(size: f64, scale: f64, wrong: f64, noise: f64) -> TorqueComparison {
         let mut gram = DMatrix::zeros(2, 2);
         let deviates = normals(3, 1000);
         for (i, deviate) in deviates.iter().enumerate() {
@@ -213,21 +219,21 @@ mod tests {
             gram += &row * row.transpose();
         }
         let reading = DVector::from_column_slice(&[1.0, 0.0]);
-        Compared::new(&gram, 1000.0, &reading).expect("enough")
+        TorqueComparison::new(&gram, 1000.0, &reading).expect("enough")
     }
 
     /// The fault of a torque that is the only one.
-    fn of_torque(scale: f64, wrong: f64, noise: f64) -> Option<Fault> {
+    fn of_torque(scale: f64, wrong: f64, noise: f64) -> Option<ReadingFault> {
         torque_faults(&[Some(compared(1.0, scale, wrong, noise))], &[false])[0]
     }
 
     /// The fault of a sensor of a robot that weighs ten times the moved mass.
-    fn of_force(scale: f64, wrong: f64, noise: f64) -> Option<Fault> {
+    fn of_force(scale: f64, wrong: f64, noise: f64) -> Option<ReadingFault> {
         wrench_fault(&[None, Some((compared(1.0, scale, wrong, noise), 80.0))])
     }
 
-    fn is_unit(fault: Option<Fault>, expected: f64) -> bool {
-        matches!(fault, Some(Fault::Unit(ratio)) if (0.7..1.5).contains(&(ratio / expected)))
+    fn is_unit(fault: Option<ReadingFault>, expected: f64) -> bool {
+        matches!(fault, Some(ReadingFault::Unit(ratio)) if (0.7..1.5).contains(&(ratio / expected)))
     }
 
     #[test]
@@ -236,16 +242,16 @@ mod tests {
             assert_eq!(of_torque(1.0, wrong, noise), None, "{wrong} {noise}");
             assert_eq!(of_force(1.0, wrong, noise), None, "{wrong} {noise}");
         }
-        assert_eq!(of_torque(-1.0, 0.4, 1.0), Some(Fault::Sign));
+        assert_eq!(of_torque(-1.0, 0.4, 1.0), Some(ReadingFault::Sign));
         // Cables and drifting offsets, with little motion, are not counts.
         assert_eq!(of_force(1.0, 60.0, 1.0), None);
         for (scale, times) in [(1000.0, 1000.0), (-1000.0, 1000.0), (0.001, 0.001)] {
             assert!(is_unit(of_torque(scale, 0.3, 1.0), times), "{scale}");
             assert!(is_unit(of_force(scale, 0.3, 1.0), times), "{scale}");
         }
-        assert!(matches!(of_torque(0.0, 0.0, 0.0), Some(Fault::Unit(ratio)) if ratio < 1.0));
+        assert!(matches!(of_torque(0.0, 0.0, 0.0), Some(ReadingFault::Unit(ratio)) if ratio < 1.0));
         for kilograms in [0.102, 9.8] {
-            assert_eq!(of_force(kilograms, 0.3, 1.0), Some(Fault::Odd));
+            assert_eq!(of_force(kilograms, 0.3, 1.0), Some(ReadingFault::Odd));
         }
     }
 
@@ -264,14 +270,14 @@ mod tests {
             torque_faults(&own.map(Some), &[true, false, false, false])
         };
         assert_eq!(all(1.0, 1.0), [None; 4]);
-        assert_eq!(all(-1.0, 1.0), [None, Some(Fault::Sign), None, None]);
+        assert_eq!(all(-1.0, 1.0), [None, Some(ReadingFault::Sign), None, None]);
         let [None, small, None, None] = all(0.001, 1.0)[..] else {
             panic!("another fault")
         };
         assert!(is_unit(small, 0.001));
         assert!(matches!(
             all(1.0, 1e4)[..],
-            [None, None, None, Some(Fault::Unit(_))]
+            [None, None, None, Some(ReadingFault::Unit(_))]
         ));
     }
 
@@ -286,7 +292,11 @@ mod tests {
             }))
         };
         for (force, torque) in [(40.0, 40.0), (0.02, 0.02), (1.1, 40.0), (1.1, 0.001)] {
-            assert_eq!(of_both(force, torque), Some(Fault::Odd), "{force} {torque}");
+            assert_eq!(
+                of_both(force, torque),
+                Some(ReadingFault::Odd),
+                "{force} {torque}"
+            );
         }
     }
 }

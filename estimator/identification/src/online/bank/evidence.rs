@@ -10,7 +10,9 @@
 //! are the Gram matrix of `[A | y]`, in which ticks add up. The noise is the most likely one, but
 //! not below the stated one.
 
-use crate::online::bank::hypothesis::{Hypothesis, Sight, View};
+use crate::online::bank::hypothesis::{Hypothesis, MotionReading, WrenchReading};
+use crate::prior::cad_root;
+use crate::robot::Robot;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SMatrix, Vector6};
 use proprio_dynamics::calibration::UNKNOWN_OFFSET;
 use proprio_dynamics::regressor::{LINK_PARAMETERS, SubTreeRegressor};
@@ -22,12 +24,12 @@ pub(super) const FORCE: f64 = 25.0;
 /// Ticks in which a misfit lasts: the 3 s of a movement, for it depends on the posture. In them it
 /// counts as one.
 pub(super) const LASTING: f64 = 30.0;
-/// An unknown of a view, as in [`View::at`], whose effect is linear.
+/// An unknown of a view, as in [`MotionReading::at`], whose effect is linear.
 pub(super) const SMALL: f64 = 1e-3;
 
 /// The unknowns of a sub-tree, `[d | s]`: ten per link, six per sensor.
 #[derive(Clone, Debug)]
-pub(super) struct Columns {
+pub(super) struct SubtreeUnknowns {
     pub(super) links: Vec<usize>,
     pub(super) sensors: Vec<usize>,
     /// Per link `U` of the prior's covariance `U'U`.
@@ -36,7 +38,24 @@ pub(super) struct Columns {
     pub(super) reference: Vec<f64>,
 }
 
-impl Columns {
+impl SubtreeUnknowns {
+    pub(super) fn new(robot: &Robot, subtree: &SubTreeRegressor, offsets: &[Wrench]) -> Self {
+        let (links, sensors) = (
+            subtree.links().to_vec(),
+            subtree.sensors().collect::<Vec<_>>(),
+        );
+        let cad = robot.model.inertias();
+        let parameters = links.iter().flat_map(|&link| cad[link].parameters());
+        let offsets = sensors.iter().flat_map(|&own| offsets[own].torque_first());
+        let root = |&link: &usize| cad_root(&cad[link], robot.urdf_relative_std);
+        Self {
+            reference: parameters.chain(offsets).collect(),
+            roots: links.iter().map(root).collect(),
+            links,
+            sensors,
+        }
+    }
+
     pub(super) fn count(&self) -> usize {
         self.reference.len()
     }
@@ -110,10 +129,10 @@ impl Columns {
     }
 }
 
-/// A hypothesis in its [`Fit`].
+/// A hypothesis in its [`HypothesisFit`].
 #[derive(Clone, Debug)]
 pub(super) struct Branch {
-    pub(super) sight: Sight,
+    pub(super) sight: WrenchReading,
     /// What multiplies the columns of the links, and of each sensor.
     of_links: f64,
     of_sensors: Vec<f64>,
@@ -127,11 +146,11 @@ pub(super) struct Branch {
 }
 
 impl Branch {
-    pub(super) fn new(sight: Sight, prior: f64, sensors: &[usize]) -> Self {
+    pub(super) fn new(sight: WrenchReading, prior: f64, sensors: &[usize]) -> Self {
         // Noise and offsets stay those of readings in the sensor's own unit. So of the first
         // sensor, it is everything else that is taken in that unit.
         let (of_links, of_sensors) = match sight {
-            Sight::Unit(number, factor) => {
+            WrenchReading::Unit(number, factor) => {
                 let is_first = sensors.first() == Some(&number);
                 let other = if is_first { 1.0 / factor } else { 1.0 };
                 let own = if is_first { 1.0 } else { factor };
@@ -163,7 +182,7 @@ impl Branch {
 }
 
 /// The rows of a sub-tree at one time.
-pub(super) struct Rows<'a> {
+pub(super) struct TickRows<'a> {
     pub(super) rows: &'a SubTreeRegressor,
     pub(super) structure: &'a Structure,
     pub(super) kinematics: &'a Kinematics,
@@ -177,8 +196,8 @@ pub(super) struct Rows<'a> {
 
 /// Hypotheses with the same A: they differ in how F/T readings are taken.
 #[derive(Clone, Debug)]
-pub(super) struct Fit {
-    pub(super) view: View,
+pub(super) struct HypothesisFit {
+    pub(super) view: MotionReading,
     pub(super) contact: Option<usize>,
     unknowns: usize,
     pub(super) branches: Vec<Branch>,
@@ -190,11 +209,11 @@ pub(super) struct Fit {
     forgotten: f64,
 }
 
-impl Fit {
+impl HypothesisFit {
     pub(super) fn new(
-        view: View,
+        view: MotionReading,
         contact: Option<usize>,
-        columns: &Columns,
+        columns: &SubtreeUnknowns,
         branches: Vec<Branch>,
     ) -> Self {
         Self {
@@ -223,7 +242,7 @@ impl Fit {
     }
 
     /// What is stated, from the same readings; with this contact from now on.
-    pub(super) fn continued(&self, columns: &Columns, contact: Option<usize>) -> Self {
+    pub(super) fn continued(&self, columns: &SubtreeUnknowns, contact: Option<usize>) -> Self {
         let branches = self.branches[..1].to_vec();
         let mut with = Self::new(self.view, contact, columns, branches);
         if !self.gram.is_empty() {
@@ -240,7 +259,7 @@ impl Fit {
     }
 
     /// Adds the rows of a sub-tree at one time.
-    pub(super) fn add(&mut self, columns: &Columns, now: &Rows<'_>) {
+    pub(super) fn add(&mut self, columns: &SubtreeUnknowns, now: &TickRows<'_>) {
         let rows = now.rows;
         let (count, width) = (rows.remaining(), self.unknowns + self.branches.len());
         let mut all = DMatrix::zeros(count, width);
@@ -258,7 +277,7 @@ impl Fit {
                 let changes = (columns.sensors.iter().enumerate()).map(|(place, &sensor)| {
                     let reading = now.readings[sensor];
                     let change = match branch.sight {
-                        Sight::Unit(..) => {
+                        WrenchReading::Unit(..) => {
                             let configured = &columns.reference[columns.first_offset()..];
                             let six = |axis| configured[6 * place + axis];
                             let offset = Wrench::from_torque_first(std::array::from_fn(six));
@@ -351,7 +370,7 @@ impl Fit {
     }
 
     /// Finds each branch's most likely noise, and its evidence.
-    pub(super) fn weigh(&mut self, columns: &Columns) {
+    pub(super) fn weigh(&mut self, columns: &SubtreeUnknowns) {
         if self.gram.is_empty() {
             return;
         }
@@ -378,12 +397,12 @@ impl Fit {
     }
 
     /// What is estimated beside `[d | s]`, along the axis where it is largest: a share of
-    /// [`FORCE`], or what [`View::at`] takes.
+    /// [`FORCE`], or what [`MotionReading::at`] takes.
     ///
     /// Of a force it is the root mean square. How uncertain a view is counts in the deviation of
     /// torques instead: the turn of a standing base about gravity is never known, and matters to
     /// none.
-    pub(super) fn extent(&self, columns: &Columns) -> f64 {
+    pub(super) fn extent(&self, columns: &SubtreeUnknowns) -> f64 {
         let Some((factor, right)) = self.system(columns, 0) else {
             return f64::INFINITY;
         };
@@ -402,7 +421,11 @@ impl Fit {
     }
 
     /// What the parameters are if a branch holds.
-    pub(super) fn posterior(&self, columns: &Columns, number: usize) -> Option<Posterior> {
+    pub(super) fn posterior(
+        &self,
+        columns: &SubtreeUnknowns,
+        number: usize,
+    ) -> Option<HypothesisPosterior> {
         let (factor, right) = self.system(columns, number)?;
         let branch = &self.branches[number];
         let solution = factor.solve(&right);
@@ -410,14 +433,14 @@ impl Fit {
         let mean = columns.unscale(own);
         let mut hypothesis = self.hypothesis(branch);
         hypothesis.view = self.view.at(extra);
-        let mut all = Posterior {
+        let mut all = HypothesisPosterior {
             hypothesis,
             mean,
             of_view: extra[..self.view.unknowns()].to_vec(),
             // The offset is in the sensor's own unit.
             offset_factors: (columns.sensors.iter())
                 .map(|&sensor| match branch.sight {
-                    Sight::Unit(number, factor) if number == sensor => factor,
+                    WrenchReading::Unit(number, factor) if number == sensor => factor,
                     _ => 1.0,
                 })
                 .collect(),
@@ -429,7 +452,7 @@ impl Fit {
     }
 
     /// The factor of `noise + S` and b of a branch.
-    fn system(&self, columns: &Columns, number: usize) -> Option<System> {
+    fn system(&self, columns: &SubtreeUnknowns, number: usize) -> Option<System> {
         let (unknowns, branch) = (self.unknowns, &self.branches[number]);
         if self.gram.is_empty() {
             let root = DMatrix::from_diagonal_element(unknowns, unknowns, branch.noise.sqrt());
@@ -450,19 +473,19 @@ type System = (Cholesky<f64, Dyn>, DVector<f64>);
 
 /// The parameters of a sub-tree if a hypothesis holds.
 #[derive(Clone, Debug)]
-pub(super) struct Posterior {
+pub(super) struct HypothesisPosterior {
     pub(super) hypothesis: Hypothesis,
     /// `[d | s]`, in SI units.
     pub(super) mean: Vec<f64>,
-    /// What [`View::at`] takes.
+    /// What [`MotionReading::at`] takes.
     pub(super) of_view: Vec<f64>,
     offset_factors: Vec<f64>,
     factor: Cholesky<f64, Dyn>,
     noise: f64,
 }
 
-impl Posterior {
-    fn scale_offsets(&mut self, columns: &Columns) {
+impl HypothesisPosterior {
+    fn scale_offsets(&mut self, columns: &SubtreeUnknowns) {
         let offsets = self.mean[columns.first_offset()..].chunks_exact_mut(6);
         for (six, factor) in offsets.zip(&self.offset_factors) {
             six.iter_mut().for_each(|offset| *offset *= factor);
@@ -470,8 +493,13 @@ impl Posterior {
     }
 
     /// The standard deviation of a number with these sensitivities to `[d | s]`, and to what
-    /// [`View::at`] takes.
-    pub(super) fn deviation(&self, columns: &Columns, sensitivity: &[f64], of_view: &[f64]) -> f64 {
+    /// [`MotionReading::at`] takes.
+    pub(super) fn deviation(
+        &self,
+        columns: &SubtreeUnknowns,
+        sensitivity: &[f64],
+        of_view: &[f64],
+    ) -> f64 {
         let mut scaled = DVector::zeros(self.factor.l_dirty().nrows());
         columns.scale(sensitivity, &mut scaled.as_mut_slice()[..columns.count()]);
         let offsets = scaled.as_mut_slice()[columns.first_offset()..columns.count()].chunks_mut(6);
@@ -489,7 +517,11 @@ impl Posterior {
 
 /// Per sensor, the expected square of its noise in the whitened rows: together, their number. To
 /// read a sensor in a larger unit takes its noise for less, and must not look like a better fit.
-fn noise_parts(columns: &Columns, now: &Rows<'_>, factor: &Cholesky<f64, Dyn>) -> Vec<f64> {
+fn noise_parts(
+    columns: &SubtreeUnknowns,
+    now: &TickRows<'_>,
+    factor: &Cholesky<f64, Dyn>,
+) -> Vec<f64> {
     let first = now.rows.offset_column();
     let part = |(place, &sensor): (usize, &usize)| {
         let variances = &now.variances[sensor];
@@ -510,7 +542,7 @@ fn projections(rows: &SubTreeRegressor) -> DMatrix<f64> {
 
 /// The wrenches of forces of 1 N at a contact along the axes of the base, at and in the axes of the
 /// sub-tree's top link.
-fn unit_forces(contact: usize, now: &Rows<'_>) -> Option<[[f64; 6]; 3]> {
+fn unit_forces(contact: usize, now: &TickRows<'_>) -> Option<[[f64; 6]; 3]> {
     let spec = now.structure.contacts().get(contact)?;
     let frame = *now.kinematics.pose(spec.frame.link) * spec.frame.pose;
     let point = frame.point(&spec.position);
@@ -541,8 +573,8 @@ mod tests {
 
     const UNKNOWNS: usize = LINK_PARAMETERS + 6;
 
-    fn columns() -> Columns {
-        Columns {
+    fn columns() -> SubtreeUnknowns {
+        SubtreeUnknowns {
             links: vec![1],
             sensors: vec![0],
             roots: vec![SMatrix::identity()],
@@ -559,12 +591,12 @@ mod tests {
         (a, y)
     }
 
-    fn fit(sight: Sight) -> Fit {
+    fn fit(sight: WrenchReading) -> HypothesisFit {
         let branches = vec![Branch::new(sight, 1.0, &[0])];
-        Fit::new(View::AsStated, None, &columns(), branches)
+        HypothesisFit::new(MotionReading::AsStated, None, &columns(), branches)
     }
 
-    fn add(fit: &mut Fit, a: &DMatrix<f64>, y: &DVector<f64>) {
+    fn add(fit: &mut HypothesisFit, a: &DMatrix<f64>, y: &DVector<f64>) {
         let all = DMatrix::from_fn(y.len(), UNKNOWNS + 1, |i, j| {
             if j < UNKNOWNS { a[(i, j)] } else { y[i] }
         });
@@ -576,7 +608,7 @@ mod tests {
     }
 
     /// Until the noise has converged.
-    fn weighed(fit: &mut Fit) -> (f64, f64) {
+    fn weighed(fit: &mut HypothesisFit) -> (f64, f64) {
         (0..100).for_each(|_| fit.weigh(&columns()));
         (fit.branches[0].log_evidence, fit.branches[0].noise)
     }
@@ -593,7 +625,7 @@ mod tests {
     fn the_evidence_is_the_density_of_the_readings_with_their_likeliest_noise() {
         for (deviation, least) in [(3.0, 4.0), (0.1, 1.0)] {
             let (a, y) = rows(7, 60, deviation);
-            let mut fit = fit(Sight::AsStated);
+            let mut fit = fit(WrenchReading::AsStated);
             add(&mut fit, &a, &y);
             let (evidence, noise) = weighed(&mut fit);
             assert!(
@@ -615,7 +647,7 @@ mod tests {
     fn what_is_forgotten_may_have_another_value_afterwards() {
         let ((a, y), (b, z)) = (rows(11, 40, 0.3), rows(21, 40, 0.3));
         let offsets: Vec<usize> = (LINK_PARAMETERS..UNKNOWNS).collect();
-        let mut fit = fit(Sight::AsStated);
+        let mut fit = fit(WrenchReading::AsStated);
         add(&mut fit, &a, &y);
         fit.forget(&offsets);
         add(&mut fit, &b, &z);
@@ -639,11 +671,11 @@ mod tests {
     #[test]
     fn a_contact_continued_explains_later_rows_alone() {
         let ((a, y), (b, z)) = (rows(61, 40, 0.3), rows(71, 40, 0.3));
-        let mut before = Fit::new(
-            View::AsStated,
+        let mut before = HypothesisFit::new(
+            MotionReading::AsStated,
             None,
             &columns(),
-            [Sight::AsStated, Sight::Unit(0, 4.0)]
+            [WrenchReading::AsStated, WrenchReading::Unit(0, 4.0)]
                 .map(|sight| Branch::new(sight, 1.0, &[0]))
                 .to_vec(),
         );
@@ -679,7 +711,7 @@ mod tests {
     #[test]
     fn readings_in_another_unit_are_those_of_bodies_in_that_unit() {
         let (mut a, y) = rows(31, 60, 0.3);
-        let mut fit = fit(Sight::Unit(0, 4.0));
+        let mut fit = fit(WrenchReading::Unit(0, 4.0));
         add(&mut fit, &a, &y);
         let (evidence, noise) = weighed(&mut fit);
         a.columns_mut(0, LINK_PARAMETERS).scale_mut(0.25);
@@ -692,7 +724,7 @@ mod tests {
     #[test]
     fn the_deviation_of_a_number_is_that_of_its_posterior() {
         let (a, y) = rows(41, 60, 0.3);
-        let mut fit = fit(Sight::AsStated);
+        let mut fit = fit(WrenchReading::AsStated);
         let columns = columns();
         let sensitivity = normals(51, UNKNOWNS);
         let mut expected = DVector::from_column_slice(&sensitivity);

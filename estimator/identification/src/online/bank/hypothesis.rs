@@ -17,7 +17,7 @@ const ENCODER: f64 = 0.2;
 
 /// How the readings of joints and base are to be taken.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum View {
+pub enum MotionReading {
     /// As stated.
     AsStated,
     /// This encoder counts in the other direction.
@@ -40,7 +40,7 @@ pub enum View {
     Encoder(usize, [f64; 2]),
 }
 
-impl View {
+impl MotionReading {
     /// The number of unknowns that are estimated.
     pub(crate) const fn unknowns(&self) -> usize {
         match self {
@@ -64,7 +64,7 @@ impl View {
 
 /// How the readings of the F/T sensors are to be taken.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Sight {
+pub enum WrenchReading {
     /// As stated.
     AsStated,
     /// This sensor's axes are others: forces and torques are turned, mirrored or negated by this.
@@ -79,9 +79,9 @@ pub enum Sight {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hypothesis {
     /// Joints and base.
-    pub view: View,
+    pub view: MotionReading,
     /// F/T sensors.
-    pub sight: Sight,
+    pub sight: WrenchReading,
     /// The contact that has acted on the robot since the start, as a steady force.
     pub contact: Option<usize>,
 }
@@ -89,8 +89,8 @@ pub struct Hypothesis {
 impl Hypothesis {
     /// Everything is as stated, and no contact acts.
     pub(crate) const AS_STATED: Self = Self {
-        view: View::AsStated,
-        sight: Sight::AsStated,
+        view: MotionReading::AsStated,
+        sight: WrenchReading::AsStated,
         contact: None,
     };
 
@@ -106,26 +106,33 @@ impl Hypothesis {
     pub const fn role(&self) -> Option<ChannelRole> {
         match (self.view, self.sight) {
             (
-                View::Reversed(dof)
-                | View::Degrees(dof)
-                | View::Swapped(dof, _)
-                | View::Encoder(dof, _),
+                MotionReading::Reversed(dof)
+                | MotionReading::Degrees(dof)
+                | MotionReading::Swapped(dof, _)
+                | MotionReading::Encoder(dof, _),
                 _,
             ) => Some(ChannelRole::Joint(dof)),
-            (View::Upright(_) | View::ImuTurned(_) | View::ImuInG | View::BaseTurned(_), _) => {
-                Some(ChannelRole::Base)
-            }
-            (View::AsStated, Sight::AsStated) => None,
-            (_, Sight::Axes(sensor, _) | Sight::Unit(sensor, _) | Sight::Swapped(sensor, _)) => {
-                Some(ChannelRole::Sensor(sensor))
-            }
+            (
+                MotionReading::Upright(_)
+                | MotionReading::ImuTurned(_)
+                | MotionReading::ImuInG
+                | MotionReading::BaseTurned(_),
+                _,
+            ) => Some(ChannelRole::Base),
+            (MotionReading::AsStated, WrenchReading::AsStated) => None,
+            (
+                _,
+                WrenchReading::Axes(sensor, _)
+                | WrenchReading::Unit(sensor, _)
+                | WrenchReading::Swapped(sensor, _),
+            ) => Some(ChannelRole::Sensor(sensor)),
         }
     }
 
     /// For a person.
     #[must_use]
     pub const fn describe<'r>(&self, robot: &'r Robot) -> impl fmt::Display + use<'r> {
-        Described {
+        DescribedHypothesis {
             hypothesis: *self,
             robot,
         }
@@ -133,12 +140,12 @@ impl Hypothesis {
 }
 
 /// A hypothesis about `robot`.
-struct Described<'r> {
+struct DescribedHypothesis<'r> {
     hypothesis: Hypothesis,
     robot: &'r Robot,
 }
 
-impl fmt::Display for Described<'_> {
+impl fmt::Display for DescribedHypothesis<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let robot = self.robot;
         let joint = |dof: usize| robot.model.dof_name(dof);
@@ -147,12 +154,14 @@ impl fmt::Display for Described<'_> {
             cut.map_or("?", |cut| robot.model.joint_name(cut.joint()))
         };
         match self.hypothesis.view {
-            View::AsStated => {}
-            View::Reversed(dof) => return write!(f, "the encoder of {} is reversed", joint(dof)),
-            View::Degrees(dof) => {
+            MotionReading::AsStated => {}
+            MotionReading::Reversed(dof) => {
+                return write!(f, "the encoder of {} is reversed", joint(dof));
+            }
+            MotionReading::Degrees(dof) => {
                 return write!(f, "the encoder of {} reads degrees", joint(dof));
             }
-            View::Swapped(a, b) => {
+            MotionReading::Swapped(a, b) => {
                 return write!(
                     f,
                     "the encoders of {} and {} are swapped",
@@ -160,10 +169,14 @@ impl fmt::Display for Described<'_> {
                     joint(b)
                 );
             }
-            View::Upright(_) => return f.write_str("gravity has another direction than stated"),
-            View::ImuTurned(_) => return f.write_str("the IMU is mounted in another direction"),
-            View::ImuInG => return f.write_str("the IMU reads accelerations in g"),
-            View::Encoder(dof, [offset, gain]) => {
+            MotionReading::Upright(_) => {
+                return f.write_str("gravity has another direction than stated");
+            }
+            MotionReading::ImuTurned(_) => {
+                return f.write_str("the IMU is mounted in another direction");
+            }
+            MotionReading::ImuInG => return f.write_str("the IMU reads accelerations in g"),
+            MotionReading::Encoder(dof, [offset, gain]) => {
                 return write!(
                     f,
                     "the encoder of {} has another zero or gain (right is {:.3} times its reading \
@@ -172,20 +185,20 @@ impl fmt::Display for Described<'_> {
                     1.0 + gain,
                 );
             }
-            View::BaseTurned(turn) => {
+            MotionReading::BaseTurned(turn) => {
                 let angle = turn.norm().to_degrees();
                 return write!(f, "the base, or its IMU, is tilted by {angle:.0} degrees");
             }
         }
         match self.hypothesis.sight {
-            Sight::AsStated => {}
-            Sight::Axes(number, axes) if axes == -Mat3::identity() => {
+            WrenchReading::AsStated => {}
+            WrenchReading::Axes(number, axes) if axes == -Mat3::identity() => {
                 return write!(f, "the F/T sensor {} has the other sign", sensor(number));
             }
-            Sight::Axes(number, _) => {
+            WrenchReading::Axes(number, _) => {
                 return write!(f, "the F/T sensor {} has other axes", sensor(number));
             }
-            Sight::Unit(number, factor) => {
+            WrenchReading::Unit(number, factor) => {
                 return write!(
                     f,
                     "the F/T sensor {} reads in another unit (right is {factor:.4} times its \
@@ -193,7 +206,7 @@ impl fmt::Display for Described<'_> {
                     sensor(number)
                 );
             }
-            Sight::Swapped(a, b) => {
+            WrenchReading::Swapped(a, b) => {
                 let (a, b) = (sensor(a), sensor(b));
                 return write!(f, "the F/T sensors {a} and {b} are swapped");
             }
@@ -215,7 +228,7 @@ impl fmt::Display for Described<'_> {
 
 /// The readings of joints and base at one time, as they are to be taken.
 #[derive(Clone, Debug)]
-pub(crate) struct Motion {
+pub(crate) struct SeenMotion {
     pub(crate) position: Vec<f64>,
     pub(crate) velocity: Vec<f64>,
     pub(crate) acceleration: Vec<f64>,
@@ -223,7 +236,7 @@ pub(crate) struct Motion {
     pub(crate) base: FrameMotion,
 }
 
-impl Motion {
+impl SeenMotion {
     pub(crate) fn new(dofs: usize) -> Self {
         Self {
             position: vec![0.0; dofs],
@@ -249,24 +262,24 @@ impl Motion {
     }
 
     /// Takes these readings as `view` says.
-    pub(crate) fn see(&mut self, view: View) {
+    pub(crate) fn see(&mut self, view: MotionReading) {
         let each = [
             &mut self.position,
             &mut self.velocity,
             &mut self.acceleration,
         ];
         match view {
-            View::AsStated => {}
-            View::Reversed(dof) => each.into_iter().for_each(|values| values[dof] *= -1.0),
-            View::Degrees(dof) => each
+            MotionReading::AsStated => {}
+            MotionReading::Reversed(dof) => each.into_iter().for_each(|values| values[dof] *= -1.0),
+            MotionReading::Degrees(dof) => each
                 .into_iter()
                 .for_each(|values| values[dof] *= PI / 180.0),
-            View::Swapped(a, b) => each.into_iter().for_each(|values| values.swap(a, b)),
-            View::Upright(axis) => self.base.proper_acceleration = axis * GRAVITY,
-            View::ImuTurned(turn) => self.turn_base(&turn),
-            View::ImuInG => self.base.proper_acceleration *= GRAVITY,
-            View::BaseTurned(turn) => self.turn_base(Rotation3::new(turn).matrix()),
-            View::Encoder(dof, [offset, gain]) => {
+            MotionReading::Swapped(a, b) => each.into_iter().for_each(|values| values.swap(a, b)),
+            MotionReading::Upright(axis) => self.base.proper_acceleration = axis * GRAVITY,
+            MotionReading::ImuTurned(turn) => self.turn_base(&turn),
+            MotionReading::ImuInG => self.base.proper_acceleration *= GRAVITY,
+            MotionReading::BaseTurned(turn) => self.turn_base(Rotation3::new(turn).matrix()),
+            MotionReading::Encoder(dof, [offset, gain]) => {
                 each.into_iter()
                     .for_each(|values| values[dof] *= 1.0 + gain);
                 self.position[dof] += offset;
@@ -281,7 +294,7 @@ impl Motion {
     }
 }
 
-impl Sight {
+impl WrenchReading {
     /// The reading of `sensor`, as it is to be taken.
     pub(crate) fn reading(self, sensor: usize, readings: &[Wrench]) -> Wrench {
         let own = readings[sensor];
@@ -321,17 +334,20 @@ pub(crate) fn quarter_turns() -> Vec<Mat3> {
 }
 
 /// How an F/T sensor may be read: other axes, mirrored or not; other units.
-pub(crate) fn sights(sensor: usize) -> Vec<Sight> {
+pub(crate) fn sights(sensor: usize) -> Vec<WrenchReading> {
     /// Millinewtons, kilogram-force and pound-force, taken for newtons and the other way round.
     const FACTORS: [f64; 3] = [1e3, GRAVITY, 4.448_222];
-    let mut all = vec![Sight::Axes(sensor, -Mat3::identity())];
+    let mut all = vec![WrenchReading::Axes(sensor, -Mat3::identity())];
     for turn in quarter_turns() {
-        all.extend([Sight::Axes(sensor, turn), Sight::Axes(sensor, -turn)]);
+        all.extend([
+            WrenchReading::Axes(sensor, turn),
+            WrenchReading::Axes(sensor, -turn),
+        ]);
     }
     let units = FACTORS
         .into_iter()
         .flat_map(|factor| [factor, 1.0 / factor]);
-    all.extend(units.map(|factor| Sight::Unit(sensor, factor)));
+    all.extend(units.map(|factor| WrenchReading::Unit(sensor, factor)));
     all
 }
 
@@ -341,11 +357,14 @@ mod tests {
 
     #[test]
     fn what_is_estimated_has_its_own_unit() {
-        let turn = View::BaseTurned(Vec3::zeros()).at(&[1.0, 0.0, -0.5]);
-        assert_eq!(turn, View::BaseTurned(Vec3::new(0.3, 0.0, -0.15)));
-        let encoder = View::Encoder(2, [0.0; 2]).at(&[0.5, -1.0]);
-        assert_eq!(encoder, View::Encoder(2, [0.1, -0.2]));
-        assert_eq!(View::Reversed(1).at(&[]), View::Reversed(1));
+        let turn = MotionReading::BaseTurned(Vec3::zeros()).at(&[1.0, 0.0, -0.5]);
+        assert_eq!(turn, MotionReading::BaseTurned(Vec3::new(0.3, 0.0, -0.15)));
+        let encoder = MotionReading::Encoder(2, [0.0; 2]).at(&[0.5, -1.0]);
+        assert_eq!(encoder, MotionReading::Encoder(2, [0.1, -0.2]));
+        assert_eq!(
+            MotionReading::Reversed(1).at(&[]),
+            MotionReading::Reversed(1)
+        );
     }
 
     #[test]
@@ -355,9 +374,9 @@ mod tests {
             velocity: &[3.0, 4.0],
             acceleration: &[5.0, 6.0],
         };
-        let mut motion = Motion::new(2);
+        let mut motion = SeenMotion::new(2);
         motion.copy_from(state, &FrameMotion::standing(&Vec3::zeros()));
-        motion.see(View::Encoder(1, [0.5, 0.25]));
+        motion.see(MotionReading::Encoder(1, [0.5, 0.25]));
         assert_eq!(motion.position, [1.0, 3.0]);
         assert_eq!(motion.velocity, [3.0, 5.0]);
         assert_eq!(motion.acceleration, [5.0, 7.5]);
@@ -366,10 +385,10 @@ mod tests {
     #[test]
     fn a_base_that_is_tilted_moves_in_other_axes() {
         let turn = Vec3::new(0.0, 0.0, 0.5 * PI);
-        let mut motion = Motion::new(0);
+        let mut motion = SeenMotion::new(0);
         motion.base.proper_acceleration = Vec3::x();
         motion.base.angular_velocity = Vec3::y();
-        motion.see(View::BaseTurned(turn));
+        motion.see(MotionReading::BaseTurned(turn));
         assert!((motion.base.proper_acceleration - Vec3::y()).norm() < 1e-12);
         assert!((motion.base.angular_velocity + Vec3::x()).norm() < 1e-12);
     }

@@ -1,12 +1,16 @@
 //! One sub-tree that can be free of contacts, and all hypotheses about it.
 
-use crate::online::bank::evidence::{Branch, Columns, Fit, LASTING, Posterior};
-use crate::online::bank::hypothesis::{Hypothesis, Sight, View, quarter_turns, sights};
-use crate::robot::BaseMotion;
+use crate::online::bank::evidence::{
+    Branch, HypothesisFit, HypothesisPosterior, LASTING, SubtreeUnknowns,
+};
+use crate::online::bank::hypothesis::{
+    Hypothesis, MotionReading, WrenchReading, quarter_turns, sights,
+};
+use crate::robot::{BaseMotion, Robot, dofs_above, dofs_between};
+use proprio_dynamics::ContactSet;
 use proprio_dynamics::model::{JointKind, Model};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::spatial::Vec3;
-use proprio_dynamics::{ContactSet, Structure};
 
 /// Prior odds of a contact since the start.
 pub(super) const CONTACT: f64 = 0.1;
@@ -32,32 +36,26 @@ const USUAL: f64 = 1.0 / 3.0;
 
 /// See the [module](self).
 #[derive(Clone, Debug)]
-pub(super) struct Unit {
+pub(super) struct SubtreeHypotheses {
     pub(super) component: usize,
     pub(super) subtree: usize,
-    pub(super) columns: Columns,
+    pub(super) columns: SubtreeUnknowns,
     /// The first branch of the first one is that everything is as stated.
-    pub(super) fits: Vec<Fit>,
-    at_start: Vec<Fit>,
+    pub(super) fits: Vec<HypothesisFit>,
+    at_start: Vec<HypothesisFit>,
     /// The number of ticks from which on it is weighed again.
     weigh_from: usize,
     /// How much a tick counts: what exceeds the stated noise is a misfit, which lasts.
     share: f64,
 }
 
-impl Unit {
-    /// `contacts` are those that come and go.
+impl SubtreeHypotheses {
     pub(super) fn new(
-        (component, subtree): (usize, usize),
-        columns: Columns,
-        (model, structure): (&Model, &Structure),
-        base: (usize, &BaseMotion),
-        contacts: &ContactSet,
+        component: usize,
+        subtree: usize,
+        columns: SubtreeUnknowns,
+        at_start: Vec<HypothesisFit>,
     ) -> Self {
-        let here = structure.subtrees()[subtree]
-            .contacts
-            .intersection(contacts);
-        let at_start = hypotheses(&columns, model, structure.sensors().len(), base, &here);
         Self {
             component,
             subtree,
@@ -76,11 +74,11 @@ impl Unit {
     }
 
     /// What is stated; with other offsets from now on; then with each contact that may begin now.
-    pub(super) fn changes(&self) -> Vec<Fit> {
+    pub(super) fn changes(&self) -> Vec<HypothesisFit> {
         let contacts = self.at_start.iter().filter_map(|fit| fit.contact).map(Some);
         let continued = |contact| self.fits[0].continued(&self.columns, contact);
         let all = [None, None].into_iter().chain(contacts);
-        let mut fits: Vec<Fit> = all.map(continued).collect();
+        let mut fits: Vec<HypothesisFit> = all.map(continued).collect();
         fits[1].forget(&self.offsets());
         fits
     }
@@ -126,9 +124,9 @@ impl Unit {
 
     /// Of what is not refuted here, how much likelier the readings are if it is the case than as
     /// stated, with or without a contact.
-    pub(super) fn evidence(&self) -> Vec<(View, Sight, f64)> {
+    pub(super) fn evidence(&self) -> Vec<(MotionReading, WrenchReading, f64)> {
         let as_stated = (self.fits.iter())
-            .filter(|fit| fit.view == View::AsStated)
+            .filter(|fit| fit.view == MotionReading::AsStated)
             .map(|fit| fit.branches[0].log_evidence)
             .fold(f64::NEG_INFINITY, f64::max);
         let without_contact = self.fits.iter().filter(|fit| fit.contact.is_none());
@@ -145,13 +143,13 @@ impl Unit {
 
     /// Sets the odds, with the evidence of other sub-trees for what matters to them too, and drops
     /// what is refuted.
-    pub(super) fn decide(&mut self, elsewhere: impl Fn(View, Sight) -> f64) {
+    pub(super) fn decide(&mut self, elsewhere: impl Fn(MotionReading, WrenchReading) -> f64) {
         let share = self.share;
         let mut best = f64::NEG_INFINITY;
         for fit in &mut self.fits {
             for branch in fit.branches.iter_mut().filter(|branch| !branch.is_refuted) {
                 let other = match (fit.view, branch.sight) {
-                    (View::AsStated, Sight::AsStated) => 0.0,
+                    (MotionReading::AsStated, WrenchReading::AsStated) => 0.0,
                     (view, sight) => elsewhere(view, sight),
                 };
                 branch.log_odds = branch.log_prior + share * branch.log_evidence + other;
@@ -175,7 +173,7 @@ impl Unit {
 
     /// The odds of what is stated, or differs from it by something harmless.
     fn stated(&self) -> f64 {
-        let odds = |fit: &Fit| fit.branches[0].log_odds;
+        let odds = |fit: &HypothesisFit| fit.branches[0].log_odds;
         let own = odds(&self.fits[0]);
         let likelier = self.fits.iter().filter(|fit| odds(fit) > own);
         let harmless = likelier.filter(|fit| self.is_harmless(fit));
@@ -184,7 +182,7 @@ impl Unit {
 
     /// Whether it is a contact with next to no force, a small tilt of the base, or a small error of
     /// an encoder.
-    fn is_harmless(&self, fit: &Fit) -> bool {
+    fn is_harmless(&self, fit: &HypothesisFit) -> bool {
         match (fit.contact, fit.view.unknowns()) {
             (Some(_), _) => fit.extent(&self.columns) <= LITTLE,
             (None, 0) => false,
@@ -215,11 +213,10 @@ impl Unit {
 
     /// Whether everything is as stated, as far as is known.
     pub(super) fn is_settled(&self) -> bool {
-        let is_open = |fit: &Fit| {
-            let mut structural = fit
-                .branches
-                .iter()
-                .filter(|branch| fit.view != View::AsStated || branch.sight != Sight::AsStated);
+        let is_open = |fit: &HypothesisFit| {
+            let mut structural = fit.branches.iter().filter(|branch| {
+                fit.view != MotionReading::AsStated || branch.sight != WrenchReading::AsStated
+            });
             structural.any(Branch::needs_cover) && !self.is_harmless(fit)
         };
         !self.fits.iter().any(is_open) && !self.may_have_begun_in_contact()
@@ -233,7 +230,7 @@ impl Unit {
     }
 
     /// All hypotheses that need cover, but the stated one.
-    pub(super) fn alternatives(&self) -> Vec<Posterior> {
+    pub(super) fn alternatives(&self) -> Vec<HypothesisPosterior> {
         let all = self.fits.iter().flat_map(|fit| {
             fit.branches
                 .iter()
@@ -255,16 +252,15 @@ impl Branch {
     }
 }
 
-/// All hypotheses about a sub-tree with these columns and contacts.
-fn hypotheses(
-    columns: &Columns,
-    model: &Model,
-    sensor_count: usize,
-    (base_link, base): (usize, &BaseMotion),
+/// All hypotheses about a sub-tree with these columns and contacts that come and go.
+pub(super) fn hypotheses(
+    columns: &SubtreeUnknowns,
+    robot: &Robot,
     contacts: &ContactSet,
-) -> Vec<Fit> {
+) -> Vec<HypothesisFit> {
+    let (model, sensor_count) = (&robot.model, robot.structure.sensors().len());
     let branch = |sight, prior| Branch::new(sight, prior, &columns.sensors);
-    let mut first = vec![branch(Sight::AsStated, 1.0)];
+    let mut first = vec![branch(WrenchReading::AsStated, 1.0)];
     for &sensor in &columns.sensors {
         first.extend(
             sights(sensor)
@@ -274,44 +270,57 @@ fn hypotheses(
         let others = (0..sensor_count).filter(|other| *other != sensor);
         first.extend(others.map(|other| {
             branch(
-                Sight::Swapped(sensor.min(other), sensor.max(other)),
+                WrenchReading::Swapped(sensor.min(other), sensor.max(other)),
                 STRUCTURAL,
             )
         }));
     }
-    let mut fits = vec![Fit::new(View::AsStated, None, columns, first)];
+    let mut fits = vec![HypothesisFit::new(
+        MotionReading::AsStated,
+        None,
+        columns,
+        first,
+    )];
     let count = contacts.iter().count() as f64;
     fits.extend(contacts.iter().map(|contact| {
-        let branches = vec![branch(Sight::AsStated, CONTACT / count)];
-        Fit::new(View::AsStated, Some(contact), columns, branches)
+        let branches = vec![branch(WrenchReading::AsStated, CONTACT / count)];
+        HypothesisFit::new(MotionReading::AsStated, Some(contact), columns, branches)
     }));
-    let dofs = path(model, base_link, &columns.links);
+    let dofs: Vec<usize> = dofs_between(model, robot.base_link, &columns.links).collect();
     let is_turning = |dof: &usize| {
         let joint = model
             .dof_joint(*dof)
             .and_then(|joint| model.joints().get(joint));
         joint.is_some_and(|joint| matches!(joint.kind, JointKind::Revolute(_)))
     };
-    let mut views: Vec<View> = dofs.iter().copied().map(View::Reversed).collect();
-    views.extend(dofs.iter().copied().filter(is_turning).map(View::Degrees));
+    let mut views: Vec<MotionReading> = dofs.iter().copied().map(MotionReading::Reversed).collect();
+    views.extend(
+        dofs.iter()
+            .copied()
+            .filter(is_turning)
+            .map(MotionReading::Degrees),
+    );
     // Of a limb's encoders any two may be swapped.
     for b in 0..model.dof_count() {
         let link = model.dof_joint(b).map_or(0, |joint| joint + 1);
-        let limb = above(model, link).into_iter().filter(|a| *a != b);
+        let limb = dofs_above(model, link).into_iter().filter(|a| *a != b);
         let concerned = limb.filter(|a| dofs.contains(a) || dofs.contains(&b));
-        views.extend(concerned.map(|a| View::Swapped(a.min(b), a.max(b))));
+        views.extend(concerned.map(|a| MotionReading::Swapped(a.min(b), a.max(b))));
     }
-    views.extend(dofs.iter().map(|&dof| View::Encoder(dof, [0.0; 2])));
-    views.push(View::BaseTurned(Vec3::zeros()));
-    match base {
+    views.extend(
+        dofs.iter()
+            .map(|&dof| MotionReading::Encoder(dof, [0.0; 2])),
+    );
+    views.push(MotionReading::BaseTurned(Vec3::zeros()));
+    match &robot.base {
         BaseMotion::Imu(pose) => {
             let to_base = |turn| pose.rotation * turn * pose.rotation.transpose();
             views.extend(
                 quarter_turns()
                     .into_iter()
-                    .map(|turn| View::ImuTurned(to_base(turn))),
+                    .map(|turn| MotionReading::ImuTurned(to_base(turn))),
             );
-            views.push(View::ImuInG);
+            views.push(MotionReading::ImuInG);
         }
         BaseMotion::Standing(motion) => {
             let axes = [Vec3::x(), Vec3::y(), Vec3::z()];
@@ -320,7 +329,7 @@ fn hypotheses(
             // The nearest one is as good as stated.
             views.extend(
                 axes.filter(|axis| axis.dot(&stated) < 0.9)
-                    .map(View::Upright),
+                    .map(MotionReading::Upright),
             );
         }
         BaseMotion::Stance(_) => {}
@@ -330,29 +339,12 @@ fn hypotheses(
             0 => STRUCTURAL,
             _ => ESTIMATED,
         };
-        Fit::new(view, None, columns, vec![branch(Sight::AsStated, prior)])
+        HypothesisFit::new(
+            view,
+            None,
+            columns,
+            vec![branch(WrenchReading::AsStated, prior)],
+        )
     }));
     fits
-}
-
-/// The degrees of freedom that move a link against the root.
-fn above(model: &Model, mut link: usize) -> Vec<usize> {
-    let mut dofs = Vec::new();
-    while link > 0 {
-        let joint = &model.joints()[link - 1];
-        dofs.extend(joint.dof);
-        link = joint.parent;
-    }
-    dofs
-}
-
-/// The degrees of freedom that move one of these links against the base.
-fn path(model: &Model, base: usize, links: &[usize]) -> Vec<usize> {
-    let of_base = above(model, base);
-    let of_links: Vec<Vec<usize>> = links.iter().map(|&link| above(model, link)).collect();
-    let is_between = |dof: &usize| {
-        let is_above = |dofs: &Vec<usize>| dofs.contains(dof) != of_base.contains(dof);
-        of_links.iter().any(is_above)
-    };
-    (0..model.dof_count()).filter(is_between).collect()
 }

@@ -11,7 +11,7 @@ use pulp::{Arch, Simd, WithSimd};
 pub(crate) const STRETCH: f64 = 1e3;
 
 /// The state of a descent.
-pub(crate) struct State {
+pub(crate) struct Iterate {
     pub(crate) chart: Chart,
     pub(crate) y: DVector<f64>,
     /// The last weight for which this was approximately the minimum: infinite for CAD, None for a
@@ -198,7 +198,7 @@ impl Graded {
             let reflector = &mut reflector[step..];
             reflector.copy_from_slice(column);
             reflector[0] += sign * length;
-            Arch::new().dispatch(Reflect {
+            Arch::new().dispatch(PivotedReflection {
                 reflector,
                 per_half: 1.0 / (length * (length + sign * column[0])),
                 columns: tail,
@@ -236,7 +236,7 @@ impl Graded {
 
 /// Reflects the rows from the pivot's on, in the columns after it and in the right side, and
 /// updates the square norms of the rows below.
-pub(crate) struct Reflect<'a> {
+pub(crate) struct PivotedReflection<'a> {
     pub(crate) reflector: &'a [f64],
     /// Two over the reflector's square norm.
     pub(crate) per_half: f64,
@@ -246,7 +246,7 @@ pub(crate) struct Reflect<'a> {
     pub(crate) right: &'a mut [f64],
 }
 
-impl WithSimd for Reflect<'_> {
+impl WithSimd for PivotedReflection<'_> {
     type Output = ();
 
     #[inline(always)]
