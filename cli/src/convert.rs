@@ -5,7 +5,7 @@ use crate::samples;
 use anyhow::{Context, bail};
 use clap::error::ErrorKind;
 use proprio_estimator::assessment::{Assessment, Assessor, Coverage};
-use proprio_estimator::config::ConfigError;
+use proprio_estimator::config::InvalidConfig;
 use proprio_estimator::reading::{self, ReadingError};
 use proprio_estimator::setup::Setup;
 use proprio_estimator::{files, offline as estimates};
@@ -405,7 +405,7 @@ pub(crate) fn encode(args: &EncodeArgs) -> anyhow::Result<()> {
 /// reads.
 ///
 /// # Errors
-/// A [`ConfigError`]: the configuration does not match the log.
+/// An [`InvalidConfig`]: the configuration does not match the log.
 pub(crate) fn check_columns(
     header: &[u8],
     log: &Path,
@@ -418,8 +418,8 @@ pub(crate) fn check_columns(
 }
 
 /// The error that the configuration does not match the log.
-pub(crate) fn unfit(config: &Path, log: &Path, error: &dyn std::error::Error) -> ConfigError {
-    ConfigError {
+pub(crate) fn unfit(config: &Path, log: &Path, error: &dyn std::error::Error) -> InvalidConfig {
+    InvalidConfig {
         file: config.to_owned(),
         problem: format!("{}: {error}", log.display()),
     }
@@ -486,10 +486,10 @@ pub(crate) fn estimate(args: &EstimateArgs) -> anyhow::Result<()> {
     let report = estimates::estimate(setup, log, out.writer(), assessor.as_mut());
     let report = match report {
         Ok(report) => report,
-        Err(error @ estimates::OfflineError::MissingChannels(_)) => {
+        Err(error @ estimates::EstimationError::MissingChannels(_)) => {
             return Err(unfit(config, &args.samples, &error).into());
         }
-        Err(estimates::OfflineError::Write(error)) => {
+        Err(estimates::EstimationError::Write(error)) => {
             bail!("{}: cannot be written: {error}", args.out.display())
         }
         Err(error) => return Err(error).with_context(|| args.samples.display().to_string()),

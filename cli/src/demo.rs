@@ -20,7 +20,7 @@ use crate::running::interrupted_by;
 use anyhow::{Context, bail};
 use experiment::Experiment;
 use processes::Processes;
-use proprio_estimator::config::ConfigError;
+use proprio_estimator::config::InvalidConfig;
 use proprio_simulator::{FaultError, InjectedFault, SimulatedRobot, SimulationSettings, Simulator};
 use proprio_topics::Nanos;
 use proprio_topics::ipc::{Domain, DomainConfig};
@@ -150,7 +150,7 @@ fn copy_robot(robot: &SimulatedRobot, buses: &[String], to: &Path) -> anyhow::Re
                 buses.len(),
                 list.len()
             );
-            return Err(ConfigError {
+            return Err(InvalidConfig {
                 file: robot.folder.join("gateway.toml"),
                 problem,
             }

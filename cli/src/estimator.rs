@@ -3,7 +3,7 @@
 mod running;
 
 use proprio_estimator::check::Posture;
-use proprio_estimator::config::ConfigError;
+use proprio_estimator::config::InvalidConfig;
 use proprio_estimator::daemon;
 use proprio_estimator::setup::{Setup, nearest};
 use proprio_gateway::plan::Plan;
@@ -57,7 +57,7 @@ fn posture(setup: &Setup, at: &[String], domain: &DomainConfig) -> Result<Postur
 /// Checks that the gateway publishes all channels that the estimator reads; prints the result.
 fn fits(config: &Path, setup: &Setup, gateway: &Path) -> anyhow::Result<()> {
     let plan = Plan::load(gateway)?;
-    let wrong = |problem: String| ConfigError {
+    let wrong = |problem: String| InvalidConfig {
         file: config.to_owned(),
         problem,
     };

@@ -9,7 +9,7 @@ use anyhow::Context;
 use proprio_dynamics::model::{Frame, Limits, Model};
 use proprio_dynamics::regressor::identifiable::ParameterColumn;
 use proprio_dynamics::spatial::Pose;
-use proprio_estimator::config::{Base, Config, ConfigError};
+use proprio_estimator::config::{Base, Config, InvalidConfig};
 use proprio_estimator::daemon;
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::setup::{Setup, frame};
@@ -81,7 +81,7 @@ pub(crate) fn run(args: &ExciteArgs) -> anyhow::Result<()> {
         None => None,
     };
     let at_work = setup.robot_as_identified();
-    let wrong = |problem: String| ConfigError {
+    let wrong = |problem: String| InvalidConfig {
         file: args.config.clone(),
         problem,
     };

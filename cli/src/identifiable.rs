@@ -5,7 +5,7 @@ use crate::names::find;
 use anyhow::Context;
 use proprio_dynamics::model::Model;
 use proprio_estimator::check::significant;
-use proprio_estimator::config::{Config, ConfigError, ForceTorque};
+use proprio_estimator::config::{Config, ForceTorque, InvalidConfig};
 use proprio_estimator::setup::{Setup, nearest};
 use proprio_identification::{Robot, parallel};
 use proprio_planning::knowledge::{Knowledge, TorqueKnowledge, limit, only, regime};
@@ -94,7 +94,7 @@ pub(crate) fn run(args: &IdentifiableArgs) -> anyhow::Result<()> {
         (None, Some(urdf)) => (urdf, of_urdf(urdf, &args.base)?),
         (None, None) => anyhow::bail!("give a URDF, or --config with estimator.toml"),
     };
-    let wrong = |problem: String| ConfigError {
+    let wrong = |problem: String| InvalidConfig {
         file: file.clone(),
         problem,
     };
@@ -186,8 +186,8 @@ pub(crate) fn short(number: f64) -> String {
 }
 
 /// The configuration of a robot of which only the URDF is known.
-fn of_urdf(urdf: &Path, base: &str) -> Result<Config, ConfigError> {
-    let wrong = |problem| ConfigError {
+fn of_urdf(urdf: &Path, base: &str) -> Result<Config, InvalidConfig> {
+    let wrong = |problem| InvalidConfig {
         file: urdf.to_owned(),
         problem,
     };

@@ -185,7 +185,7 @@ fn fail(error: &anyhow::Error, is_journal: bool) -> ExitCode {
 fn is_configuration(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| {
         cause.is::<proprio_gateway::plan::PlanError>()
-            || cause.is::<proprio_estimator::config::ConfigError>()
+            || cause.is::<proprio_estimator::config::InvalidConfig>()
             || cause.is::<proprio_simulator::SimulatorError>()
             || cause.is::<proprio_simulator::SimulatedRobotError>()
             || cause.is::<proprio_simulator::FaultError>()

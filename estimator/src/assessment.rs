@@ -33,8 +33,8 @@ pub struct Assessor {
     /// The last estimate: its instant and torques.
     last: Option<(Nanos, Vec<JointTorque>)>,
     course: Vec<InForce>,
-    joints: Vec<Tally>,
-    subtrees: Vec<Tally>,
+    joints: Vec<CoverageSum>,
+    subtrees: Vec<CoverageSum>,
 }
 
 /// The figures of a log.
@@ -62,13 +62,13 @@ pub struct Coverage {
 }
 
 #[derive(Clone, Copy, Debug, Default)]
-struct Tally {
+struct CoverageSum {
     squares: f64,
     covered: u64,
     count: u64,
 }
 
-impl Tally {
+impl CoverageSum {
     fn add(&mut self, error: f64, deviation: f64) {
         self.squares += error * error;
         self.covered += u64::from(error.abs() <= WITHIN * deviation);
@@ -100,8 +100,8 @@ impl Assessor {
             next: 0,
             last: None,
             course: vec![in_force(setup, Nanos::MIN)],
-            joints: vec![Tally::default(); setup.robot.joint_names().count()],
-            subtrees: vec![Tally::default(); setup.robot.subtree_names().count()],
+            joints: vec![CoverageSum::default(); setup.robot.joint_names().count()],
+            subtrees: vec![CoverageSum::default(); setup.robot.subtree_names().count()],
             robot,
         })
     }
@@ -178,7 +178,7 @@ impl Assessor {
     /// The figures.
     #[must_use]
     pub fn finish(self) -> Assessment {
-        let named = |names: Vec<&str>, tallies: &[Tally]| {
+        let named = |names: Vec<&str>, tallies: &[CoverageSum]| {
             let pairs = names.into_iter().zip(tallies);
             pairs
                 .filter_map(|(name, tally)| Some((name.to_owned(), tally.coverage()?)))

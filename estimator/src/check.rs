@@ -20,7 +20,7 @@ use crate::config::STANDARD_GRAVITY;
 use crate::pipeline::Pipeline;
 use crate::plausible;
 use crate::setup::{Setup, gravity_loads, nearest};
-use proprio_dynamics::model::Limits;
+use proprio_dynamics::model::{Limits, Model};
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{
     ContactKind, Determinacy, DynamicsError, FrameMotion, InverseDynamics, JointState, Kinematics,
@@ -80,12 +80,12 @@ pub struct Posture {
     /// Per degree of freedom, its position \[rad or m\]; NaN: its locked position, else zero, or
     /// the nearest limit.
     position: Vec<f64>,
-    measured: Option<Measured>,
+    measured: Option<PostureReadings>,
 }
 
 /// What a running robot measures in a posture.
 #[derive(Clone, Debug)]
-pub struct Measured {
+pub struct PostureReadings {
     /// Per F/T sensor, its reading.
     pub wrenches: Vec<Wrench>,
     /// The proper acceleration of the IMU at the base, in its axes \[m/s^2\].
@@ -98,7 +98,7 @@ impl Posture {
     /// The posture of a running robot: per degree of freedom the position \[rad or m\], NaN where
     /// nobody measures it.
     #[must_use]
-    pub const fn measured(position: Vec<f64>, measured: Measured) -> Self {
+    pub const fn measured(position: Vec<f64>, measured: PostureReadings) -> Self {
         Self {
             position,
             measured: Some(measured),
@@ -156,22 +156,6 @@ impl Check {
         setup.identifies &= refused.is_none();
         let setup = &setup;
         let model = &setup.state.model;
-        let bodies = model.inertias();
-        let mut beyond: Vec<f64> = bodies.iter().map(|body| body.mass).collect();
-        for joint in model.joints().iter().rev() {
-            beyond[joint.parent] += beyond[joint.child];
-        }
-        let still = vec![0.0; model.dof_count()];
-        let pose = |position: &[f64], base: usize, motion: &FrameMotion| {
-            let mut kinematics = Kinematics::new(model, base)?;
-            let state = JointState {
-                position,
-                velocity: &still,
-                acceleration: &still,
-            };
-            kinematics.update(model, state, motion)?;
-            Ok::<_, DynamicsError>(kinematics)
-        };
         let mut position = positions(
             setup,
             |limits| 0.0_f64.clamp(limits.lower, limits.upper),
@@ -182,130 +166,38 @@ impl Check {
                 *place = *given;
             }
         }
-        let upright = FrameMotion::standing(&Vec3::new(0.0, 0.0, -STANDARD_GRAVITY));
-        let mut declared = None;
-        // Where gravity is known, and the link by which the robot is held.
-        let (known, motion, held, words) = match &setup.robot.base {
-            BaseMotion::Imu(x_li) => {
-                let measured = posture.measured.as_ref();
-                let measured = measured.and_then(|measured| measured.proper_acceleration);
-                let base = setup.robot.base_link;
-                let (known, motion) = measured.map_or((0, upright), |proper| {
-                    let imu = FrameMotion::standing(&-proper);
-                    (base, FrameMotion::of_link_from_imu(&imu, x_li))
-                });
-                let whose = match measured {
-                    Some(_) => "gravity as the IMU measures it",
-                    None => "the root link's z axis up",
-                };
-                (known, motion, support(setup).unwrap_or(0), whose.to_owned())
-            }
-            BaseMotion::Standing(motion) => {
-                let base = setup.robot.base_link;
-                (base, *motion, base, gravity_words(motion))
-            }
-            BaseMotion::Stance(stances) => {
-                declared = stances.first().map(|stance| stance.contact);
-                let (link, motion) =
-                    (stances.first()).map_or((0, upright), |stance| (stance.link, stance.motion));
-                (link, motion, link, gravity_words(&motion))
-            }
-        };
-        let start = pose(&position, known, &motion)?;
-        let kinematics = pose(&position, held, start.motion(held))?;
+        let hold = Hold::new(setup, posture.measured.as_ref());
+        let start = at_rest(model, &position, hold.known, &hold.motion)?;
+        let kinematics = at_rest(model, &position, hold.link, start.motion(hold.link))?;
         let mut dynamics = InverseDynamics::new(model);
         dynamics.update(model, &kinematics, &[])?;
         let cuts = setup.robot.structure.sensors().iter();
         let loads: Vec<Wrench> = cuts
             .map(|cut| cut.reading(&dynamics.transmitted(&kinematics, cut.joint())))
             .collect();
-        let measured = |number: usize| {
-            let raw = posture.measured.as_ref()?.wrenches.get(number)?;
-            let calibration = setup.state.calibrations.get(number)?;
-            Some(calibration.apply(raw, f64::NAN))
-        };
-        let names = setup
-            .robot
-            .structure
-            .sensors()
-            .iter()
-            .zip(setup.robot.sensor_names());
-        let sensors = names.zip(&loads).enumerate();
-        let sensors = sensors.map(|(number, ((cut, name), load))| AtRest {
-            name: name.to_owned(),
-            mass: beyond[cut.joint() + 1],
-            reading: *load,
-            measured: measured(number),
-            offset: setup.known_offset(number),
-        });
-        let sensors: Vec<AtRest> = sensors.collect();
-        let posture = format!(
-            "{}; held at rest by {}, {words}; no contacts",
-            posture_words(setup, posture, &position),
-            model.link_name(held)
-        );
-        let withheld = Withheld::of(
-            setup,
-            &Still {
-                base: *kinematics.motion(setup.robot.base_link),
-                position,
-                declared,
-                loads,
-            },
-        );
-        let loads = gravity_loads(model);
-        let overloaded = (loads.iter().enumerate()).filter_map(|(dof, _)| {
-            let effort = model.effort(model.dof_joint(dof)?)?;
-            (loads[dof] > HOLDS * effort)
-                .then(|| (model.dof_name(dof).to_owned(), loads[dof], effort))
-        });
-        // A general posture: where axes are aligned, the result would be a special case.
-        let somewhere = |limits: Limits| limits.lower + 0.618 * (limits.upper - limits.lower);
-        let kinematics = pose(&positions(setup, somewhere, 0.7), 0, &upright)?;
-        let mut solver = Solver::new(&setup.robot.structure);
-        let nothing = vec![Wrench::zero(); sensors.len()];
-        solver.solve(
-            model,
-            &setup.robot.structure,
-            &kinematics,
-            &nothing,
-            &setup.robot.always,
-            &[],
-        )?;
-        let certainty = solver.torque_certainty();
-        let subtree_of = |dof: usize| {
-            let link = setup.robot.structure.link_of(dof)?;
-            setup.robot.structure.subtree_of(link)
-        };
-        let subtrees = setup.robot.structure.subtrees();
-        // Sub-trees without an F/T sensor are not expected to give torques.
-        let is_measured =
-            |dof| subtree_of(dof).is_some_and(|number| !subtrees[number].sensors.is_empty());
-        let lost: Vec<usize> = (0..model.dof_count())
-            .filter(|&dof| {
-                setup.robot.locked[dof].is_nan() && certainty[dof] == Determinacy::Assumed
-            })
-            .filter(|&dof| is_measured(dof))
-            .collect();
-        let hiding = subtrees.iter().enumerate();
-        let hiding =
-            hiding.filter(|(number, _)| lost.iter().any(|dof| subtree_of(*dof) == Some(*number)));
-        let hiding = hiding
-            .flat_map(|(_, subtree)| subtree.contacts.intersection(&setup.robot.always).iter());
+        let (undetermined, hiding) = undetermined(setup)?;
         Ok(Self {
-            mass: bodies.iter().map(|body| body.mass).sum(),
-            posture,
-            sensors,
-            withheld,
+            mass: model.inertias().iter().map(|body| body.mass).sum(),
+            posture: format!(
+                "{}; held at rest by {}, {}; no contacts",
+                posture_words(setup, posture, &position),
+                model.link_name(hold.link),
+                hold.words
+            ),
+            sensors: sensors_at_rest(setup, posture, &loads),
+            withheld: Withheld::of(
+                setup,
+                &Still {
+                    base: *kinematics.motion(setup.robot.base_link),
+                    position,
+                    declared: hold.declared,
+                    loads,
+                },
+            ),
             refused,
-            overloaded: overloaded.collect(),
-            hiding: hiding
-                .map(|contact| setup.robot.contact_label(contact).to_owned())
-                .collect(),
-            undetermined: lost
-                .into_iter()
-                .map(|dof| model.dof_name(dof).to_owned())
-                .collect(),
+            overloaded: overloaded(model),
+            hiding,
+            undetermined,
         })
     }
 
@@ -323,6 +215,150 @@ impl Check {
             )
         })
     }
+}
+
+/// How the robot is held at rest.
+struct Hold {
+    /// The link where gravity is known, and its motion.
+    known: usize,
+    motion: FrameMotion,
+    /// The link by which the robot is held.
+    link: usize,
+    /// Gravity, in words.
+    words: String,
+    /// The contact that is declared to be present.
+    declared: Option<usize>,
+}
+
+impl Hold {
+    fn new(setup: &Setup, measured: Option<&PostureReadings>) -> Self {
+        let upright = upright();
+        let at = |link, motion, declared| Self {
+            known: link,
+            motion,
+            link,
+            words: gravity_words(&motion),
+            declared,
+        };
+        let base = setup.robot.base_link;
+        match &setup.robot.base {
+            BaseMotion::Imu(x_li) => {
+                let measured = measured.and_then(|measured| measured.proper_acceleration);
+                let (known, motion) = measured.map_or((0, upright), |proper| {
+                    let imu = FrameMotion::standing(&-proper);
+                    (base, FrameMotion::of_link_from_imu(&imu, x_li))
+                });
+                let words = match measured {
+                    Some(_) => "gravity as the IMU measures it",
+                    None => "the root link's z axis up",
+                };
+                Self {
+                    known,
+                    motion,
+                    link: support(setup).unwrap_or(0),
+                    words: words.to_owned(),
+                    declared: None,
+                }
+            }
+            BaseMotion::Standing(motion) => at(base, *motion, None),
+            BaseMotion::Stance(stances) => match stances.first() {
+                Some(stance) => at(stance.link, stance.motion, Some(stance.contact)),
+                None => at(0, upright, None),
+            },
+        }
+    }
+}
+
+/// The motion of a link at rest whose z axis points up.
+fn upright() -> FrameMotion {
+    FrameMotion::standing(&Vec3::new(0.0, 0.0, -STANDARD_GRAVITY))
+}
+
+/// The robot at rest, whose link `base` has this motion.
+fn at_rest(
+    model: &Model,
+    position: &[f64],
+    base: usize,
+    motion: &FrameMotion,
+) -> Result<Kinematics, DynamicsError> {
+    let still = vec![0.0; model.dof_count()];
+    let state = JointState {
+        position,
+        velocity: &still,
+        acceleration: &still,
+    };
+    let mut kinematics = Kinematics::new(model, base)?;
+    kinematics.update(model, state, motion)?;
+    Ok(kinematics)
+}
+
+/// Per F/T sensor, its load at rest, beside what it measures.
+fn sensors_at_rest(setup: &Setup, posture: &Posture, loads: &[Wrench]) -> Vec<AtRest> {
+    let model = &setup.state.model;
+    let mut beyond: Vec<f64> = model.inertias().iter().map(|body| body.mass).collect();
+    for joint in model.joints().iter().rev() {
+        beyond[joint.parent] += beyond[joint.child];
+    }
+    let measured = |number: usize| {
+        let raw = posture.measured.as_ref()?.wrenches.get(number)?;
+        let calibration = setup.state.calibrations.get(number)?;
+        Some(calibration.apply(raw, f64::NAN))
+    };
+    let cuts = setup.robot.structure.sensors().iter().zip(loads);
+    let named = cuts.zip(setup.robot.sensor_names()).enumerate();
+    let sensors = named.map(|(number, ((cut, load), name))| AtRest {
+        name: name.to_owned(),
+        mass: beyond[cut.joint() + 1],
+        reading: *load,
+        measured: measured(number),
+        offset: setup.known_offset(number),
+    });
+    sensors.collect()
+}
+
+/// Joints that could not hold their limb ([`Check::overloaded`]).
+fn overloaded(model: &Model) -> Vec<(String, f64, f64)> {
+    let loads = gravity_loads(model).into_iter().enumerate();
+    let overloaded = loads.filter_map(|(dof, load)| {
+        let effort = model.effort(model.dof_joint(dof)?)?;
+        (load > HOLDS * effort).then(|| (model.dof_name(dof).to_owned(), load, effort))
+    });
+    overloaded.collect()
+}
+
+/// The joints whose torque can never be determined, and the contacts that hide it.
+fn undetermined(setup: &Setup) -> Result<(Vec<String>, Vec<String>), DynamicsError> {
+    let (model, robot) = (&setup.state.model, &setup.robot);
+    let structure = &robot.structure;
+    // A general posture: where axes are aligned, the result would be a special case.
+    let somewhere = |limits: Limits| limits.lower + 0.618 * (limits.upper - limits.lower);
+    let kinematics = at_rest(model, &positions(setup, somewhere, 0.7), 0, &upright())?;
+    let mut solver = Solver::new(structure);
+    let nothing = vec![Wrench::zero(); structure.sensors().len()];
+    solver.solve(model, structure, &kinematics, &nothing, &robot.always, &[])?;
+    let certainty = solver.torque_certainty();
+    let subtree_of = |dof: usize| structure.subtree_of(structure.link_of(dof)?);
+    let subtrees = structure.subtrees();
+    // Sub-trees without an F/T sensor are not expected to give torques.
+    let is_measured =
+        |dof| subtree_of(dof).is_some_and(|number| !subtrees[number].sensors.is_empty());
+    let lost: Vec<usize> = (0..model.dof_count())
+        .filter(|&dof| robot.locked[dof].is_nan() && certainty[dof] == Determinacy::Assumed)
+        .filter(|&dof| is_measured(dof))
+        .collect();
+    let hiding = subtrees.iter().enumerate();
+    let hiding =
+        hiding.filter(|(number, _)| lost.iter().any(|dof| subtree_of(*dof) == Some(*number)));
+    let hiding =
+        hiding.flat_map(|(_, subtree)| subtree.contacts.intersection(&robot.always).iter());
+    Ok((
+        lost.iter()
+            .map(|dof| model.dof_name(*dof).to_owned())
+            .collect(),
+        hiding
+            .map(|contact| robot.contact_label(contact).to_owned())
+            .collect(),
+    ))
 }
 
 /// Positions of all degrees of freedom: the locked position; else `within` of the limits; else,

@@ -4,21 +4,23 @@
 //! that form.
 
 use proprio_dynamics::calibration::{Calibration, Gain, UNKNOWN_OFFSET, gain_from_force_first};
+use proprio_dynamics::model::{MeasurementDirection, MeasurementFrame};
 use proprio_dynamics::spatial::Wrench;
 use proprio_identification::robot::{IdentificationInput, TorqueSide};
 use proprio_topics::{ROBOT_NAME, is_robot_name};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
 use std::collections::BTreeMap;
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
-/// Keys that had another name in an earlier version.
-const RENAMED: [(&str, &str); 1] = [("model_std", "urdf_relative_std")];
+/// Keys of earlier versions, and what to do about them.
+const FORMER: [(&str, &str); 1] = [("model_std", "is now called `urdf_relative_std`: rename it")];
 
 /// A configuration that cannot be used: exit 2.
 #[derive(Debug, thiserror::Error)]
 #[error("{}: {problem}", .file.display())]
-pub struct ConfigError {
+pub struct InvalidConfig {
     /// The file.
     pub file: PathBuf,
     /// Where in the file, what is wrong, and what is allowed.
@@ -40,7 +42,7 @@ pub struct Config {
     /// replace the URDF's inertias and this file's offsets.
     pub parameters: Option<PathBuf>,
     /// How the estimator's thread is scheduled.
-    pub realtime: Option<Realtime>,
+    pub realtime: Option<ThreadScheduling>,
     /// Where kinematics start.
     pub base: Base,
     /// Joints that are not measured, and their fixed positions \[rad or m\]. Joints that follow
@@ -53,10 +55,10 @@ pub struct Config {
     pub force_torque: Vec<ForceTorque>,
     /// The unknown external wrenches.
     #[serde(default)]
-    pub contact: Vec<Contact>,
+    pub contact: Vec<ContactSite>,
     /// Patches of tactile skin, which show where contacts are.
     #[serde(default)]
-    pub skin: Vec<Skin>,
+    pub skin: Vec<TactileSkin>,
     /// What is identified, and from which measurements.
     #[serde(default)]
     pub identification: Identification,
@@ -68,14 +70,14 @@ pub struct Config {
     pub input: Input,
     /// When and what is published.
     #[serde(default)]
-    pub output: Output,
+    pub output: Publishing,
 }
 
 /// How a thread is scheduled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
-pub struct Realtime {
+pub struct ThreadScheduling {
     /// The processor it is bound to.
     pub cpu: Option<usize>,
     /// Its SCHED_FIFO priority, 1 to 99.
@@ -141,7 +143,7 @@ pub(crate) fn exactly<'de, D: Deserializer<'de>, const N: usize>(
         .map_err(|_| D::Error::custom(format!("{given} numbers where {N} are needed")))
 }
 
-fn exactly_if_given<'de, D: Deserializer<'de>, const N: usize>(
+pub(crate) fn exactly_if_given<'de, D: Deserializer<'de>, const N: usize>(
     deserializer: D,
 ) -> Result<Option<[f64; N]>, D::Error> {
     exactly(deserializer).map(Some)
@@ -166,10 +168,12 @@ pub struct ForceTorque {
     pub joint: String,
     /// The measurement frame: axes and origin of its reading; default: that of the URDF's sensor
     /// element, else `child`.
-    pub frame: Option<SensorFrame>,
+    #[cfg_attr(test, schemars(with = "Option<elsewhere::FrameWord>"))]
+    pub frame: Option<MeasurementFrame>,
     /// The measurement direction: which link acts on which; default: that of the URDF's sensor
     /// element, else `child_to_parent`.
-    pub direction: Option<Direction>,
+    #[cfg_attr(test, schemars(with = "Option<elsewhere::DirectionWord>"))]
+    pub direction: Option<MeasurementDirection>,
     /// With `frame = "sensor"`: the sensor's origin in the child link's frame \[m\].
     #[serde(default, deserialize_with = "exactly_if_given")]
     pub xyz_m: Option<[f64; 3]>,
@@ -234,35 +238,11 @@ const fn default_noise_nm() -> [f64; 3] {
     [0.002, 0.003, 0.0015]
 }
 
-/// The measurement frame of a force/torque sensor: axes and origin of its reading.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
-#[serde(rename_all = "lowercase")]
-pub enum SensorFrame {
-    /// The child link's.
-    Child,
-    /// The parent link's.
-    Parent,
-    /// The sensor's own, posed relative to the child link.
-    Sensor,
-}
-
-/// The measurement direction of a force/torque sensor: which link acts on which.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
-#[serde(rename_all = "snake_case")]
-pub enum Direction {
-    /// By the child on the parent: reading = -(wrench by the parent on the child) + offset.
-    ChildToParent,
-    /// By the parent on the child: reading = wrench by the parent on the child + offset.
-    ParentToChild,
-}
-
 /// An unknown external wrench.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
-pub struct Contact {
+pub struct ContactSite {
     /// Its name in tables and services; default: `link`.
     pub name: Option<String>,
     /// The link or folded frame that it acts on. Its wrench is given in the axes and at the origin
@@ -270,7 +250,7 @@ pub struct Contact {
     pub link: String,
     /// How many unknowns it has.
     #[serde(default)]
-    pub kind: ContactKind,
+    pub kind: ContactModel,
     /// The direction of a `force_along`, in the frame's axes.
     #[serde(default, deserialize_with = "exactly_if_given")]
     pub direction: Option<[f64; 3]>,
@@ -280,14 +260,14 @@ pub struct Contact {
     pub position_m: [f64; 3],
     /// Whether it is always there.
     #[serde(default)]
-    pub presence: Presence,
+    pub presence: Occurrence,
 }
 
 /// How many unknowns a contact has.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "snake_case")]
-pub enum ContactKind {
+pub enum ContactModel {
     /// A force and a torque: 6.
     #[default]
     Wrench,
@@ -301,7 +281,7 @@ pub enum ContactKind {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "lowercase")]
-pub enum Presence {
+pub enum Occurrence {
     /// It is always present, unless it is declared absent.
     #[default]
     Always,
@@ -315,7 +295,7 @@ pub enum Presence {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
-pub struct Skin {
+pub struct TactileSkin {
     /// Its channel.
     pub channel: String,
     /// The link or folded frame that its taxels are placed in.
@@ -331,11 +311,11 @@ pub struct Skin {
     pub first_taxel: usize,
     /// Standard deviation of an untouched taxel's value, in its unit (iCub: counts). Measure it
     /// with the robot in motion and nobody near. Default: 1.
-    #[serde(default = "default_skin_noise")]
+    #[serde(default = "one")]
     pub noise: f64,
     /// How many touches that are none the patch may show per hour. This and `noise` give the
     /// threshold of a taxel ([`crate::skin::threshold`]). Default: 1.
-    #[serde(default = "default_false_alarms")]
+    #[serde(default = "one")]
     pub false_alarms_per_hour: f64,
     /// Standard deviation of a touch's position, each axis \[m\]. Default: the median distance of
     /// neighbouring taxels divided by the square root of 12.
@@ -346,11 +326,7 @@ pub struct Skin {
     pub max_silence_ms: f64,
 }
 
-const fn default_skin_noise() -> f64 {
-    1.0
-}
-
-const fn default_false_alarms() -> f64 {
+const fn one() -> f64 {
     1.0
 }
 
@@ -366,11 +342,11 @@ pub struct Identification {
     /// Whether parameters are identified on-line.
     pub enabled: bool,
     /// From which measurements; default: the force/torque sensors. On-line they alone are used.
-    #[cfg_attr(test, schemars(with = "Vec<elsewhere::IdentificationInput>"))]
+    #[cfg_attr(test, schemars(with = "Vec<elsewhere::InputWord>"))]
     pub inputs: Vec<IdentificationInput>,
     /// Where the joint torques used for identification are measured; default: on the link side of
     /// the gears.
-    #[cfg_attr(test, schemars(with = "elsewhere::TorqueSide"))]
+    #[cfg_attr(test, schemars(with = "elsewhere::SideWord"))]
     pub torque_side: TorqueSide,
     /// Largest rate of on-line identification instants \[Hz\]; the trigger's rate if that is less.
     pub rate_hz: f64,
@@ -387,7 +363,7 @@ pub struct Identification {
     pub urdf_relative_std: f64,
     /// Whether `proprio identify` also identifies the gain error of each force/torque sensor, and
     /// which entries of it.
-    #[cfg_attr(test, schemars(with = "elsewhere::Gain"))]
+    #[cfg_attr(test, schemars(with = "elsewhere::GainWord"))]
     pub gain: Gain,
     /// Prior standard deviation of a gain error, relative. It holds for diagonal entries, and for
     /// force-force and torque-torque cross-talk. For cross-talk of a torque into a force it is
@@ -466,49 +442,40 @@ impl Default for Input {
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
-pub struct Output {
+pub struct Publishing {
     /// The trigger channel: each of its stamps gives one estimate. Default: the first force/torque
     /// sensor, else the first joint.
     pub trigger: Option<String>,
-    /// Whether an estimate waits for the samples of other channels. Default: `aligned` if
-    /// `max_wait_ms` is given, else `immediate`.
-    pub timing: Option<Timing>,
-    /// How long an `aligned` estimate waits for them, counted in stamps \[ms\]; at most 32 periods
-    /// of the fastest channel; default 1. A dead channel costs this wait. The order of arrival does
-    /// not matter, provided that no sample arrives more than half of this behind a later one.
+    /// How long an estimate waits for the samples of other channels, counted in stamps \[ms\]; at
+    /// most 32 periods of the fastest channel. A dead channel costs this wait. The order of arrival
+    /// does not matter, provided that no sample arrives more than half of this behind a later one.
+    /// Default: it does not wait. The other channels are extrapolated to the trigger's sample, and
+    /// the standard deviations include what that costs.
     pub max_wait_ms: Option<f64>,
+    /// Whether an estimate waits at all; `max_wait_ms` says that already.
+    pub timing: Option<Timing>,
     /// A joint torque whose standard deviation exceeds this is withheld \[Nm\]; default: the
     /// largest gravity load of the links beyond the joint, or a quarter of its effort limit if that
     /// is more ([`crate::setup::Setup::max_deviation`]).
     pub max_torque_std_nm: Option<f64>,
 }
 
-/// When an estimate is made.
+/// Whether an estimate waits for the samples of other channels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema, serde::Serialize))]
 #[serde(rename_all = "lowercase")]
 pub enum Timing {
-    /// Once every channel has a sample of the trigger's stamp or later, or after `max_wait_ms`.
+    /// It waits for `max_wait_ms`, by default 1 ms.
     Aligned,
-    /// As soon as the trigger's sample arrives. The other channels are extrapolated to it, and the
-    /// standard deviations include what that costs.
+    /// It does not wait.
     Immediate,
 }
 
-impl Output {
-    /// [`Output::timing`] with its default.
-    #[must_use]
-    pub fn timing(&self) -> Timing {
-        self.timing.unwrap_or(match self.max_wait_ms {
-            Some(_) => Timing::Aligned,
-            None => Timing::Immediate,
-        })
-    }
-
-    /// [`Output::max_wait_ms`] with its default \[ms\].
-    #[must_use]
-    pub fn max_wait_ms(&self) -> f64 {
-        self.max_wait_ms.unwrap_or(1.0)
+impl Publishing {
+    /// How long an estimate waits for the samples of other channels \[ms\]; none: it does not.
+    pub(crate) fn wait_ms(&self) -> Option<f64> {
+        let least = (self.timing == Some(Timing::Aligned)).then_some(1.0);
+        self.max_wait_ms.or(least)
     }
 }
 
@@ -516,9 +483,9 @@ impl Config {
     /// Reads a configuration file; its paths become relative to where the file is.
     ///
     /// # Errors
-    /// [`ConfigError`]: not readable, not TOML, an unknown key, a wrong value.
-    pub fn load(file: &Path) -> Result<Self, ConfigError> {
-        let error = |problem| ConfigError {
+    /// [`InvalidConfig`]: not readable, not TOML, an unknown key, a wrong value.
+    pub fn load(file: &Path) -> Result<Self, InvalidConfig> {
+        let error = |problem| InvalidConfig {
             file: file.to_owned(),
             problem,
         };
@@ -542,12 +509,11 @@ impl Config {
     pub fn parse(text: &str) -> Result<Self, String> {
         let config: Self = toml::from_str(text).map_err(|e| {
             let problem = e.to_string();
-            RENAMED
-                .iter()
-                .find(|(old, _)| problem.contains(&format!("unknown field `{old}`")))
-                .map_or(problem.clone(), |(old, new)| {
-                    format!("{problem}\n`{old}` is now called `{new}`: rename it")
-                })
+            let mut former = FORMER.iter();
+            match former.find(|(key, _)| problem.contains(&format!("unknown field `{key}`"))) {
+                Some((key, what)) => format!("{problem}\n`{key}` {what}"),
+                None => problem,
+            }
         })?;
         config.check()?;
         Ok(config)
@@ -563,194 +529,172 @@ impl Config {
         if !is_robot_name(&self.robot) {
             return Err(format!("robot = {:?}: {ROBOT_NAME}", self.robot));
         }
-        if let Some(Realtime {
-            priority: Some(priority),
-            ..
-        }) = self.realtime
-            && !(1..=99).contains(&priority)
-        {
-            return Err(format!("realtime.priority = {priority} must be 1 to 99"));
+        if let Some(priority) = self.realtime.and_then(|scheduling| scheduling.priority) {
+            within("realtime.priority", priority, [1, 99])?;
         }
-        let positive = |key: &str, value: f64, most: f64| {
-            if value > 0.0 && value <= most {
-                Ok(())
-            } else {
-                Err(format!("{key} = {value} must be above 0, at most {most}"))
-            }
-        };
-        positive("input.max_silence_ms", self.input.max_silence_ms, 3.6e6)?;
-        positive(
-            "differentiation.position_noise_rad",
-            self.differentiation.position_noise_rad,
-            1.0,
-        )?;
-        positive(
-            "differentiation.angular_velocity_noise_radps",
-            self.differentiation.angular_velocity_noise_radps,
-            10.0,
-        )?;
-        positive(
-            "differentiation.max_window_ms",
-            self.differentiation.max_window_ms,
-            1e4,
-        )?;
-        self.output.max_torque_std_nm.map_or(Ok(()), |bound| {
-            positive("output.max_torque_std_nm", bound, f64::MAX)
-        })?;
-        let relative = self.identification.urdf_relative_std;
-        if !(0.0..=2.0).contains(&relative) {
-            return Err(format!(
-                "identification.urdf_relative_std = {relative} must be 0 to 2"
-            ));
+        let (wanted, identification) = (&self.differentiation, &self.identification);
+        for (key, value, most) in [
+            ("input.max_silence_ms", self.input.max_silence_ms, 3.6e6),
+            (
+                "differentiation.position_noise_rad",
+                wanted.position_noise_rad,
+                1.0,
+            ),
+            (
+                "differentiation.angular_velocity_noise_radps",
+                wanted.angular_velocity_noise_radps,
+                10.0,
+            ),
+            ("differentiation.max_window_ms", wanted.max_window_ms, 1e4),
+            (
+                "output.max_torque_std_nm",
+                self.output.max_torque_std_nm.unwrap_or(1.0),
+                f64::MAX,
+            ),
+            ("identification.gain_std", identification.gain_std, 1.0),
+        ] {
+            positive(key, value, most)?;
         }
-        let rate = self.identification.rate_hz;
-        if !(1.0..=1000.0).contains(&rate) {
-            return Err(format!("identification.rate_hz = {rate} must be 1 to 1000"));
+        for (key, value, range) in [
+            (
+                "identification.urdf_relative_std",
+                identification.urdf_relative_std,
+                [0.0, 2.0],
+            ),
+            (
+                "identification.rate_hz",
+                identification.rate_hz,
+                [1.0, 1000.0],
+            ),
+            (
+                "identification.save_every_s",
+                identification.save_every_s,
+                [1.0, 1e6],
+            ),
+            // Buffers for a waiting instant: 32 samples of a channel beside those of its window,
+            // and 256 instants.
+            (
+                "output.max_wait_ms",
+                self.output.max_wait_ms.unwrap_or(0.0),
+                [0.0, 250.0],
+            ),
+        ] {
+            within(key, value, range)?;
         }
-        let every = self.identification.save_every_s;
-        if !(1.0..=1e6).contains(&every) {
-            return Err(format!(
-                "identification.save_every_s = {every} must be 1 to 1000000"
-            ));
-        }
-        positive("identification.gain_std", self.identification.gain_std, 1.0)?;
-        // Buffers for a waiting instant: 32 samples of a channel beside those of its window, and
-        // 256 instants.
         if self.output.timing == Some(Timing::Immediate) && self.output.max_wait_ms.is_some() {
             return Err(
-                "output.max_wait_ms is of no use with timing = \"immediate\"; remove one of them, \
-                 or set timing = \"aligned\""
+                "output.max_wait_ms is of no use with timing = \"immediate\": remove one of them"
                     .into(),
             );
         }
-        let max_wait_ms = self.output.max_wait_ms();
-        if !(0.0..=250.0).contains(&max_wait_ms) {
-            return Err(format!(
-                "output.max_wait_ms = {max_wait_ms} must be 0 to 250"
-            ));
-        }
-        let finite = |key: &str, values: &[f64]| match values.iter().find(|v| !v.is_finite()) {
-            Some(value) => Err(format!("{key} has the value {value}; it must be finite")),
-            None => Ok(()),
-        };
-        match &self.base {
-            Base::Fixed { gravity_mps2, .. } => finite("base.gravity_mps2", gravity_mps2)?,
-            Base::Stance { foot } => {
-                if foot.is_empty() {
-                    return Err(
-                        "base.foot is empty; add one [[base.foot]] for each link that may be at \
-                         rest"
-                            .into(),
-                    );
-                }
-                for foot in foot {
-                    finite(
-                        &format!("base.foot {:?}: gravity_mps2", foot.link),
-                        &foot.gravity_mps2,
-                    )?;
-                }
-            }
-            Base::Imu { xyz_m, rpy_rad, .. } => {
-                finite("base.xyz_m", xyz_m)?;
-                finite("base.rpy_rad", rpy_rad)?;
-            }
-        }
+        self.base.check()?;
         for (joint, position) in &self.locked {
             finite(&format!("locked.{joint}"), &[*position])?;
         }
-        for ft in &self.force_torque {
-            let at = |key: &str| format!("force_torque {:?}: {key}", ft.sensor);
-            for (key, noise) in [("noise_n", ft.noise_n), ("noise_nm", ft.noise_nm)] {
-                if let Some(value) = noise
-                    .into_iter()
-                    .find(|v| v.is_nan() || *v <= 0.0 || v.is_infinite())
-                {
-                    return Err(format!(
-                        "{} has the value {value}; a standard deviation must be above 0",
-                        at(key)
-                    ));
-                }
-            }
-            for (key, deviation) in [
-                ("offset_std_n", ft.offset_std_n),
-                ("offset_std_nm", ft.offset_std_nm),
-            ] {
-                if let Some(value) = deviation
-                    .into_iter()
-                    .flatten()
-                    .find(|v| !(*v >= 0.0 && v.is_finite()))
-                {
-                    return Err(format!(
-                        "{} has the value {value}; a standard deviation cannot be negative",
-                        at(key)
-                    ));
-                }
-            }
-            if let Some(numbers) = &ft.gain {
-                finite(&at("gain"), numbers)?;
-                if gain_from_force_first(numbers).is_none_or(|gain| !gain.is_invertible()) {
-                    return Err(format!(
-                        "{} is singular: some wrenches would give no reading; check its numbers",
-                        at("gain")
-                    ));
-                }
-            }
-            finite(&at("temperature_n_per_k"), &ft.temperature_n_per_k)?;
-            finite(&at("temperature_nm_per_k"), &ft.temperature_nm_per_k)?;
-            finite(&at("reference_celsius"), ft.reference_celsius.as_slice())?;
-            let drifts = ft.temperature_n_per_k != [0.0; 3] || ft.temperature_nm_per_k != [0.0; 3];
-            if drifts && ft.reference_celsius.is_none() {
-                return Err(format!(
-                    "{} is missing: temperature_n_per_k and temperature_nm_per_k are relative to \
-                     it",
-                    at("reference_celsius")
-                ));
-            }
-            finite(&at("offset_n"), &ft.offset_n.unwrap_or_default())?;
-            finite(&at("offset_nm"), &ft.offset_nm.unwrap_or_default())?;
-            finite(&at("xyz_m"), &ft.xyz_m.unwrap_or_default())?;
-            finite(&at("rpy_rad"), &ft.rpy_rad.unwrap_or_default())?;
-        }
-        for skin in &self.skin {
-            let at = |key: &str| format!("skin {:?}: {key}", skin.channel);
-            positive(&at("noise"), skin.noise, 1e6)?;
-            let alarms = skin.false_alarms_per_hour;
-            positive(&at("false_alarms_per_hour"), alarms, 1e6)?;
-            positive(&at("max_silence_ms"), skin.max_silence_ms, 3.6e6)?;
-            if let Some(std) = skin.position_std_m {
-                positive(&at("position_std_m"), std, 1.0)?;
-            }
-        }
-        for contact in &self.contact {
-            let at = |key: &str| format!("contact {:?}: {key}", contact.name());
-            finite(&at("position_m"), &contact.position_m)?;
-            match (contact.kind, contact.direction) {
-                (ContactKind::ForceAlong, None) => {
-                    return Err(format!(
-                        "{} is missing: kind = \"force_along\" needs it",
-                        at("direction")
-                    ));
-                }
-                (ContactKind::ForceAlong, Some(direction)) => {
-                    finite(&at("direction"), &direction)?;
-                    if direction == [0.0; 3] {
-                        return Err(format!("{} must not be zero", at("direction")));
-                    }
-                }
-                (_, Some(_)) => {
-                    return Err(format!(
-                        "{} is allowed with kind = \"force_along\" only",
-                        at("direction")
-                    ));
-                }
-                (_, None) => {}
-            }
-        }
+        self.force_torque.iter().try_for_each(ForceTorque::check)?;
+        self.skin.iter().try_for_each(TactileSkin::check)?;
+        self.contact.iter().try_for_each(ContactSite::check)
+    }
+}
+
+fn positive(key: &str, value: f64, most: f64) -> Result<(), String> {
+    if value > 0.0 && value <= most {
         Ok(())
+    } else {
+        Err(format!("{key} = {value} must be above 0, at most {most}"))
+    }
+}
+
+fn within<T: PartialOrd + Display>(key: &str, value: T, range: [T; 2]) -> Result<(), String> {
+    let [least, most] = range;
+    if value >= least && value <= most {
+        Ok(())
+    } else {
+        Err(format!("{key} = {value} must be {least} to {most}"))
+    }
+}
+
+fn finite(key: &str, values: &[f64]) -> Result<(), String> {
+    match values.iter().find(|value| !value.is_finite()) {
+        Some(value) => Err(format!("{key} has the value {value}; it must be finite")),
+        None => Ok(()),
+    }
+}
+
+impl Base {
+    fn check(&self) -> Result<(), String> {
+        match self {
+            Self::Fixed { gravity_mps2, .. } => finite("base.gravity_mps2", gravity_mps2),
+            Self::Stance { foot } if foot.is_empty() => Err(
+                "base.foot is empty; add one [[base.foot]] for each link that may be at rest"
+                    .into(),
+            ),
+            Self::Stance { foot } => foot.iter().try_for_each(|foot| {
+                let key = format!("base.foot {:?}: gravity_mps2", foot.link);
+                finite(&key, &foot.gravity_mps2)
+            }),
+            Self::Imu { xyz_m, rpy_rad, .. } => {
+                finite("base.xyz_m", xyz_m)?;
+                finite("base.rpy_rad", rpy_rad)
+            }
+        }
     }
 }
 
 impl ForceTorque {
+    fn check(&self) -> Result<(), String> {
+        let at = |key: &str| format!("force_torque {:?}: {key}", self.sensor);
+        for (key, noise) in [("noise_n", self.noise_n), ("noise_nm", self.noise_nm)] {
+            if let Some(value) = noise.into_iter().find(|v| !(*v > 0.0 && v.is_finite())) {
+                return Err(format!(
+                    "{} has the value {value}; a standard deviation must be above 0",
+                    at(key)
+                ));
+            }
+        }
+        for (key, deviation) in [
+            ("offset_std_n", self.offset_std_n),
+            ("offset_std_nm", self.offset_std_nm),
+        ] {
+            let mut values = deviation.into_iter().flatten();
+            if let Some(value) = values.find(|v| !(*v >= 0.0 && v.is_finite())) {
+                return Err(format!(
+                    "{} has the value {value}; a standard deviation cannot be negative",
+                    at(key)
+                ));
+            }
+        }
+        if let Some(numbers) = &self.gain {
+            finite(&at("gain"), numbers)?;
+            if gain_from_force_first(numbers).is_none_or(|gain| !gain.is_invertible()) {
+                return Err(format!(
+                    "{} is singular: some wrenches would give no reading; check its numbers",
+                    at("gain")
+                ));
+            }
+        }
+        let reference = self.reference_celsius;
+        finite(&at("temperature_n_per_k"), &self.temperature_n_per_k)?;
+        finite(&at("temperature_nm_per_k"), &self.temperature_nm_per_k)?;
+        finite(&at("reference_celsius"), reference.as_slice())?;
+        let drifts = [self.temperature_n_per_k, self.temperature_nm_per_k] != [[0.0; 3]; 2];
+        if drifts && reference.is_none() {
+            return Err(format!(
+                "{} is missing: temperature_n_per_k and temperature_nm_per_k are relative to it",
+                at("reference_celsius")
+            ));
+        }
+        for (key, numbers) in [
+            ("offset_n", self.offset_n),
+            ("offset_nm", self.offset_nm),
+            ("xyz_m", self.xyz_m),
+            ("rpy_rad", self.rpy_rad),
+        ] {
+            finite(&at(key), &numbers.unwrap_or_default())?;
+        }
+        Ok(())
+    }
+
     /// Its offset, and the standard deviations of it [torque; force] \[Nm, N\].
     #[must_use]
     pub fn offset(&self) -> (Wrench, [f64; 6]) {
@@ -776,7 +720,41 @@ impl ForceTorque {
     }
 }
 
-impl Contact {
+impl TactileSkin {
+    fn check(&self) -> Result<(), String> {
+        for (key, value, most) in [
+            ("noise", self.noise, 1e6),
+            ("false_alarms_per_hour", self.false_alarms_per_hour, 1e6),
+            ("max_silence_ms", self.max_silence_ms, 3.6e6),
+            ("position_std_m", self.position_std_m.unwrap_or(1.0), 1.0),
+        ] {
+            positive(&format!("skin {:?}: {key}", self.channel), value, most)?;
+        }
+        Ok(())
+    }
+}
+
+impl ContactSite {
+    fn check(&self) -> Result<(), String> {
+        let at = |key: &str| format!("contact {:?}: {key}", self.name());
+        finite(&at("position_m"), &self.position_m)?;
+        let key = at("direction");
+        match (self.kind, self.direction) {
+            (ContactModel::ForceAlong, None) => {
+                Err(format!("{key} is missing: kind = \"force_along\" needs it"))
+            }
+            (ContactModel::ForceAlong, Some(direction)) => {
+                finite(&key, &direction)?;
+                match direction == [0.0; 3] {
+                    true => Err(format!("{key} must not be zero")),
+                    false => Ok(()),
+                }
+            }
+            (_, Some(_)) => Err(format!("{key} is allowed with kind = \"force_along\" only")),
+            (_, None) => Ok(()),
+        }
+    }
+
     /// Its name if given, else that of its link.
     #[must_use]
     pub fn name(&self) -> &str {
@@ -792,8 +770,28 @@ mod elsewhere {
     use serde::Serialize;
 
     #[derive(JsonSchema, Serialize)]
+    #[serde(remote = "super::MeasurementFrame", rename_all = "lowercase")]
+    pub(super) enum FrameWord {
+        /// The child link's.
+        Child,
+        /// The parent link's.
+        Parent,
+        /// The sensor's own, posed relative to the child link.
+        Sensor,
+    }
+
+    #[derive(JsonSchema, Serialize)]
+    #[serde(remote = "super::MeasurementDirection", rename_all = "snake_case")]
+    pub(super) enum DirectionWord {
+        /// By the child on the parent: reading = -(wrench by the parent on the child) + offset.
+        ChildToParent,
+        /// By the parent on the child: reading = wrench by the parent on the child + offset.
+        ParentToChild,
+    }
+
+    #[derive(JsonSchema, Serialize)]
     #[serde(remote = "super::Gain", rename_all = "lowercase")]
-    pub(super) enum Gain {
+    pub(super) enum GainWord {
         /// All 36 where there is a sensor: the prior keeps those that the logs do not determine.
         Auto,
         /// None: the factory gain is correct.
@@ -806,7 +804,7 @@ mod elsewhere {
 
     #[derive(JsonSchema, Serialize)]
     #[serde(remote = "super::IdentificationInput", rename_all = "lowercase")]
-    pub(super) enum IdentificationInput {
+    pub(super) enum InputWord {
         /// The force/torque sensors.
         Wrench,
         /// Measured joint torques.
@@ -815,7 +813,7 @@ mod elsewhere {
 
     #[derive(JsonSchema, Serialize)]
     #[serde(remote = "super::TorqueSide", rename_all = "lowercase")]
-    pub(super) enum TorqueSide {
+    pub(super) enum SideWord {
         /// Between gear and link, by a joint torque sensor. The rotor's inertia is not included.
         Link,
         /// At the motor: current times torque constant and gear ratio. The rotor's inertia is
@@ -884,8 +882,8 @@ mod tests {
             }
         );
         assert_eq!(config.force_torque[0].noise_n, [0.08, 0.09, 0.18]);
-        assert_eq!(config.contact[0].kind, ContactKind::Wrench);
-        assert_eq!(config.contact[0].presence, Presence::Always);
+        assert_eq!(config.contact[0].kind, ContactModel::Wrench);
+        assert_eq!(config.contact[0].presence, Occurrence::Always);
         assert!(!config.identification.enabled);
         assert_eq!(config.identification.urdf_relative_std, 0.2);
         assert_eq!(config.identification.rate_hz, 100.0);
@@ -986,6 +984,11 @@ mod tests {
                 "trigger = \"ft\"",
                 "triger = \"ft\"",
                 "unknown field `triger`",
+            ),
+            (
+                "trigger = \"ft\"",
+                "timing = \"immediate\"\nmax_wait_ms = 2",
+                "output.max_wait_ms is of no use with timing = \"immediate\"",
             ),
             (
                 "trigger = \"ft\"",

@@ -8,23 +8,22 @@
 
 mod identification;
 
-use self::identification::{IdentificationThread, StateFile, report_leading};
+use self::identification::{IdentificationThread, StateFile};
 use crate::check::{Check, Posture};
-use crate::config::{Config, ConfigError};
+use crate::config::{Config, InvalidConfig};
 use crate::first_look::FirstLook;
 use crate::gateway_log::{ChannelStatus, GatewayLog};
 use crate::pipeline::Pipeline;
 use crate::setup::Setup;
 use anyhow::{Context, anyhow};
-use proprio_identification::online::{Hypothesis, Paused};
 use proprio_topics::ipc::{
     Domain, DomainConfig, PortError, Reader, Renewal, Renewing, Topic, Watch, Writer, monotonic,
     open_files_remedy,
 };
 use proprio_topics::{
     ContactDeclaration, ContactEstimate, Description, DriveEstimate, EstimatorHealth,
-    GatewayHealth, IdentificationHealth, InertiaEstimate, Nanos, Publisher, Role, Sample,
-    TorqueBudget, TorqueEstimate, realtime,
+    GatewayHealth, InertiaEstimate, Nanos, Publisher, Role, Sample, TorqueBudget, TorqueEstimate,
+    realtime,
 };
 use sd_notify::NotifyState;
 use std::io::Write as _;
@@ -61,7 +60,7 @@ pub fn check(
 ) -> anyhow::Result<Setup> {
     let (_, setup) = load(config, |_| {})?;
     let file = config.to_owned();
-    let wrong = |problem| ConfigError {
+    let wrong = |problem| InvalidConfig {
         file: file.clone(),
         problem,
     };
@@ -70,7 +69,7 @@ pub fn check(
     // The reader of a pipe may close it early.
     let _ = write!(std::io::stdout(), "{setup}{checked}");
     match checked.problem() {
-        Some(problem) => Err(ConfigError { file, problem }.into()),
+        Some(problem) => Err(InvalidConfig { file, problem }.into()),
         None => Ok(setup),
     }
 }
@@ -78,7 +77,7 @@ pub fn check(
 /// Runs the estimator until SIGTERM or SIGINT.
 ///
 /// # Errors
-/// One error chain that states what is wrong, where, and what to do. [`ConfigError`] in the chain
+/// One error chain that states what is wrong, where, and what to do. [`InvalidConfig`] in the chain
 /// means a wrong configuration.
 pub fn run(config: &Path, domain: &DomainConfig) -> anyhow::Result<()> {
     let (config, setup) = load(config, |_| {})?;
@@ -97,11 +96,14 @@ pub fn run(config: &Path, domain: &DomainConfig) -> anyhow::Result<()> {
 /// identified parameters). Logs the warnings.
 ///
 /// # Errors
-/// [`ConfigError`].
-pub fn load(file: &Path, adjust: impl FnOnce(&mut Config)) -> Result<(Config, Setup), ConfigError> {
+/// [`InvalidConfig`].
+pub fn load(
+    file: &Path,
+    adjust: impl FnOnce(&mut Config),
+) -> Result<(Config, Setup), InvalidConfig> {
     let mut config = Config::load(file)?;
     adjust(&mut config);
-    let setup = Setup::new(&config).map_err(|problem| ConfigError {
+    let setup = Setup::new(&config).map_err(|problem| InvalidConfig {
         file: file.to_owned(),
         problem,
     })?;
@@ -128,7 +130,7 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
     let mut gateway_log = GatewayLog::new(&setup, &domain.config().name);
     let mut gateway = Watch::<GatewayHealth>::default();
     let renewal = Arc::new(Renewal::default());
-    let shared = Shared {
+    let shared = PlaneStatus {
         last_turn: Arc::clone(&last_turn),
         channels: Arc::clone(&channels),
     };
@@ -158,7 +160,11 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
     tracing::info!(robot = config.robot, "running");
     let _ = sd_notify::notify(&[NotifyState::Ready, NotifyState::Status("running")]);
     let watchdog = sd_notify::watchdog_enabled();
-    let (mut is_damaged, mut has_failed) = (false, false);
+    let mut renewal = RenewalLog {
+        renewal,
+        is_damaged: false,
+        has_failed: false,
+    };
     let mut ticks = tokio::time::interval(Duration::from_millis(100));
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     let why = loop {
@@ -171,25 +177,9 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
             break "the data plane has ended";
         }
         let now = monotonic();
-        match domain.renewed() {
-            Some(renewed) => {
-                if !std::mem::replace(&mut is_damaged, true) {
-                    tracing::error!("{}", domain.damage());
-                }
-                match renewed {
-                    Ok(new) => {
-                        domain = new;
-                        renewal.pass(domain.clone());
-                        gateway = Watch::default();
-                    }
-                    Err(error) if !has_failed => {
-                        has_failed = true;
-                        tracing::error!("{error}; trying again");
-                    }
-                    Err(_) => {}
-                }
-            }
-            None => (is_damaged, has_failed) = (false, false),
+        if let Some(new) = renewal.renewed(&domain) {
+            domain = new;
+            gateway = Watch::default();
         }
         gateway_log.tell(gateway.look(&domain, &config.robot, now), &channels, now);
         if watchdog.is_some() && now - Nanos(last_turn.load(Relaxed)) < STALLED {
@@ -204,8 +194,40 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
         .map_err(|_| anyhow!("the data plane panicked; this is a bug in the program: report it"))
 }
 
+/// Passes a domain that replaces a damaged one to the data plane, and tells of it once.
+struct RenewalLog {
+    renewal: Arc<Renewal>,
+    is_damaged: bool,
+    has_failed: bool,
+}
+
+impl RenewalLog {
+    /// The new domain, if the present one is damaged and could be replaced.
+    fn renewed(&mut self, domain: &Domain) -> Option<Domain> {
+        let Some(renewed) = domain.renewed() else {
+            (self.is_damaged, self.has_failed) = (false, false);
+            return None;
+        };
+        if !std::mem::replace(&mut self.is_damaged, true) {
+            tracing::error!("{}", domain.damage());
+        }
+        match renewed {
+            Ok(new) => {
+                self.renewal.pass(new.clone());
+                Some(new)
+            }
+            Err(error) => {
+                if !std::mem::replace(&mut self.has_failed, true) {
+                    tracing::error!("{error}; trying again");
+                }
+                None
+            }
+        }
+    }
+}
+
 /// What data plane and control plane tell each other, without a lock.
-struct Shared {
+struct PlaneStatus {
     /// The time of the last turn of its loop.
     last_turn: Arc<AtomicI64>,
     /// Per channel of the configuration, what has come of it.
@@ -213,7 +235,7 @@ struct Shared {
 }
 
 /// The ports of the data plane.
-struct Ports {
+struct EstimatorPorts {
     domain: Domain,
     samples: Option<Reader<Sample>>,
     descriptions: Option<Reader<Description>>,
@@ -229,7 +251,7 @@ struct Ports {
     description: Writer<Description>,
 }
 
-impl Ports {
+impl EstimatorPorts {
     fn open(domain: Domain, setup: &Setup, robot: &str, identifies: bool) -> anyhow::Result<Self> {
         let epoch = domain.epoch();
         // The health topic first: it admits one writer, so a second estimator of this robot fails
@@ -267,7 +289,7 @@ impl Ports {
 struct DataPlane {
     robot: String,
     pipeline: Pipeline,
-    ports: Ports,
+    ports: EstimatorPorts,
     renewing: Renewing,
     /// Losses and epochs of the readers of domains before.
     lost: u64,
@@ -290,7 +312,7 @@ struct DataPlane {
     next_health: Nanos,
     /// When the next budget is due, and the joint that it is of.
     next_budget: (Nanos, usize),
-    shared: Shared,
+    shared: PlaneStatus,
 }
 
 impl DataPlane {
@@ -299,14 +321,14 @@ impl DataPlane {
         robot: &str,
         setup: Setup,
         state_file: Option<StateFile>,
-        shared: Shared,
+        shared: PlaneStatus,
         renewing: Renewing,
     ) -> anyhow::Result<Self> {
         let first_look = FirstLook::start(&setup)?;
         let mut pipeline = Pipeline::new(setup);
         let identifies = pipeline.identification().is_some();
         // Before the state: another estimator of this robot may be using its file.
-        let ports = Ports::open(domain, pipeline.setup(), robot, identifies)?;
+        let ports = EstimatorPorts::open(domain, pipeline.setup(), robot, identifies)?;
         if let Some(state_file) = &state_file {
             state_file.resume(&mut pipeline);
         }
@@ -347,7 +369,7 @@ impl DataPlane {
     fn renew(&mut self, now: Nanos) {
         let (setup, robot) = (self.pipeline.setup(), &self.robot);
         let identifies = self.ports.inertias.is_some();
-        let open = |domain: &Domain| Ports::open(domain.clone(), setup, robot, identifies);
+        let open = |domain: &Domain| EstimatorPorts::open(domain.clone(), setup, robot, identifies);
         match self.renewing.ports(now, open) {
             Some(Ok(ports)) => {
                 if let Some(samples) = &self.ports.samples {
@@ -622,52 +644,10 @@ impl DataPlane {
         ) = (counts.late, counts.backward, counts.not_finite);
         self.health.lost = self.lost + self.ports.samples.as_ref().map_or(0, Reader::lost);
         self.health.epochs = self.epochs + self.ports.samples.as_ref().map_or(0, Reader::epochs);
-        if let (Some(identification), Some(online)) =
+        if let (Some(thread), Some(online)) =
             (&mut self.identification, self.pipeline.identification())
         {
-            let mut sum = IdentificationHealth {
-                groups: u32::try_from(identification.reported.len()).unwrap_or(0),
-                ..IdentificationHealth::default()
-            };
-            for (component, (reported, changes, leading)) in
-                identification.reported.iter_mut().enumerate()
-            {
-                let Some((paused, counts)) = online.state(component) else {
-                    continue;
-                };
-                sum.paused += u32::from(paused != Paused::No);
-                sum.learnt += counts.learnt;
-                sum.still += counts.still;
-                sum.contact += counts.contact;
-                sum.outlier += counts.outlier;
-                sum.suspected += counts.suspected;
-                sum.stale += counts.stale;
-                sum.saturated += counts.saturated;
-                sum.device_fault += counts.device_fault;
-                sum.unseen += counts.unseen;
-                sum.offset_changes += counts.offset_changes;
-                sum.load_changes += counts.load_changes;
-                sum.unknown_changes += counts.changes - counts.offset_changes - counts.load_changes;
-                // Common to all components.
-                sum.late = counts.late;
-                sum.failed += counts.failed;
-                let group = identification.groups.get(component).map(String::as_str);
-                if std::mem::replace(reported, paused) != paused {
-                    tracing::info!(group, "{}", paused.describe(&self.pipeline.setup().robot));
-                }
-                if std::mem::replace(changes, counts.changes) != counts.changes
-                    && let Some(change) = online.last_change(component)
-                {
-                    tracing::warn!(group, "{change}");
-                }
-                let likelier = online.solution().components.get(component);
-                let likelier = likelier.and_then(|own| own.leading);
-                let kind = likelier.map(Hypothesis::without_estimate);
-                if std::mem::replace(leading, kind) != kind {
-                    report_leading(group, likelier, &self.pipeline.setup().robot);
-                }
-            }
-            self.health.identification = sum;
+            self.health.identification = thread.health(online, &self.pipeline.setup().robot);
         }
         // A failed send is not repeated: the next health message follows soon.
         let _ = self.ports.health.send(&self.health, now);

@@ -17,28 +17,22 @@ impl Setup {
     /// The standard deviation of the torque contains their uncertainty.
     #[must_use]
     pub fn upstream_note(&self) -> String {
+        let (model, cuts) = (&self.robot.model, self.robot.structure.sensors());
         let mut parts = Vec::new();
-        for sensor in self.robot.structure.sensors() {
+        for sensor in cuts {
             let (mut joints, mut are_identified) = (Vec::new(), true);
             let mut joint = sensor.joint();
             // Up to the root, or to the next sensor: then both ends of the segment are measured.
             let bounded = loop {
-                let parent = self.robot.model.joints().get(joint).map_or(0, |j| j.parent);
+                let parent = model.joints().get(joint).map_or(0, |j| j.parent);
                 if parent == 0 {
                     break false;
                 }
                 are_identified &= self.state.is_identified(parent);
                 joint = parent - 1;
-                if self
-                    .robot
-                    .structure
-                    .sensors()
-                    .iter()
-                    .any(|s| s.joint() == joint)
-                {
+                if cuts.iter().any(|cut| cut.joint() == joint) {
                     break true;
                 }
-                let model = &self.robot.model;
                 let moves = model.joints().get(joint).is_some_and(|j| j.dof.is_some());
                 // Between a moving joint and a sensor in it there is no mass.
                 if moves && model.cut(model.joint_name(joint)) != Some(sensor.joint()) {
@@ -47,14 +41,14 @@ impl Setup {
             };
             if !joints.is_empty() && !bounded {
                 joints.reverse();
-                let whose = if are_identified {
-                    "the identified parameters of the links in between"
-                } else {
-                    "the URDF's parameters of the links in between"
+                let whose = match are_identified {
+                    true => "the identified parameters",
+                    false => "the URDF's parameters",
                 };
                 parts.push(format!(
-                    "{} is mounted beyond {}: the torques of these joints also depend on {whose}.",
-                    self.robot.model.joint_name(sensor.joint()),
+                    "{} is mounted beyond {}: the torques of these joints also depend on {whose} \
+                     of the links in between.",
+                    model.joint_name(sensor.joint()),
                     joints.join(", ")
                 ));
             }
@@ -240,52 +234,38 @@ impl Setup {
     }
 }
 
-impl fmt::Display for Setup {
-    /// The text that `proprio estimator --check` prints.
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Setup {
+    /// Writes where kinematics start.
+    fn write_base(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let base = self.robot.model.link_name(self.robot.base_link);
+        let stances = match &self.robot.base {
+            BaseMotion::Imu(_) => return writeln!(f, "base {base}: an IMU measures its motion"),
+            BaseMotion::Standing(_) => return writeln!(f, "base {base}: at rest"),
+            BaseMotion::Stance(stances) => stances,
+        };
         writeln!(
             f,
-            "robot {}: {} links, {} moving joints, {} sub-trees",
-            self.robot.name,
-            self.robot.model.link_count(),
-            self.robot.model.dof_count(),
-            self.robot.structure.subtrees().len()
+            "base: the first of these links whose contact is present, at rest"
         )?;
-        let base = self.robot.model.link_name(self.robot.base_link);
-        match &self.robot.base {
-            BaseMotion::Imu(_) => writeln!(f, "base {base}: an IMU measures its motion")?,
-            BaseMotion::Standing(_) => writeln!(f, "base {base}: at rest")?,
-            BaseMotion::Stance(stances) => {
-                writeln!(
-                    f,
-                    "base: the first of these links whose contact is present, at rest"
-                )?;
-                for stance in stances {
-                    let contact = self
-                        .robot
-                        .contacts
-                        .get(stance.contact)
-                        .map_or("", |c| c.name.as_str());
-                    writeln!(
-                        f,
-                        "  {} with contact {contact}",
-                        self.robot.model.link_name(stance.link)
-                    )?;
-                }
-            }
+        for stance in stances {
+            let contact = self.robot.contacts.get(stance.contact);
+            let contact = contact.map_or("", |contact| contact.name.as_str());
+            let link = self.robot.model.link_name(stance.link);
+            writeln!(f, "  {link} with contact {contact}")?;
         }
+        Ok(())
+    }
+
+    /// Writes the channels, the skins, and where F/T sensors are that move.
+    fn write_channels(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (number, channel) in self.robot.channels.iter().enumerate() {
             let trigger = if number == self.robot.trigger {
                 " (trigger: each of its stamps gives an estimate)"
             } else {
                 ""
             };
-            writeln!(
-                f,
-                "  reads {} {}{trigger}",
-                channel.kind.word(),
-                channel.name
-            )?;
+            let kind = channel.kind.word();
+            writeln!(f, "  reads {kind} {}{trigger}", channel.name)?;
         }
         for skin in &self.skins {
             let taxels = skin.taxels.iter().flatten().count();
@@ -310,6 +290,12 @@ impl fmt::Display for Setup {
                 )?;
             }
         }
+        Ok(())
+    }
+
+    /// Writes which joints are locked or follow others.
+    fn write_joints(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let model = &self.robot.model;
         for (number, joint) in model.joints().iter().enumerate() {
             let name = model.joint_name(number);
             match joint.dof.and_then(|_| model.follows(name)) {
@@ -325,43 +311,57 @@ impl fmt::Display for Setup {
         }
         for (dof, position) in self.robot.locked.iter().enumerate() {
             if !position.is_nan() {
-                writeln!(
-                    f,
-                    "  locked {} at {position}",
-                    self.robot.model.dof_name(dof)
-                )?;
+                writeln!(f, "  locked {} at {position}", model.dof_name(dof))?;
             }
         }
-        for (number, subtree) in self.robot.structure.subtrees().iter().enumerate() {
-            let sensors: Vec<_> = subtree
-                .sensors
-                .iter()
-                .filter_map(|s| self.robot.structure.sensors().get(s))
-                .map(|s| self.robot.model.joint_name(s.joint()))
+        Ok(())
+    }
+
+    /// Writes what each sub-tree is solved from.
+    fn write_subtrees(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (model, structure) = (&self.robot.model, &self.robot.structure);
+        for (number, subtree) in structure.subtrees().iter().enumerate() {
+            let sensors = subtree.sensors.iter();
+            let sensors: Vec<_> = sensors
+                .filter_map(|s| structure.sensors().get(s))
+                .map(|s| model.joint_name(s.joint()))
                 .collect();
-            let contacts: Vec<_> = subtree
-                .contacts
-                .iter()
-                .map(|c| self.robot.contact_label(c))
-                .collect();
-            let unknowns: usize = subtree
-                .contacts
-                .iter()
-                .filter_map(|c| self.robot.structure.contacts().get(c))
-                .map(|c| c.kind.unknowns())
-                .sum();
+            let contacts = subtree.contacts.iter();
+            let names: Vec<_> = contacts.map(|c| self.robot.contact_label(c)).collect();
+            let contacts = subtree.contacts.iter();
+            let specs = contacts.filter_map(|c| structure.contacts().get(c));
+            let unknowns: usize = specs.map(|spec| spec.kind.unknowns()).sum();
             writeln!(
                 f,
                 "sub-tree {number} from {}: F/T [{}], contacts [{}]: {unknowns} unknowns in 6 \
                  equations",
-                self.robot.model.link_name(subtree.top),
+                model.link_name(subtree.top),
                 sensors.join(", "),
-                contacts.join(", ")
+                names.join(", ")
             )?;
             if let Some(note) = self.identifiability_note(number) {
                 writeln!(f, "  {note}")?;
             }
         }
+        Ok(())
+    }
+}
+
+impl fmt::Display for Setup {
+    /// The text that `proprio estimator --check` prints.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "robot {}: {} links, {} moving joints, {} sub-trees",
+            self.robot.name,
+            self.robot.model.link_count(),
+            self.robot.model.dof_count(),
+            self.robot.structure.subtrees().len()
+        )?;
+        self.write_base(f)?;
+        self.write_channels(f)?;
+        self.write_joints(f)?;
+        self.write_subtrees(f)?;
         self.write_parameters(f)?;
         let note = self.upstream_note();
         if !note.is_empty() {

@@ -9,7 +9,7 @@
 //! K s = tau + (c + l |tau|) sgn(dq) + d dq + J ddq + b
 //! ```
 //!
-//! | symbol | [`Drive::parameters`] | unit |
+//! | symbol | [`DriveModel::parameters`] | unit |
 //! |---|---|---|
 //! | `K` | constant: torque of the joint by the reported one, or by current | 1; Nm/A |
 //! | `c` | Coulomb friction | Nm |
@@ -34,8 +34,8 @@
 //! - Residuals are correlated within a second, not between seconds: the covariance is that of the
 //!   sums over seconds (the "sandwich" of cluster-robust statistics).
 //! - The error of `tau` itself is that of the robot's parameters, and does not average out. The
-//!   drive inherits it ([`Drive::inherited`]): it is part of the deviation of the drive's torque,
-//!   and not of the difference between both.
+//!   drive inherits it ([`DriveModel::inherited`]): it is part of the deviation of the drive's
+//!   torque, and not of the difference between both.
 //! - What a log does not show (friction of a joint that stood still) keeps a wide prior.
 
 use nalgebra::{Matrix6, Vector6};
@@ -62,7 +62,7 @@ const LEAST_NOISE: f64 = 1e-5;
 /// What a drive reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Signal {
+pub enum DriveSignal {
     /// A torque \[Nm; N\].
     Torque,
     /// A current \[A\].
@@ -71,11 +71,11 @@ pub enum Signal {
 
 /// A joint's drive, as identified.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Drive {
+pub struct DriveModel {
     /// The joint.
     pub joint: String,
     /// What it reports.
-    pub signal: Signal,
+    pub signal: DriveSignal,
     /// `K, c, d, l, J, b`, see [`crate::drive`].
     pub parameters: [f64; 6],
     /// Their covariance, if the torques that they were found from are exact.
@@ -89,7 +89,7 @@ pub struct Drive {
 
 /// What a joint and its drive do at one instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Row {
+pub struct DriveRow {
     /// The instant.
     pub t: Nanos,
     /// What the drive reports: torque \[Nm; N\] and current \[A\], NaN where it reports none.
@@ -125,7 +125,7 @@ pub enum Unfit {
     Unrelated,
 }
 
-impl Drive {
+impl DriveModel {
     /// The torque of the joint by its drive \[Nm; N\], from what it reports and the joint's motion;
     /// and two variances: the second is what it inherits.
     #[must_use]
@@ -157,7 +157,7 @@ impl Drive {
         )
     }
 
-    /// Standard deviations of [`Drive::parameters`], with what they inherit.
+    /// Standard deviations of [`DriveModel::parameters`], with what they inherit.
     #[must_use]
     pub fn deviations(&self) -> [f64; 6] {
         let [relative, offset] = self.inherited;
@@ -169,7 +169,7 @@ impl Drive {
     }
 }
 
-impl Signal {
+impl DriveSignal {
     /// Its value in a report.
     #[must_use]
     pub const fn of(self, [torque, current]: [f64; 2]) -> f64 {
@@ -186,14 +186,15 @@ impl Signal {
 ///
 /// # Errors
 /// [`Unfit`], of the first that it reports.
-pub fn fit(joint: &str, logs: &[Vec<Row>]) -> Option<Result<Drive, Unfit>> {
-    let is_reported = |signal: &Signal| {
+pub fn fit(joint: &str, logs: &[Vec<DriveRow>]) -> Option<Result<DriveModel, Unfit>> {
+    let is_reported = |signal: &DriveSignal| {
         let mut rows = logs.iter().flatten();
         rows.any(|row| signal.of(row.report).is_finite())
     };
-    let signals = [Signal::Torque, Signal::Current].into_iter();
+    let signals = [DriveSignal::Torque, DriveSignal::Current].into_iter();
     let found = signals.filter(is_reported).map(|signal| {
-        let fitted = |has_load| Fit::new(signal, logs, has_load).and_then(|fit| fit.drive(joint));
+        let fitted =
+            |has_load| DriveFit::new(signal, logs, has_load).and_then(|fit| fit.drive(joint));
         fitted(true)
             .ok()
             .filter(|drive| {
@@ -222,21 +223,21 @@ struct Equation {
 }
 
 /// A fit of `s = x . theta`.
-struct Fit {
-    signal: Signal,
+struct DriveFit {
+    signal: DriveSignal,
     has_load: bool,
     seconds: Vec<Second>,
     /// RMS of `s`.
     report: f64,
-    /// See [`Fit::wide`].
+    /// See [`DriveFit::wide`].
     prior: Matrix6<f64>,
     theta: Vector6<f64>,
     /// Variance of a residual in motion.
     variance: f64,
 }
 
-impl Fit {
-    fn new(signal: Signal, logs: &[Vec<Row>], has_load: bool) -> Result<Self, Unfit> {
+impl DriveFit {
+    fn new(signal: DriveSignal, logs: &[Vec<DriveRow>], has_load: bool) -> Result<Self, Unfit> {
         let seconds = seconds(signal, logs, has_load);
         if seconds.len() < LEAST_SECONDS {
             return Err(Unfit::TooShort {
@@ -365,7 +366,7 @@ impl Fit {
         count / (count - if self.has_load { 6.0 } else { 5.0 })
     }
 
-    fn drive(mut self, joint: &str) -> Result<Drive, Unfit> {
+    fn drive(mut self, joint: &str) -> Result<DriveModel, Unfit> {
         (0..ROUNDS)
             .try_for_each(|_| self.improve())
             .ok_or(Unfit::Unrelated)?;
@@ -382,7 +383,7 @@ impl Fit {
         }
         let error = self.rows().map(|(_, row)| row.torque).sum::<f64>();
         let error = (error / self.rows().count() as f64).sqrt();
-        let drive = Drive {
+        let drive = DriveModel {
             joint: joint.to_owned(),
             signal: self.signal,
             parameters,
@@ -398,7 +399,7 @@ impl Fit {
 }
 
 /// The usable rows, by second.
-fn seconds(signal: Signal, logs: &[Vec<Row>], has_load: bool) -> Vec<Second> {
+fn seconds(signal: DriveSignal, logs: &[Vec<DriveRow>], has_load: bool) -> Vec<Second> {
     let mut seconds: Vec<Second> = Vec::new();
     for log in logs {
         let mut last = None;
@@ -436,10 +437,10 @@ mod tests {
     use proptest::prelude::*;
 
     /// A drive with this model, and no uncertainty.
-    fn exact(parameters: [f64; 6]) -> Drive {
-        Drive {
+    fn exact(parameters: [f64; 6]) -> DriveModel {
+        DriveModel {
             joint: "elbow".into(),
-            signal: Signal::Current,
+            signal: DriveSignal::Current,
             parameters,
             covariance: Matrix6::zeros(),
             inherited: [0.0; 2],
@@ -459,7 +460,7 @@ mod tests {
         parameters: [f64; 6],
         seconds: f64,
         reports: impl Fn(f64, f64) -> [f64; 2],
-    ) -> Vec<Row> {
+    ) -> Vec<DriveRow> {
         let row = |number: u32| {
             let t = 0.02 * f64::from(number);
             let moves = if t % 5.0 < 4.0 { 1.0 } else { 0.0 };
@@ -468,7 +469,7 @@ mod tests {
                 moves * 1.5 * (1.7 * t).cos(),
             );
             let torque = 4.0 * (0.61 * t).sin() + 2.0 * (2.3 * t).cos();
-            Row {
+            DriveRow {
                 t: Nanos::from_seconds(t),
                 report: reports(t, report(parameters, torque, velocity, acceleration)),
                 torque,
@@ -501,7 +502,7 @@ mod tests {
     fn a_report_without_noise_gives_the_model() {
         let found = fit("elbow", &[rows(MODEL, 40.0, |_, s| [f64::NAN, s])]);
         let found = found.unwrap().unwrap();
-        assert_eq!(found.signal, Signal::Current);
+        assert_eq!(found.signal, DriveSignal::Current);
         for (found, expected) in found.parameters.into_iter().zip(MODEL) {
             assert!((found - expected).abs() < 2e-3, "{found} {expected}");
         }
@@ -543,7 +544,10 @@ mod tests {
         let noisy = |t: f64, s: f64| [s + 0.05 * (97.0 * t).sin(), f64::NAN];
         let found = fit("elbow", &[rows([k, c, d, 0.0, j, b], 40.0, noisy)]);
         let found = found.unwrap().unwrap();
-        assert_eq!((found.signal, found.parameters[3]), (Signal::Torque, 0.0));
+        assert_eq!(
+            (found.signal, found.parameters[3]),
+            (DriveSignal::Torque, 0.0)
+        );
         assert_eq!(found.deviations()[3], 0.0);
     }
 
@@ -551,7 +555,7 @@ mod tests {
     #[test]
     fn the_report_that_follows_the_torque_is_used() {
         let both = fit("elbow", &[rows(MODEL, 40.0, |_, s| [0.0, s])]);
-        assert_eq!(both.unwrap().unwrap().signal, Signal::Current);
+        assert_eq!(both.unwrap().unwrap().signal, DriveSignal::Current);
         let constant = fit("elbow", &[rows(MODEL, 40.0, |_, _| [1.5, f64::NAN])]);
         assert_eq!(constant, Some(Err(Unfit::Unrelated)));
         let short = fit("elbow", &[rows(MODEL, 8.0, |_, s| [s, f64::NAN])]);

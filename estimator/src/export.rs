@@ -2,7 +2,7 @@
 //! ([`Parameters`]).
 
 use crate::parameters::{
-    Calibrated, Friction, Offset, Parameters, ParametersError, Provenance, Rotor, Span,
+    Friction, Offset, Parameters, ParametersError, Provenance, Rotor, SensorCalibration, UsedLog,
 };
 use nalgebra::DMatrix;
 use proprio_dynamics::calibration::Unknown;
@@ -25,126 +25,124 @@ pub fn parameters(
     robot: &Robot,
     program: &str,
 ) -> Result<Parameters, ParametersError> {
-    let trained = || outcome.logs.iter().filter(|log| log.role == LogRole::Train);
+    let logs = trained(outcome).map(|log| UsedLog {
+        file: log.file.clone(),
+        start: log.span.0,
+        end: log.span.1,
+    });
     let provenance = Provenance {
         program: program.to_owned(),
         tau: outcome.tau.is_finite().then_some(outcome.tau),
-        logs: trained()
-            .map(|log| Span {
-                file: log.file.clone(),
-                start: log.span.0,
-                end: log.span.1,
-            })
-            .collect(),
+        logs: logs.collect(),
     };
-    let mut parameters = Parameters::new(robot, provenance);
-
-    let columns = &outcome.covariance.columns;
-    let place = |unknown: ParameterColumn| columns.iter().position(|column| *column == unknown);
-    let (mut inertias, mut offsets, mut places, mut calibrations) =
-        (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    // What was identified, and where the covariance of the outcome has it.
+    let (mut inertias, mut offsets) = (Vec::new(), Vec::new());
+    let (mut rows, mut of_calibrations) = (Vec::new(), Vec::new());
     for link in &outcome.links {
-        let of_link = (0..10).filter_map(|parameter| {
-            place(ParameterColumn::Inertial {
-                link: link.link,
-                parameter,
-            })
+        let number = link.link;
+        let unknowns = (0..10).map(|parameter| ParameterColumn::Inertial {
+            link: number,
+            parameter,
         });
-        let of_link: Vec<usize> = of_link.collect();
-        if of_link.len() == 10 {
-            inertias.push((link.link, link.identified));
-            places.extend(of_link);
+        if let Some(own) = rows_of(outcome, unknowns) {
+            inertias.push((number, link.identified));
+            rows.extend(own);
         }
     }
     for channel in &robot.channels {
         let ChannelRole::Sensor(sensor) = channel.role else {
             continue;
         };
-        let of_sensor =
-            (0..6).filter_map(|component| place(ParameterColumn::Offset { sensor, component }));
-        let of_sensor: Vec<usize> = of_sensor.collect();
-        let last = trained()
-            .rev()
-            .find_map(|log| Some((log, log.offsets.iter().find(|o| o.sensor == channel.name)?)));
-        let (Some((log, offset)), 6) = (last, of_sensor.len()) else {
-            continue;
-        };
-        let calibration = outcome
-            .calibrations
-            .iter()
-            .find(|own| own.sensor == channel.name);
-        let of_calibration = (0..outcome.covariance.calibrations.len()).filter(|&place| {
-            outcome
-                .covariance
-                .calibrations
-                .get(place)
-                .is_some_and(|(own, _)| *own == sensor)
-        });
-        calibrations.extend(of_calibration.map(|place| columns.len() + place));
-        offsets.push(Offset {
-            sensor: channel.name.clone(),
-            reading: wrench(&offset.end),
-            drift: wrench(&offset.rate),
-            known: log.span.1,
-            noise: wrench(&AXES.map(|axis| {
-                let name = format!("wrench/{}/{axis}", channel.name);
-                let found = outcome.channels.iter().find(|own| own.name == name);
-                found.map_or(0.0, |own| own.deviation)
-            })),
-            calibrated: calibration.map(|own| Calibrated {
-                calibration: own.identified,
-                kind: own.kind,
-            }),
-        });
-        places.extend(of_sensor);
-    }
-    places.extend(calibrations);
-    // The outcome has U U^T, where rows of U are unknowns; here root^T root, where columns are.
-    let upper = &outcome.covariance.root;
-    let root = DMatrix::from_fn(upper.ncols(), places.len(), |i, j| {
-        places
-            .get(j)
-            .and_then(|row| upper.get((*row, i)))
-            .copied()
-            .unwrap_or(f64::NAN)
-    });
-    parameters.set_identified(&inertias, &offsets, &root)?;
-
-    // For each joint, the friction of the last log that has it.
-    let mut friction: Vec<Friction> = Vec::new();
-    for mut found in trained().rev().flat_map(frictions) {
-        if !friction.iter().any(|f| f.joint == found.joint) {
-            let own = outcome
-                .rotors
-                .iter()
-                .find(|rotor| rotor.joint == found.joint);
-            found.rotor = own.map(|rotor| Rotor {
-                inertia: rotor.inertia,
-                deviation: rotor.deviation,
-            });
-            friction.push(found);
+        let unknowns = (0..6).map(|component| ParameterColumn::Offset { sensor, component });
+        let own = rows_of(outcome, unknowns);
+        if let (Some(offset), Some(own)) = (last_offset(outcome, &channel.name), own) {
+            offsets.push(offset);
+            rows.extend(own);
+            let calibrations = outcome.covariance.calibrations.iter();
+            let calibrations = calibrations.zip(outcome.covariance.columns.len()..);
+            let own = calibrations.filter(|((other, _), _)| *other == sensor);
+            of_calibrations.extend(own.map(|(_, row)| row));
         }
     }
-    parameters.set_friction(&friction)?;
+    rows.extend(of_calibrations);
+    // The outcome has U U^T, where rows of U are unknowns; here root^T root, where columns are.
+    let upper = &outcome.covariance.root;
+    let root = DMatrix::from_fn(upper.ncols(), rows.len(), |i, j| {
+        let number = rows.get(j).and_then(|row| upper.get((*row, i)));
+        number.copied().unwrap_or(f64::NAN)
+    });
+    let mut parameters = Parameters::new(robot, provenance);
+    parameters.set_identified(&inertias, &offsets, &root)?;
+    parameters.set_friction(&frictions(outcome))?;
     Ok(parameters)
+}
+
+/// For each joint, the friction of the last log that has it, and the joint's rotor.
+fn frictions(outcome: &Outcome) -> Vec<Friction> {
+    let mut frictions: Vec<Friction> = Vec::new();
+    for found in trained(outcome).rev().flat_map(|log| &log.friction) {
+        if frictions.iter().any(|own| own.joint == found.joint) {
+            continue;
+        }
+        let rotor = (outcome.rotors.iter()).find(|rotor| rotor.joint == found.joint);
+        frictions.push(Friction {
+            joint: found.joint.clone(),
+            coulomb: found.coulomb_nm,
+            viscous: found.viscous,
+            offset: found.offset_nm,
+            rotor: rotor.map(|rotor| Rotor {
+                inertia: rotor.inertia,
+                deviation: rotor.deviation,
+            }),
+        });
+    }
+    frictions
+}
+
+fn trained(outcome: &Outcome) -> impl DoubleEndedIterator<Item = &LogOutcome> {
+    outcome.logs.iter().filter(|log| log.role == LogRole::Train)
+}
+
+/// The rows of unknowns in the root of the outcome's covariance; none if it lacks one.
+fn rows_of(
+    outcome: &Outcome,
+    unknowns: impl Iterator<Item = ParameterColumn>,
+) -> Option<Vec<usize>> {
+    let columns = &outcome.covariance.columns;
+    unknowns
+        .map(|unknown| columns.iter().position(|column| *column == unknown))
+        .collect()
+}
+
+/// A sensor's offset at the end of the last training log that contains it, and its calibration.
+fn last_offset(outcome: &Outcome, sensor: &str) -> Option<Offset> {
+    let (log, offset) = trained(outcome).rev().find_map(|log| {
+        let offset = log.offsets.iter().find(|offset| offset.sensor == sensor)?;
+        Some((log, offset))
+    })?;
+    let calibrations = &outcome.calibrations;
+    let calibration = calibrations.iter().find(|found| found.sensor == sensor);
+    let noise = AXES.map(|axis| {
+        let name = format!("wrench/{sensor}/{axis}");
+        let channel = outcome.channels.iter().find(|channel| channel.name == name);
+        channel.map_or(0.0, |channel| channel.deviation)
+    });
+    Some(Offset {
+        sensor: sensor.to_owned(),
+        reading: wrench(&offset.end),
+        drift: wrench(&offset.rate),
+        known: log.span.1,
+        noise: wrench(&noise),
+        calibrated: calibration.map(|found| SensorCalibration {
+            calibration: found.identified,
+            kind: found.kind,
+        }),
+    })
 }
 
 /// A wrench from `[fx fy fz tx ty tz]`.
 fn wrench([fx, fy, fz, tx, ty, tz]: &[f64; 6]) -> Wrench {
     Wrench::from_parts([*fx, *fy, *fz], [*tx, *ty, *tz])
-}
-
-fn frictions(log: &LogOutcome) -> Vec<Friction> {
-    log.friction
-        .iter()
-        .map(|f| Friction {
-            joint: f.joint.clone(),
-            coulomb: f.coulomb_nm,
-            viscous: f.viscous,
-            offset: f.offset_nm,
-            rotor: None,
-        })
-        .collect()
 }
 
 /// What is known with these parameters about `robot` before it takes a payload up.

@@ -223,7 +223,7 @@ mod tests {
     fn setup() -> Setup {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/oracle/sessions");
         let mut config = Config::load(&folder.join("estimator.toml")).expect("a configuration");
-        config.contact.last_mut().expect("the hand").presence = crate::config::Presence::Possible;
+        config.contact.last_mut().expect("the hand").presence = crate::config::Occurrence::Possible;
         Setup::new(&config).expect("it fits")
     }
 

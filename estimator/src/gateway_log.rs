@@ -45,7 +45,7 @@ impl ChannelStatus {
 
 /// Why a channel is missing, if it is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Missing {
+enum Absence {
     No,
     Undescribed,
     Silent,
@@ -53,12 +53,12 @@ enum Missing {
 
 /// A channel, as the log knows it.
 #[derive(Debug)]
-struct Channel {
+struct WatchedChannel {
     name: String,
     newest: i64,
     /// When its next sample must have come.
     due: Nanos,
-    told: Missing,
+    told: Absence,
 }
 
 /// Turns what is known of the gateway into log lines.
@@ -68,18 +68,18 @@ pub(crate) struct GatewayLog {
     domain: String,
     told: Option<Presence>,
     silence: Nanos,
-    channels: Vec<Channel>,
+    channels: Vec<WatchedChannel>,
 }
 
 impl GatewayLog {
     /// For the gateway of the robot in the shared-memory domain `domain`.
     pub(crate) fn new(setup: &Setup, domain: &str) -> Self {
         let robot = &setup.robot;
-        let channels = setup.channels().map(|(_, name)| Channel {
+        let channels = setup.channels().map(|(_, name)| WatchedChannel {
             name: name.to_owned(),
             newest: Nanos::MIN.0,
             due: Nanos::MAX,
-            told: Missing::No,
+            told: Absence::No,
         });
         Self {
             robot: robot.name.clone(),
@@ -142,7 +142,7 @@ impl GatewayLog {
 
     fn tell_channels(&mut self, channels: &[ChannelStatus], now: Nanos) {
         let silence = self.silence;
-        let mut changed = [Missing::No, Missing::Undescribed, Missing::Silent]
+        let mut changed = [Absence::No, Absence::Undescribed, Absence::Silent]
             .map(|missing| (missing, Vec::new()));
         for (channel, status) in self.channels.iter_mut().zip(channels) {
             let newest = status.newest.load(Relaxed);
@@ -151,11 +151,11 @@ impl GatewayLog {
                 channel.due = now + silence;
             }
             let missing = if status.undescribed.load(Relaxed) {
-                Missing::Undescribed
+                Absence::Undescribed
             } else if came {
-                Missing::No
+                Absence::No
             } else if now > channel.due {
-                Missing::Silent
+                Absence::Silent
             } else {
                 channel.told
             };
@@ -168,12 +168,12 @@ impl GatewayLog {
         for (missing, names) in changed.iter().filter(|(_, names)| !names.is_empty()) {
             let names = names.join(", ");
             match missing {
-                Missing::No => tracing::info!("received again: {names}"),
-                Missing::Undescribed => tracing::error!(
+                Absence::No => tracing::info!("received again: {names}"),
+                Absence::Undescribed => tracing::error!(
                     "the gateway does not have {names}: what depends on it is withheld; add it to \
                      gateway.toml, correct its name, or lock the joint in [locked]"
                 ),
-                Missing::Silent => tracing::warn!(
+                Absence::Silent => tracing::warn!(
                     "no samples of {names}: what depends on it is withheld; see the gateway's log \
                      and `proprio status` for its board"
                 ),
@@ -219,11 +219,11 @@ mod tests {
 
     /// A log of an elbow and a wrist, and what the data plane knows of them.
     fn log() -> (GatewayLog, [ChannelStatus; 2]) {
-        let channels = ["elbow", "wrist"].map(|name| Channel {
+        let channels = ["elbow", "wrist"].map(|name| WatchedChannel {
             name: name.to_owned(),
             newest: Nanos::MIN.0,
             due: Nanos::MAX,
-            told: Missing::No,
+            told: Absence::No,
         });
         let log = GatewayLog {
             robot: "icub".to_owned(),

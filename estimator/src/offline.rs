@@ -30,13 +30,12 @@
 //! deviate with the same probability, if no unknown wrench acts.
 
 use crate::assessment::Assessor;
-use crate::config::Timing;
-use crate::drive;
+use crate::drive::DriveRow;
 use crate::pipeline::{Estimate, Pipeline};
-use crate::reading::{MissingChannels, Target, check_columns, check_skins, targets};
+use crate::reading::{ColumnOwner, MissingChannels, check_columns, check_skins, targets};
 use crate::setup::Setup;
 use proprio_identification::online::Hypothesis;
-use proprio_topics::csv::{Row, SeriesValue, TableReader, TableReport, Value, What};
+use proprio_topics::csv::{Row, Series, SeriesValue, TableReader, TableReport, Value, What};
 use proprio_topics::{
     Agreement, ContactWrench, DriveEstimate, DriveTorque, JointTorque, Kind, NO_CAUSE, Nanos,
     Reason, Residual,
@@ -48,7 +47,7 @@ use std::ops::ControlFlow;
 /// Why a log cannot be estimated.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum OfflineError {
+pub enum EstimationError {
     /// The log cannot be read.
     #[error(transparent)]
     Log(#[from] proprio_topics::csv::TableError),
@@ -115,18 +114,18 @@ fn run_due_job(pipeline: &mut Pipeline, t: Nanos, likelier: &mut Vec<(Nanos, Hyp
 /// Estimates for every trigger stamp of a log. They also go to `assessor`, which has read this log.
 ///
 /// # Errors
-/// [`OfflineError`]; a joint that the log lacks and the configuration does not lock is one.
+/// [`EstimationError`]; a joint that the log lacks and the configuration does not lock is one.
 pub fn estimate(
     setup: Setup,
     log: impl Read,
     out: impl Write,
     mut assessor: Option<&mut Assessor>,
-) -> Result<EstimateReport, OfflineError> {
+) -> Result<EstimateReport, EstimationError> {
     let mut table = None;
     let mut out = Some(out);
     let (mut report, pipeline) = follow(setup, log, |pipeline, is_stamped| {
         if let Some(out) = out.take() {
-            table = Some(Table::new(out, pipeline.setup())?);
+            table = Some(EstimateTable::new(out, pipeline.setup())?);
         }
         if let Some(table) = &mut table {
             table.write(pipeline.last_estimate(), pipeline.drives(), is_stamped)?;
@@ -140,7 +139,7 @@ pub fn estimate(
     })?;
     let mut table = match (table, out) {
         (Some(table), _) => table,
-        (None, Some(out)) => Table::new(out, pipeline.setup())?,
+        (None, Some(out)) => EstimateTable::new(out, pipeline.setup())?,
         (None, None) => return Ok(report),
     };
     table.out.flush()?;
@@ -157,35 +156,22 @@ pub fn estimate(
 pub fn follow(
     setup: Setup,
     log: impl Read,
-    mut each: impl FnMut(&mut Pipeline, bool) -> Result<ControlFlow<()>, OfflineError>,
-) -> Result<(EstimateReport, Pipeline), OfflineError> {
+    mut each: impl FnMut(&mut Pipeline, bool) -> Result<ControlFlow<()>, EstimationError>,
+) -> Result<(EstimateReport, Pipeline), EstimationError> {
     let mut reader = TableReader::new(log)?;
     let mut report = EstimateReport::default();
     let mut pipeline = Pipeline::new(setup);
-    let robot = &pipeline.setup().robot;
-    check_columns(robot, reader.series(), |_| true)?;
-    check_skins(pipeline.setup(), reader.series())?;
-    let mut targets = targets(robot, reader.series());
-    for (series, target) in reader.series().iter().zip(&mut targets) {
-        if let What::Channel(kind @ Kind::Skin) = series.what {
-            *target = pipeline
-                .setup()
-                .channel(kind, &series.name)
-                .map(Target::Channel);
-        }
-    }
-    for (series, target) in reader.series().iter().zip(&targets) {
-        if target.is_none() {
-            report.unused_channels.push(series.name.clone());
-        }
-    }
+    let owners = owners(pipeline.setup(), reader.series())?;
+    let series = reader.series().iter().zip(&owners);
+    let unused = series.filter(|(_, owner)| owner.is_none());
+    report.unused_channels = unused.map(|(series, _)| series.name.clone()).collect();
     // Rows of a log without stamps are spaced so far that none affects the next.
-    let spacing =
-        pipeline.setup().robot.max_silence + pipeline.setup().robot.max_silence + Nanos(1);
+    let max_silence = pipeline.setup().robot.max_silence;
+    let spacing = max_silence + max_silence + Nanos(1);
     let (mut row, mut pseudo) = (Row::default(), Nanos::ZERO);
     let (mut stamped, mut newest) = (true, Nanos::MIN);
     let mut likelier = Vec::new();
-    let mut make = |pipeline: &mut Pipeline, stamped: bool| -> Result<_, OfflineError> {
+    let mut make = |pipeline: &mut Pipeline, stamped: bool| -> Result<_, EstimationError> {
         while let Some(t) = pipeline.poll().map(|estimate| estimate.t) {
             if each(pipeline, stamped)?.is_break() {
                 return Ok(ControlFlow::Break(()));
@@ -201,17 +187,7 @@ pub fn follow(
             pseudo += spacing;
             pseudo
         });
-        for SeriesValue { series, value } in &row.items {
-            match (targets.get(*series).copied().flatten(), value) {
-                (Some(Target::Channel(channel)), Value::Reading(reading, quality)) => {
-                    pipeline.push(channel, t, reading, *quality);
-                }
-                (Some(Target::Contact(contact)), Value::Contact(state)) => {
-                    pipeline.declare(contact, t, state);
-                }
-                _ => {}
-            }
-        }
+        push_row(&mut pipeline, &owners, t, &row);
         let counts = pipeline.counts();
         if report.first_dropped.is_none() && counts.late + counts.backward + counts.not_finite > 0 {
             report.first_dropped = Some(row.line);
@@ -237,19 +213,49 @@ pub fn follow(
     Ok((report, pipeline))
 }
 
+/// Per series of a log, where its values go; none if the configuration has no such channel or
+/// contact.
+fn owners(setup: &Setup, series: &[Series]) -> Result<Vec<Option<ColumnOwner>>, MissingChannels> {
+    check_columns(&setup.robot, series, |_| true)?;
+    check_skins(setup, series)?;
+    let mut owners = targets(&setup.robot, series);
+    for (series, owner) in series.iter().zip(&mut owners) {
+        if let What::Channel(kind @ Kind::Skin) = series.what {
+            let channel = setup.channel(kind, &series.name);
+            *owner = channel.map(ColumnOwner::Channel);
+        }
+    }
+    Ok(owners)
+}
+
+/// Passes the samples and declarations of a row to the pipeline.
+fn push_row(pipeline: &mut Pipeline, owners: &[Option<ColumnOwner>], t: Nanos, row: &Row) {
+    for SeriesValue { series, value } in &row.items {
+        match (owners.get(*series).copied().flatten(), value) {
+            (Some(ColumnOwner::Channel(channel)), Value::Reading(reading, quality)) => {
+                pipeline.push(channel, t, reading, *quality);
+            }
+            (Some(ColumnOwner::Contact(contact)), Value::Contact(state)) => {
+                pipeline.declare(contact, t, state);
+            }
+            _ => {}
+        }
+    }
+}
+
 /// What joints and drives do in a log, by degree of freedom, as the estimator with this `setup`
 /// sees it; at most one row in 10 ms, because friction and load change no faster than a joint
 /// moves.
 ///
 /// # Errors
 /// As for [`follow`].
-pub fn drive_rows(setup: &Setup, log: impl Read) -> Result<Vec<Vec<drive::Row>>, OfflineError> {
-    let mut rows: Vec<Vec<drive::Row>> = vec![Vec::new(); setup.robot.model.dof_count()];
+pub fn drive_rows(setup: &Setup, log: impl Read) -> Result<Vec<Vec<DriveRow>>, EstimationError> {
+    let mut rows: Vec<Vec<DriveRow>> = vec![Vec::new(); setup.robot.model.dof_count()];
     let mut setup = setup.clone();
     setup.drives.clear();
     setup.learns_drives = true;
     // A log has the samples that a running estimator would have to wait for.
-    setup.timing = Timing::Aligned;
+    setup.waits = true;
     follow(setup, log, |pipeline, is_stamped| {
         // Friction needs velocities, and seconds.
         if !is_stamped {
@@ -270,7 +276,7 @@ pub fn drive_rows(setup: &Setup, log: impl Read) -> Result<Vec<Vec<drive::Row>>,
 }
 
 /// Writes estimates row by row.
-pub struct Table<W> {
+pub struct EstimateTable<W> {
     out: W,
     channels: Vec<String>,
     joints: usize,
@@ -283,7 +289,7 @@ pub struct Table<W> {
     withheld: BTreeMap<&'static str, u64>,
 }
 
-impl<W: Write> Table<W> {
+impl<W: Write> EstimateTable<W> {
     /// Writes the header.
     ///
     /// # Errors
@@ -347,53 +353,22 @@ impl<W: Write> Table<W> {
         drives: Option<&DriveEstimate>,
         stamped: bool,
     ) -> io::Result<()> {
-        let joints = || {
-            (0..self.joints).map(|i| {
-                estimate
-                    .torques
-                    .joints()
-                    .get(i)
-                    .copied()
-                    .unwrap_or(JointTorque::ABSENT)
-            })
-        };
-        self.text.clear();
+        let torques = estimate.torques.joints();
+        let joints = || (0..self.joints).map(|i| torques.get(i).unwrap_or(&JointTorque::ABSENT));
+        let (text, channels) = (&mut self.text, &self.channels);
+        text.clear();
         if stamped {
-            write!(self.text, "{}", estimate.t)?;
+            write!(text, "{}", estimate.t)?;
         }
-        for joint in joints() {
-            number(&mut self.text, joint.torque);
-        }
-        for joint in joints() {
-            number(&mut self.text, joint.standard_deviation);
-        }
+        numbers(text, joints().map(|joint| joint.torque));
+        numbers(text, joints().map(|joint| joint.standard_deviation));
+        let contacts = estimate.contacts.contacts();
         for i in 0..self.contacts.len() {
-            let contact = estimate
-                .contacts
-                .contacts()
-                .get(i)
-                .copied()
-                .unwrap_or(ContactWrench::ABSENT);
-            contact
-                .force
-                .into_iter()
-                .chain(contact.torque)
-                .chain(contact.standard_deviation)
-                .for_each(|v| number(&mut self.text, v));
-            flag(&mut self.text, contact.valid);
-            reason(
-                &mut self.text,
-                &self.channels,
-                contact.reason.get().unwrap_or_default(),
-                contact.cause,
-            );
-            flag(&mut self.text, contact.detected);
-            let position = contact.position.into_iter();
-            position.for_each(|v| number(&mut self.text, v));
-            flag(&mut self.text, contact.located);
+            let contact = contacts.get(i).unwrap_or(&ContactWrench::ABSENT);
+            write_contact(text, channels, contact);
         }
         for joint in joints() {
-            flag(&mut self.text, joint.valid);
+            flag(text, joint.valid);
             if joint.valid != 1 {
                 let reason = joint.reason.get().unwrap_or_default();
                 *self.withheld.entry(reason.word()).or_default() += 1;
@@ -401,47 +376,54 @@ impl<W: Write> Table<W> {
         }
         for joint in joints() {
             let why = joint.reason.get().unwrap_or_default();
-            reason(&mut self.text, &self.channels, why, joint.cause);
+            reason(text, channels, why, joint.cause);
         }
+        let residuals = estimate.contacts.residuals();
         for i in 0..self.subtrees {
-            let residual = estimate
-                .contacts
-                .residuals()
-                .get(i)
-                .copied()
-                .unwrap_or(Residual::ABSENT);
-            let numbers = residual.force.into_iter().chain(residual.torque);
-            numbers
-                .chain([residual.significance])
-                .for_each(|v| number(&mut self.text, v));
-            self.text.push(b',');
-            let contact = self
-                .contacts
-                .get(residual.contact as usize)
-                .map(String::as_str);
-            let contact = contact.or((residual.unexplained == 1).then_some("unexplained"));
-            self.text
-                .extend_from_slice(contact.unwrap_or_default().as_bytes());
+            let residual = residuals.get(i).unwrap_or(&Residual::ABSENT);
+            write_residual(text, &self.contacts, residual);
         }
         let drives = drives.map(DriveEstimate::drives).unwrap_or_default();
         let drives = || (0..self.drives).map(|i| drives.get(i).unwrap_or(&DriveTorque::ABSENT));
-        drives().for_each(|own| number(&mut self.text, own.torque));
-        drives().for_each(|own| number(&mut self.text, own.standard_deviation));
-        for own in drives() {
-            match own.agreement.get().unwrap_or_default() {
-                Agreement::Unknown => self.text.push(b','),
-                agreement => flag(&mut self.text, u32::from(agreement == Agreement::Disagrees)),
+        numbers(text, drives().map(|drive| drive.torque));
+        numbers(text, drives().map(|drive| drive.standard_deviation));
+        for drive in drives() {
+            match drive.agreement.get().unwrap_or_default() {
+                Agreement::Unknown => text.push(b','),
+                agreement => flag(text, u32::from(agreement == Agreement::Disagrees)),
             }
         }
-        self.text.push(b'\n');
+        text.push(b'\n');
         self.rows += 1;
-        self.out.write_all(&self.text)
+        self.out.write_all(text)
     }
 
     /// Returns the output.
     pub fn into_inner(self) -> W {
         self.out
     }
+}
+
+/// The cells of a contact.
+fn write_contact(text: &mut Vec<u8>, channels: &[String], contact: &ContactWrench) {
+    let wrench = contact.force.into_iter().chain(contact.torque);
+    numbers(text, wrench.chain(contact.standard_deviation));
+    flag(text, contact.valid);
+    let why = contact.reason.get().unwrap_or_default();
+    reason(text, channels, why, contact.cause);
+    flag(text, contact.detected);
+    numbers(text, contact.position);
+    flag(text, contact.located);
+}
+
+/// The cells of a sub-tree's residual.
+fn write_residual(text: &mut Vec<u8>, contacts: &[String], residual: &Residual) {
+    let wrench = residual.force.into_iter().chain(residual.torque);
+    numbers(text, wrench.chain([residual.significance]));
+    text.push(b',');
+    let contact = contacts.get(residual.contact as usize).map(String::as_str);
+    let cause = contact.or((residual.unexplained == 1).then_some("unexplained"));
+    text.extend_from_slice(cause.unwrap_or_default().as_bytes());
 }
 
 /// A cell: 1 or 0.
@@ -483,10 +465,12 @@ fn quote(text: &mut Vec<u8>, start: usize) {
     text.push(b'"');
 }
 
-/// A cell: the shortest text that reads back as the same number; empty for NaN.
-fn number(text: &mut Vec<u8>, value: f64) {
-    text.push(b',');
-    if !value.is_nan() {
-        text.extend_from_slice(zmij::Buffer::new().format(value).as_bytes());
+/// Cells: the shortest text that reads back as the same number; empty for NaN.
+fn numbers(text: &mut Vec<u8>, values: impl IntoIterator<Item = f64>) {
+    for value in values {
+        text.push(b',');
+        if !value.is_nan() {
+            text.extend_from_slice(zmij::Buffer::new().format(value).as_bytes());
+        }
     }
 }

@@ -1,5 +1,5 @@
 //! parameters.toml: the identified parameters of a robot (inertial parameters, F/T offsets and
-//! calibrations, friction) and their covariance.
+//! calibrations, friction, drives) and their covariance.
 //!
 //! ```text
 //! identification -> Parameters -> parameters.toml -> Setup::apply -> InertialState -> Pipeline
@@ -12,16 +12,18 @@
 
 mod file;
 
+use std::collections::HashSet;
 use std::io;
 
-use crate::drive::Drive;
+use crate::config::{exactly, exactly_if_given};
+use crate::drive::DriveModel;
 use nalgebra::DMatrix;
 use proprio_topics::Nanos;
 use serde::Deserialize;
 
 use proprio_dynamics::calibration::{Calibration, Kind};
 use proprio_dynamics::model::{JointKind, Model, ModelError};
-use proprio_dynamics::spatial::{RigidInertia, Wrench};
+use proprio_dynamics::spatial::{Pose, RigidInertia, Wrench};
 use proprio_identification::Robot;
 
 /// The length of a column of the correlation root, in the units in which it is written.
@@ -36,12 +38,12 @@ const SAME: f64 = 1e-9;
 pub struct Parameters {
     robot: String,
     provenance: Provenance,
-    links: Vec<Link>,
+    links: Vec<LinkRecord>,
     sensors: Vec<Offset>,
     joints: Vec<Friction>,
-    drives: Vec<Drive>,
-    /// Standard deviation of each column.
-    deviations: Vec<f64>,
+    drives: Vec<DriveModel>,
+    /// Standard deviation of each column after those of the links.
+    sensor_deviations: Vec<f64>,
     /// The upper triangular root of the correlation, column by column, each down to its diagonal,
     /// in units of 1 / [`UNIT`].
     correlation: Vec<i32>,
@@ -57,13 +59,13 @@ pub struct Provenance {
     pub tau: Option<f64>,
     /// The logs.
     #[serde(default, rename = "log")]
-    pub logs: Vec<Span>,
+    pub logs: Vec<UsedLog>,
 }
 
 /// A log that parameters were identified from.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Span {
+pub struct UsedLog {
     /// Its file name.
     pub file: String,
     /// The first instant that was used, in the log's clock.
@@ -85,16 +87,24 @@ mod nanoseconds {
     }
 }
 
-/// A body of the model: its place in the tree, its parameters in the URDF, and those identified.
-#[derive(Clone, Debug, PartialEq)]
-struct Link {
+/// A body of the model, as in the file: its place in the tree, its parameters in the URDF, and
+/// those identified with their standard deviations.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct LinkRecord {
     name: String,
     joint: Option<String>,
     parent: Option<String>,
+    #[serde(deserialize_with = "exactly")]
     placement: [f64; 12],
+    #[serde(default, deserialize_with = "exactly_if_given")]
     axis: Option<[f64; 3]>,
+    #[serde(deserialize_with = "exactly")]
     cad: [f64; 10],
+    #[serde(default, deserialize_with = "exactly_if_given")]
     identified: Option<[f64; 10]>,
+    #[serde(default, deserialize_with = "exactly_if_given")]
+    std: Option<[f64; 10]>,
 }
 
 /// The offset of an F/T sensor: its reading without load.
@@ -114,12 +124,12 @@ pub struct Offset {
     pub noise: Wrench,
     /// The sensor's calibration, if it was identified; else the configured one is used. It is
     /// applied before the offset is subtracted.
-    pub calibrated: Option<Calibrated>,
+    pub calibrated: Option<SensorCalibration>,
 }
 
 /// A sensor's calibration, and which parts of it were identified and are uncertain.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Calibrated {
+pub struct SensorCalibration {
     /// The complete calibration: the identified correction applied to the configured one.
     pub calibration: Calibration,
     /// The identified parts. They have columns in the covariance, relative to the corrected
@@ -235,50 +245,17 @@ impl Parameters {
     /// Parameters of a robot with nothing identified yet.
     #[must_use]
     pub fn new(robot: &Robot, provenance: Provenance) -> Self {
-        let model = &robot.model;
-        let link = |(number, cad): (usize, &RigidInertia)| {
-            let joint = number
-                .checked_sub(1)
-                .and_then(|joint| model.joints().get(joint));
-            let placement = joint.map_or_else(proprio_dynamics::spatial::Pose::identity, |joint| {
-                joint.placement
-            });
-            let (t, r) = (placement.translation, placement.rotation.transpose());
-            let mut numbers = [0.0; 12];
-            let values = t.iter().chain(r.iter());
-            numbers
-                .iter_mut()
-                .zip(values)
-                .for_each(|(place, value)| *place = *value);
-            Link {
-                name: model.link_name(number).to_owned(),
-                joint: joint.map(|joint| model.joint_name(joint.child - 1).to_owned()),
-                parent: joint.map(|joint| model.link_name(joint.parent).to_owned()),
-                placement: numbers,
-                axis: joint.and_then(|joint| match joint.kind {
-                    JointKind::Revolute(axis) | JointKind::Prismatic(axis) => {
-                        Some(axis.vector.into())
-                    }
-                    JointKind::Fixed => None,
-                }),
-                cad: cad.parameters(),
-                identified: None,
-            }
-        };
+        let bodies = robot.model.inertias().iter().enumerate();
         Self {
             robot: robot.name.clone(),
             provenance,
-            links: robot
-                .model
-                .inertias()
-                .iter()
-                .enumerate()
-                .map(link)
+            links: bodies
+                .map(|(link, cad)| LinkRecord::new(&robot.model, link, cad))
                 .collect(),
             sensors: Vec::new(),
             joints: Vec::new(),
             drives: Vec::new(),
-            deviations: Vec::new(),
+            sensor_deviations: Vec::new(),
             correlation: Vec::new(),
         }
     }
@@ -306,31 +283,25 @@ impl Parameters {
                 expected: columns,
             });
         }
+        if root.iter().any(|value| !value.is_finite()) {
+            return Err(ParametersError::Value("the covariance".into()));
+        }
         let mut new = Self {
-            links: self
-                .links
-                .iter()
-                .map(|link| Link {
-                    identified: None,
-                    ..link.clone()
-                })
-                .collect(),
             sensors: offsets.to_vec(),
             ..self.clone()
         };
+        for link in &mut new.links {
+            (link.identified, link.std) = (None, None);
+        }
         let count = new.links.len();
         for (number, inertia) in inertias {
-            let Some(link) = new
-                .links
-                .get_mut(*number)
-                .filter(|link| link.identified.is_none())
-            else {
-                return Err(ParametersError::Link {
-                    number: *number,
-                    count,
-                });
+            let link = new.links.get_mut(*number);
+            let link = link.filter(|link| link.identified.is_none());
+            let wrong = ParametersError::Link {
+                number: *number,
+                count,
             };
-            link.identified = Some(inertia.parameters());
+            link.ok_or(wrong)?.identified = Some(inertia.parameters());
         }
         // In the file links are in the order of the model.
         let mut order: Vec<usize> = (0..inertias.len()).collect();
@@ -340,14 +311,18 @@ impl Parameters {
             .flat_map(|i| 10 * i..10 * (i + 1))
             .chain(10 * inertias.len()..columns)
             .collect();
-        if root.iter().any(|value| !value.is_finite()) {
-            return Err(ParametersError::Value("the covariance".into()));
-        }
         let sorted = DMatrix::from_fn(root.nrows(), columns, |i, j| root[(i, order[j])]);
-        let upper = triangle(sorted);
-        new.deviations = (0..columns).map(|j| upper.column(j).norm()).collect();
-        new.correlation.clear();
-        for (j, &deviation) in new.deviations.iter().enumerate() {
+        new.set_covariance(&triangle(sorted));
+        new.check()?;
+        *self = new;
+        Ok(())
+    }
+
+    /// Takes the covariance over [identified links | sensors] as its upper triangular root.
+    fn set_covariance(&mut self, upper: &DMatrix<f64>) {
+        let mut deviations = (0..upper.ncols()).map(|j| upper.column(j).norm());
+        self.correlation.clear();
+        for (j, deviation) in deviations.clone().enumerate() {
             let scale = if deviation > 0.0 {
                 UNIT / deviation
             } else {
@@ -355,12 +330,13 @@ impl Parameters {
             };
             // At most one in magnitude, so it fits.
             #[allow(clippy::cast_possible_truncation, reason = "at most 1e9")]
-            new.correlation
+            self.correlation
                 .extend((0..=j).map(|i| (upper[(i, j)] * scale).round() as i32));
         }
-        new.check()?;
-        *self = new;
-        Ok(())
+        for link in self.links.iter_mut().filter(|l| l.identified.is_some()) {
+            link.std = Some(std::array::from_fn(|_| deviations.next().unwrap_or(0.0)));
+        }
+        self.sensor_deviations = deviations.collect();
     }
 
     /// Sets the friction of joints.
@@ -382,7 +358,7 @@ impl Parameters {
     /// # Errors
     /// A number is not finite, a variance is negative, or a constant is zero. Nothing is changed
     /// then.
-    pub fn set_drives(&mut self, drives: &[Drive]) -> Result<(), ParametersError> {
+    pub fn set_drives(&mut self, drives: &[DriveModel]) -> Result<(), ParametersError> {
         let new = Self {
             drives: drives.to_vec(),
             ..self.clone()
@@ -415,17 +391,13 @@ impl Parameters {
     /// Standard deviations of an identified link's ten parameters; none if it was not identified.
     #[must_use]
     pub fn deviation(&self, link: usize) -> Option<[f64; 10]> {
-        self.links.get(link)?.identified?;
-        let before = self
-            .links
-            .iter()
-            .take(link)
-            .filter(|l| l.identified.is_some())
-            .count();
-        self.deviations
-            .get(10 * before..10 * (before + 1))?
-            .try_into()
-            .ok()
+        self.links.get(link)?.std
+    }
+
+    /// The standard deviation of each column of the covariance.
+    fn deviations(&self) -> impl Iterator<Item = &f64> {
+        let links = self.links.iter().filter_map(|link| link.std.as_ref());
+        links.flatten().chain(&self.sensor_deviations)
     }
 
     /// The links that were identified, by their numbers in the model, ascending: their columns come
@@ -446,10 +418,13 @@ impl Parameters {
 
     /// Standard deviation of an offset, by its place in [`Parameters::offsets`].
     #[must_use]
-    pub fn offset_deviation(&self, place: usize) -> Option<Wrench> {
-        let first = 10 * self.identified().count() + 6 * place;
-        let deviations = self.deviations.get(first..first + 6)?.try_into().ok()?;
-        Some(Wrench::from_torque_first(deviations))
+    pub(crate) fn offset_deviation(&self, place: usize) -> Option<Wrench> {
+        let (sensors, _) = self.sensor_deviations.as_chunks();
+        sensors
+            .get(..self.sensors.len())?
+            .get(place)
+            .copied()
+            .map(Wrench::from_torque_first)
     }
 
     /// Standard deviations of the identified unknowns of a sensor's calibration, by its place in
@@ -461,8 +436,8 @@ impl Parameters {
             .sensors
             .get(place..=place)
             .map_or(0, calibration_columns);
-        let first = 10 * self.identified().count() + 6 * self.sensors.len() + before;
-        self.deviations
+        let first = 6 * self.sensors.len() + before;
+        self.sensor_deviations
             .get(first..first + count)
             .unwrap_or_default()
     }
@@ -475,17 +450,17 @@ impl Parameters {
 
     /// The drives that the torques are compared with.
     #[must_use]
-    pub fn drives(&self) -> &[Drive] {
+    pub fn drives(&self) -> &[DriveModel] {
         &self.drives
     }
 
     /// The covariance's root: upper triangular `U` with `P = U^T U`.
     #[must_use]
     pub fn root(&self) -> DMatrix<f64> {
-        let columns = self.deviations.len();
+        let columns = self.deviations().count();
         let mut root = DMatrix::zeros(columns, columns);
         let mut numbers = self.correlation.iter();
-        for (j, deviation) in self.deviations.iter().enumerate() {
+        for (j, deviation) in self.deviations().enumerate() {
             for i in 0..=j {
                 root[(i, j)] = numbers
                     .next()
@@ -522,155 +497,184 @@ impl Parameters {
     ///
     /// # Errors
     /// The first difference.
-    pub fn check_robot(&self, robot: &Robot) -> Result<(), ParametersError> {
+    pub(crate) fn check_robot(&self, robot: &Robot) -> Result<(), ParametersError> {
         if self.robot != robot.name {
             return Err(ParametersError::Robot {
                 found: self.robot.clone(),
                 expected: robot.name.clone(),
             });
         }
-        let model = |what: String| Err(ParametersError::Model { what });
         let ours = Self::new(robot, Provenance::default()).links;
-        for (theirs, ours) in self.links.iter().zip(&ours) {
-            let name = &ours.name;
-            if theirs.name != *name {
-                return model(format!(
-                    "it has link {} where the URDF has {name}",
-                    theirs.name
-                ));
-            }
-            if theirs.joint != ours.joint || theirs.parent != ours.parent {
-                return model(format!("link {name} has another parent or joint there"));
-            }
-            let same = |a: &[f64], b: &[f64], size: f64| {
-                a.iter().zip(b).all(|(a, b)| (a - b).abs() <= SAME * size)
-            };
-            let axes = match (theirs.axis, ours.axis) {
-                (Some(a), Some(b)) => same(&a, &b, 1.0),
-                (a, b) => a.is_none() == b.is_none(),
-            };
-            if !(axes && same(&theirs.placement, &ours.placement, 1.0)) {
-                return model(format!("link {name} has another frame or axis there"));
-            }
-            let size = ours
-                .cad
-                .iter()
-                .fold(0.0, |most, value| f64::max(most, value.abs()));
-            if !same(&theirs.cad, &ours.cad, size) {
-                return model(format!(
-                    "link {name} has other inertial parameters in that URDF"
-                ));
-            }
+        let mut pairs = self.links.iter().zip(&ours);
+        let differs = pairs
+            .find_map(|(theirs, ours)| theirs.difference(ours))
+            .or_else(|| {
+                let more = self.links.get(ours.len())?;
+                let name = &more.name;
+                Some(format!("it has link {name}, which the URDF does not have"))
+            })
+            .or_else(|| {
+                let more = ours.get(self.links.len())?;
+                let name = &more.name;
+                Some(format!("the URDF has link {name}, which it does not have"))
+            });
+        if let Some(what) = differs {
+            return Err(ParametersError::Model { what });
         }
-        match (self.links.get(ours.len()), ours.get(self.links.len())) {
-            (Some(more), _) => {
-                return model(format!(
-                    "it has link {}, which the URDF does not have",
-                    more.name
-                ));
-            }
-            (_, Some(more)) => {
-                return model(format!(
-                    "the URDF has link {}, which it does not have",
-                    more.name
-                ));
-            }
-            _ => {}
-        }
-        for offset in &self.sensors {
-            if robot.sensor(&offset.sensor).is_none() {
-                return Err(ParametersError::Unknown {
-                    what: "force/torque sensor",
-                    name: offset.sensor.clone(),
-                });
-            }
+        let unknown = |what, name: &str| {
+            let name = name.to_owned();
+            Err(ParametersError::Unknown { what, name })
+        };
+        let mut sensors = self.sensors.iter().map(|offset| &offset.sensor);
+        if let Some(sensor) = sensors.find(|sensor| robot.sensor(sensor).is_none()) {
+            return unknown("force/torque sensor", sensor);
         }
         let joints = self.joints.iter().map(|joint| &joint.joint);
         let mut joints = joints.chain(self.drives.iter().map(|drive| &drive.joint));
         match joints.find(|joint| robot.model.dof(joint).is_none()) {
-            Some(joint) => Err(ParametersError::Unknown {
-                what: "joint",
-                name: joint.clone(),
-            }),
+            Some(joint) => unknown("joint", joint),
             None => Ok(()),
         }
     }
 
     /// Checks the conditions that hold for every set of parameters.
     fn check(&self) -> Result<(), ParametersError> {
-        let finite = |what: &dyn Fn() -> String, values: &[f64]| match values
-            .iter()
-            .all(|v| v.is_finite())
-        {
-            true => Ok(()),
-            false => Err(ParametersError::Value(what())),
-        };
-        if let Some(tau) = self.provenance.tau {
-            finite(&|| "provenance.tau".into(), &[tau])?;
-        }
-        let mut names = std::collections::HashSet::new();
-        let mut new_name = |name: &str| match names.insert(name.to_owned()) {
-            true => Ok(()),
+        finite("provenance.tau", self.provenance.tau.as_slice())?;
+        let mut names = HashSet::new();
+        let mut new_name = |name: String| match names.insert(name.clone()) {
+            true => Ok(name),
             false => Err(ParametersError::Damaged(format!("{name} is given twice"))),
         };
         for link in &self.links {
-            let at = || format!("link {}", link.name);
-            new_name(&at())?;
-            finite(&at, &link.placement)?;
-            finite(&at, &link.axis.unwrap_or_default())?;
-            finite(&at, &link.cad)?;
-            if let Some(identified) = &link.identified {
-                finite(&at, identified)?;
-                RigidInertia::from_parameters(identified)
-                    .check(1e-9)
-                    .map_err(|why| ParametersError::Inconsistent {
-                        link: link.name.clone(),
-                        why: why.to_string(),
-                    })?;
-            }
+            link.check(&new_name(format!("link {}", link.name))?)?;
         }
         for sensor in &self.sensors {
-            let at = || format!("sensor {}", sensor.sensor);
-            new_name(&at())?;
-            finite(&at, &sensor.reading.force_first())?;
-            finite(&at, &sensor.drift.force_first().map(f64::sqrt))?;
-            finite(&at, &sensor.noise.force_first().map(f64::sqrt))?;
-            if let Some(Calibrated { calibration, kind }) = &sensor.calibrated {
-                finite(&at, &calibration.gain_force_first())?;
-                finite(&at, &calibration.per_kelvin().force_first())?;
-                finite(&at, calibration.reference().as_slice())?;
-                let counts = kind.temperature || *calibration.per_kelvin() != Wrench::zero();
-                if counts && calibration.reference().is_none() {
-                    return Err(ParametersError::Damaged(format!(
-                        "{}: reference_celsius is missing",
-                        at()
-                    )));
-                }
-            }
+            sensor.check(&new_name(format!("sensor {}", sensor.sensor))?)?;
         }
         for joint in &self.joints {
-            let at = || format!("joint {}", joint.joint);
-            new_name(&at())?;
+            let at = new_name(format!("joint {}", joint.joint))?;
             finite(&at, &[joint.coulomb, joint.viscous, joint.offset])?;
             if let Some(rotor) = joint.rotor {
-                // The square root of a negative number is NaN.
-                finite(&at, &[rotor.inertia, rotor.deviation.sqrt()])?;
+                finite(&at, &[rotor.inertia])?;
+                deviations(&at, &[rotor.deviation])?;
             }
         }
         for drive in &self.drives {
-            let at = || format!("drive {}", drive.joint);
-            new_name(&at())?;
+            let at = new_name(format!("drive {}", drive.joint))?;
             finite(&at, &drive.parameters)?;
             finite(&at, drive.covariance.as_slice())?;
-            // The square root of a negative number is NaN; so is the quotient of two zeros.
-            let variances = drive.covariance.diagonal().map(f64::sqrt);
-            finite(&at, variances.as_slice())?;
-            finite(&at, &drive.inherited.map(f64::sqrt))?;
-            finite(&at, &[drive.noise.sqrt(), 1.0 / drive.parameters[0]])?;
+            deviations(&at, &drive.covariance.diagonal())?;
+            deviations(&at, &drive.inherited)?;
+            deviations(&at, &[drive.noise])?;
+            finite(&at, &[1.0 / drive.parameters[0]])?;
         }
-        // The square root of a negative number is NaN.
-        let roots: Vec<f64> = self.deviations.iter().map(|d| d.sqrt()).collect();
-        finite(&|| "a standard deviation".into(), &roots)
+        deviations("a standard deviation", self.deviations())
+    }
+}
+
+/// Checks that all numbers are finite.
+fn finite(at: &str, values: &[f64]) -> Result<(), ParametersError> {
+    match values.iter().all(|value| value.is_finite()) {
+        true => Ok(()),
+        false => Err(ParametersError::Value(at.to_owned())),
+    }
+}
+
+/// Checks that all numbers can be standard deviations or variances.
+fn deviations<'a>(
+    at: &str,
+    values: impl IntoIterator<Item = &'a f64>,
+) -> Result<(), ParametersError> {
+    // The square root of a negative number is NaN.
+    match values.into_iter().all(|value| value.sqrt().is_finite()) {
+        true => Ok(()),
+        false => Err(ParametersError::Value(at.to_owned())),
+    }
+}
+
+impl LinkRecord {
+    /// A body that was not identified.
+    fn new(model: &Model, number: usize, cad: &RigidInertia) -> Self {
+        let joint = number
+            .checked_sub(1)
+            .and_then(|joint| model.joints().get(joint));
+        let pose = joint.map_or_else(Pose::identity, |joint| joint.placement);
+        let rows = pose.rotation.transpose();
+        let mut placement = pose.translation.iter().chain(rows.iter()).copied();
+        Self {
+            name: model.link_name(number).to_owned(),
+            joint: joint.map(|joint| model.joint_name(joint.child - 1).to_owned()),
+            parent: joint.map(|joint| model.link_name(joint.parent).to_owned()),
+            placement: std::array::from_fn(|_| placement.next().unwrap_or(0.0)),
+            axis: joint.and_then(|joint| match joint.kind {
+                JointKind::Revolute(axis) | JointKind::Prismatic(axis) => Some(axis.vector.into()),
+                JointKind::Fixed => None,
+            }),
+            cad: cad.parameters(),
+            identified: None,
+            std: None,
+        }
+    }
+
+    /// How this body of a file differs from that of the URDF.
+    fn difference(&self, urdf: &Self) -> Option<String> {
+        let name = &urdf.name;
+        if self.name != *name {
+            let own = &self.name;
+            return Some(format!("it has link {own} where the URDF has {name}"));
+        }
+        if self.joint != urdf.joint || self.parent != urdf.parent {
+            return Some(format!("link {name} has another parent or joint there"));
+        }
+        let same = |a: &[f64], b: &[f64], size: f64| {
+            a.iter().zip(b).all(|(a, b)| (a - b).abs() <= SAME * size)
+        };
+        let axes = match (self.axis, urdf.axis) {
+            (Some(a), Some(b)) => same(&a, &b, 1.0),
+            (a, b) => a.is_none() == b.is_none(),
+        };
+        if !(axes && same(&self.placement, &urdf.placement, 1.0)) {
+            return Some(format!("link {name} has another frame or axis there"));
+        }
+        let sizes = urdf.cad.iter().map(|value| value.abs());
+        let is_same = same(&self.cad, &urdf.cad, sizes.fold(0.0, f64::max));
+        (!is_same).then(|| format!("link {name} has other inertial parameters in that URDF"))
+    }
+
+    fn check(&self, at: &str) -> Result<(), ParametersError> {
+        finite(at, &self.placement)?;
+        finite(at, &self.axis.unwrap_or_default())?;
+        finite(at, &self.cad)?;
+        if let Some(identified) = &self.identified {
+            finite(at, identified)?;
+            let body = RigidInertia::from_parameters(identified);
+            body.check(1e-9)
+                .map_err(|why| ParametersError::Inconsistent {
+                    link: self.name.clone(),
+                    why: why.to_string(),
+                })?;
+        }
+        Ok(())
+    }
+}
+
+impl Offset {
+    fn check(&self, at: &str) -> Result<(), ParametersError> {
+        finite(at, &self.reading.force_first())?;
+        deviations(at, &self.drift.force_first())?;
+        deviations(at, &self.noise.force_first())?;
+        let Some(SensorCalibration { calibration, kind }) = &self.calibrated else {
+            return Ok(());
+        };
+        finite(at, &calibration.gain_force_first())?;
+        finite(at, &calibration.per_kelvin().force_first())?;
+        finite(at, calibration.reference().as_slice())?;
+        let counts = kind.temperature || *calibration.per_kelvin() != Wrench::zero();
+        if counts && calibration.reference().is_none() {
+            let what = format!("{at}: reference_celsius is missing");
+            return Err(ParametersError::Damaged(what));
+        }
+        Ok(())
     }
 }
 
@@ -713,7 +717,7 @@ mod tests {
             sensors: Vec::new(),
             joints: Vec::new(),
             drives: Vec::new(),
-            deviations: Vec::new(),
+            sensor_deviations: Vec::new(),
             correlation: Vec::new(),
         }
     }

@@ -24,8 +24,8 @@
 //!    [`crate::drive`]).
 //!
 //! # Alignment
-//! Each stamp `t` of the trigger channel gives exactly one estimate, in order. What follows is
-//! `timing = "aligned"`; see below for `"immediate"`. An estimate is released once
+//! Each stamp `t` of the trigger channel gives exactly one estimate, in order. What follows holds
+//! if `max_wait_ms` is given; see below for estimates that do not wait. One is released once
 //! every channel has a sample stamped `t` or later, or once the newest stamp of any channel is
 //! later than `t + max_wait`, or once 256 instants wait (a trigger above 1 kHz). The estimate uses
 //! the samples stamped `t` or earlier and, of each channel, the first later one if its stamp is at
@@ -43,7 +43,7 @@
 //! minute, the variance of the offset is increased ([`Calibration::temperature_variance`]).
 //!
 //! # Immediate estimates
-//! With `timing = "immediate"` nothing waits: the trigger's sample releases its estimate. Every
+//! Without `max_wait_ms` nothing waits: the trigger's sample releases its estimate. Every
 //! other channel is evaluated from the samples that have arrived. Where none is stamped `t` or
 //! later, the adaptive window extrapolates: positions and angular velocities with the windows that
 //! differentiate them, wrenches and proper accelerations with one of their own (`prediction`). The
@@ -81,9 +81,8 @@ mod validity;
 pub use estimate::{Counts, Estimate};
 pub use identification::Job;
 
-use crate::config::Timing;
 use crate::differentiate::Window;
-use crate::drive::Row;
+use crate::drive::DriveRow;
 use crate::history::History;
 use crate::setup::Setup;
 use crate::uncertainty::Uncertainty;
@@ -175,7 +174,7 @@ impl Pipeline {
             ChannelRole::Base => ChannelBuffer::Imu(
                 History::default(),
                 Box::new(Window::new(setup.gyro_settings).expect("settings were checked")),
-                (setup.timing == Timing::Immediate)
+                (!setup.waits)
                     .then(|| Predictor::new([ACCELEROMETER_NOISE; 3], setup.gyro_settings))
                     .flatten(),
             ),
@@ -347,7 +346,7 @@ impl Pipeline {
                 .all(|buffer| buffer.newest().is_some_and(|newest| newest >= t))
         };
         let waited = self.newest > t + self.setup.max_wait;
-        let is_immediate = self.setup.timing == Timing::Immediate;
+        let is_immediate = !self.setup.waits;
         if !(is_immediate
             || self.finished
             || waited
@@ -384,7 +383,7 @@ impl Pipeline {
     /// What joints and drives do at the last estimate, per degree of freedom whose torque is valid
     /// and whose drive reports something: what a drive is identified from. Of all joints, with
     /// [`Setup::learns_drives`].
-    pub fn drive_rows(&self) -> impl Iterator<Item = (usize, Row)> {
+    pub fn drive_rows(&self) -> impl Iterator<Item = (usize, DriveRow)> {
         let drives = self.drives.iter();
         drives.flat_map(|drives| drives.rows(self.instant()))
     }
@@ -447,11 +446,11 @@ impl Pipeline {
 
     /// The last stamp whose samples may be used for an estimate at `t`.
     fn until(&self, t: Nanos) -> Nanos {
-        match self.setup.timing {
+        match self.setup.waits {
             // Half of the wait: a sample that may be used can then arrive late by the other half.
-            Timing::Aligned => t + Nanos(self.setup.max_wait.0 / 2),
+            true => t + Nanos(self.setup.max_wait.0 / 2),
             // What has arrived, and never more is known.
-            Timing::Immediate => Nanos::MAX,
+            false => Nanos::MAX,
         }
     }
 }
@@ -462,7 +461,7 @@ const ACCELEROMETER_NOISE: f64 = 0.035;
 
 /// The predictor of F/T sensor `number`, if estimates do not wait.
 fn sensor_predictor(setup: &Setup, number: usize) -> Option<Predictor<6>> {
-    if setup.timing == Timing::Aligned {
+    if setup.waits {
         return None;
     }
     Predictor::new(sensor_peaks(setup, number), setup.joint_settings)

@@ -30,7 +30,7 @@ const SHORTEST: f64 = 2.0;
 const NAMED: usize = 5;
 
 /// A kind of quantity.
-struct Quantity {
+struct CredibleRange {
     /// The credible values of its size, and the unit.
     range: [f64; 2],
     unit: &'static str,
@@ -40,7 +40,7 @@ struct Quantity {
     mistaken: &'static [(&'static str, f64)],
 }
 
-const GRAVITY: Quantity = Quantity {
+const GRAVITY: CredibleRange = CredibleRange {
     range: [9.7, 9.9],
     unit: "m/s^2",
     because: "on Earth it is 9.76 to 9.83",
@@ -52,15 +52,15 @@ const GRAVITY: Quantity = Quantity {
     ],
 };
 
-const ANGLE: Quantity = Quantity {
+const ANGLE: CredibleRange = CredibleRange {
     range: [0.0, TAU],
     unit: "rad",
     because: "more than a full turn, 6.283185, is no other angle",
     mistaken: &[("degrees", PI / 180.0)],
 };
 
-const fn length(longest: f64) -> Quantity {
-    Quantity {
+const fn length(longest: f64) -> CredibleRange {
+    CredibleRange {
         range: [0.0, longest],
         unit: "m",
         because: "the robot itself is shorter",
@@ -68,7 +68,7 @@ const fn length(longest: f64) -> Quantity {
     }
 }
 
-impl Quantity {
+impl CredibleRange {
     /// What is wrong with `numbers`, whose size is `size`: an error if another unit explains it,
     /// else a note.
     fn judge(&self, at: &str, numbers: &[f64], size: f64) -> Result<Option<String>, String> {
@@ -117,7 +117,7 @@ fn text(numbers: &[f64]) -> String {
 pub(crate) fn check(config: &Config, model: &Model) -> Result<Vec<String>, String> {
     let mut notes = Vec::new();
     let longest = longest(model);
-    let mut judge = |quantity: &Quantity, at: &str, numbers: &[f64], size: f64| {
+    let mut judge = |quantity: &CredibleRange, at: &str, numbers: &[f64], size: f64| {
         let note = quantity.judge(at, numbers, size)?;
         notes.extend(note);
         Ok::<_, String>(())

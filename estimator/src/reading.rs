@@ -105,16 +105,16 @@ const SEGMENT: usize = 256 << 10;
 
 /// The channel or contact that a column belongs to.
 #[derive(Clone, Copy)]
-pub(crate) enum Target {
+pub(crate) enum ColumnOwner {
     Channel(usize),
     Contact(usize),
 }
 
 /// Per series of a log its channel or contact; none if the robot has no such.
-pub(crate) fn targets(robot: &Robot, series: &[Series]) -> Vec<Option<Target>> {
+pub(crate) fn targets(robot: &Robot, series: &[Series]) -> Vec<Option<ColumnOwner>> {
     let target = |series: &Series| match series.what {
-        What::Channel(kind) => robot.channel(kind, &series.name).map(Target::Channel),
-        What::Contact => robot.contact(&series.name).map(Target::Contact),
+        What::Channel(kind) => robot.channel(kind, &series.name).map(ColumnOwner::Channel),
+        What::Contact => robot.contact(&series.name).map(ColumnOwner::Contact),
     };
     series.iter().map(target).collect()
 }
@@ -242,7 +242,7 @@ impl PartialRecording {
     fn new(
         robot: &Robot,
         table: &TableReader<impl Read>,
-    ) -> Result<(Self, Vec<Option<Target>>), ReadingError> {
+    ) -> Result<(Self, Vec<Option<ColumnOwner>>), ReadingError> {
         // A log may lack an F/T sensor, but no joint and no IMU.
         check_columns(robot, table.series(), |c| c.kind != Kind::Wrench)?;
         let targets = targets(robot, table.series());
@@ -257,7 +257,7 @@ impl PartialRecording {
     fn take<R: Read>(
         &mut self,
         rows: &mut TableReader<R>,
-        targets: &[Option<Target>],
+        targets: &[Option<ColumnOwner>],
     ) -> Result<(), csv::TableError> {
         let (mut row, mut pseudo) = (Row::default(), Nanos::ZERO);
         while rows.next_row(&mut row)? {
@@ -268,10 +268,10 @@ impl PartialRecording {
             });
             for SeriesValue { series, value } in &row.items {
                 match (targets.get(*series).copied().flatten(), value) {
-                    (Some(Target::Channel(channel)), Value::Reading(reading, quality)) => {
+                    (Some(ColumnOwner::Channel(channel)), Value::Reading(reading, quality)) => {
                         self.recording.push(channel, t, reading, *quality);
                     }
-                    (Some(Target::Contact(contact)), Value::Contact(state)) => {
+                    (Some(ColumnOwner::Contact(contact)), Value::Contact(state)) => {
                         self.recording.declare(contact, t, state.active);
                     }
                     _ => {}

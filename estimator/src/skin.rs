@@ -17,7 +17,7 @@
 //!   ([`threshold`]).
 //! - **Silence.** A triangle of twelve taxels that has not been heard for `max_silence` shows no
 //!   touch; readings with a fault do not count. If it showed one when it was last heard, the touch
-//!   is lost: nobody knows whether it is still there (`Touch::lost`).
+//!   is lost: nobody knows whether it is still there (`TouchSum::lost`).
 //!
 //! Several touches on one link are one contact, at their common centroid. The centroid of a touch
 //! on a curved surface lies below the surface: by 1.7 mm for a touch 2 cm wide on a forearm of 3 cm
@@ -91,7 +91,7 @@ const NO_NORMAL_STD: f64 = 1.0;
 
 /// What patches show at an instant: sums over their pressed taxels.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(crate) struct Touch {
+pub(crate) struct TouchSum {
     /// Sum of pressures; 0 without a touch.
     pressure: f64,
     /// Sum of pressure times position.
@@ -104,7 +104,7 @@ pub(crate) struct Touch {
     pub(crate) lost: Option<usize>,
 }
 
-impl Touch {
+impl TouchSum {
     /// Whether anything is touched.
     pub(crate) fn is_there(&self) -> bool {
         self.pressure > 0.0
@@ -137,14 +137,14 @@ pub(crate) enum Taken {
 
 /// The state of a patch.
 #[derive(Debug, Clone)]
-pub(crate) struct Patch {
+pub(crate) struct TactilePatch {
     setup: PatchSetup,
-    triangles: Vec<Triangle>,
+    triangles: Vec<TaxelTriangle>,
     newest: Option<Nanos>,
 }
 
 #[derive(Debug, Clone)]
-struct Triangle {
+struct TaxelTriangle {
     taxels: [TaxelState; TRIANGLE],
     /// Its touch at each reading: pressure, moment, normal.
     touches: History<7, KEPT>,
@@ -215,9 +215,9 @@ impl TaxelState {
     }
 }
 
-impl Patch {
+impl TactilePatch {
     pub(crate) fn new(setup: PatchSetup) -> Self {
-        let triangle = || Triangle {
+        let triangle = || TaxelTriangle {
             taxels: [TaxelState::default(); TRIANGLE],
             touches: History::default(),
         };
@@ -277,7 +277,7 @@ impl Patch {
     }
 
     /// Adds to `touch` what this patch, which has number `number`, shows at `t`.
-    pub(crate) fn add_touch(&self, number: usize, t: Nanos, touch: &mut Touch) {
+    pub(crate) fn add_touch(&self, number: usize, t: Nanos, touch: &mut TouchSum) {
         for triangle in &self.triangles {
             let Some(held) = triangle.touches.at(t, t) else {
                 continue;
@@ -306,14 +306,14 @@ mod tests {
     const MS: fn(i64) -> Nanos = Nanos::from_millis;
 
     /// Two triangles of taxels 1 cm apart in a row along x, whose normals point up.
-    fn patch() -> Patch {
+    fn patch() -> TactilePatch {
         let taxel = |k: usize| {
             (k % 12 != 6).then(|| Taxel {
                 position: Vec3::new(0.01 * k as f64, 0.0, 0.03),
                 normal: Vec3::z(),
             })
         };
-        Patch::new(PatchSetup {
+        TactilePatch::new(PatchSetup {
             channel: "skin".into(),
             contact: 0,
             taxels: (0..24).map(taxel).collect(),
@@ -323,14 +323,14 @@ mod tests {
         })
     }
 
-    fn touch(patch: &Patch, t: Nanos) -> Touch {
-        let mut touch = Touch::default();
+    fn touch(patch: &TactilePatch, t: Nanos) -> TouchSum {
+        let mut touch = TouchSum::default();
         patch.add_touch(7, t, &mut touch);
         touch
     }
 
     /// Pushes a reading every 20 ms until `to` \[ms\] in which the taxels named have these values.
-    fn run(patch: &mut Patch, from: i64, to: i64, rest: f64, pressed: &[(usize, f64)]) {
+    fn run(patch: &mut TactilePatch, from: i64, to: i64, rest: f64, pressed: &[(usize, f64)]) {
         for t in (from..to).step_by(20) {
             for triangle in 0..2_u32 {
                 let mut taxels = [rest; 12];
@@ -461,7 +461,7 @@ mod tests {
         let mut patch = patch();
         run(&mut patch, 0, 1500, 0.0, &[]);
         run(&mut patch, 1500, 1600, 0.0, &[(5, 50.0)]);
-        let lost = |patch: &Patch, t| touch(patch, MS(t)).lost;
+        let lost = |patch: &TactilePatch, t| touch(patch, MS(t)).lost;
         // The last reading was at 1580.
         assert_eq!((lost(&patch, 1780), lost(&patch, 1781)), (None, Some(7)));
         assert!(!touch(&patch, MS(1781)).is_there());
@@ -531,7 +531,7 @@ mod tests {
             });
         }
         let (noise, per_hour) = (1.3, 2000.0);
-        let mut patch = Patch::new(PatchSetup {
+        let mut patch = TactilePatch::new(PatchSetup {
             taxels,
             threshold: threshold(noise, 96, per_hour),
             ..patch().setup

@@ -1,7 +1,7 @@
 //! The budget of a torque: its parts sum to the square of its deviation, and each is what an error
 //! of that input as large as its deviation does to the torque.
 
-use proprio_estimator::config::{Config, Timing};
+use proprio_estimator::config::Config;
 use proprio_estimator::differentiate::Window;
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
@@ -22,7 +22,7 @@ fn setup() -> Setup {
         (ft.offset_n, ft.offset_nm) = (Some([0.0; 3]), Some([0.0; 3]));
         (ft.offset_std_n, ft.offset_std_nm) = (Some([OFFSET[0]; 3]), Some([OFFSET[1]; 3]));
     }
-    config.output.timing = Some(Timing::Aligned);
+    config.output.max_wait_ms = Some(1.0);
     config.input.max_silence_ms = 4e3 * STEP;
     Setup::new(&config).unwrap()
 }

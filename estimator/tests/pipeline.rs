@@ -3,8 +3,9 @@
 //! estimates that depend on it, and bad samples are counted and affect nothing else.
 
 use proprio_dynamics::calibration::Calibration;
+use proprio_dynamics::model::{MeasurementDirection, MeasurementFrame};
 use proprio_dynamics::spatial::Wrench as Wrench6;
-use proprio_estimator::config::{Config, ContactKind, Direction, Presence, SensorFrame, Timing};
+use proprio_estimator::config::{Config, ContactModel, Occurrence};
 use proprio_estimator::offline;
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
@@ -27,7 +28,7 @@ fn setup(change: impl FnOnce(&mut Config)) -> Setup {
     for ft in &mut config.force_torque {
         (ft.offset_n, ft.offset_nm) = (Some([0.0; 3]), Some([0.0; 3]));
     }
-    config.output.timing = Some(Timing::Aligned);
+    config.output.max_wait_ms = Some(1.0);
     change(&mut config);
     Setup::new(&config).unwrap()
 }
@@ -400,7 +401,7 @@ fn a_state_identified_with_other_calibrations_is_not_resumed() {
     let identifying = |change: &dyn Fn(&mut Config)| {
         Pipeline::new(setup(|config| {
             config.identification.enabled = true;
-            config.contact.last_mut().unwrap().presence = Presence::Possible;
+            config.contact.last_mut().unwrap().presence = Occurrence::Possible;
             change(config);
         }))
     };
@@ -430,11 +431,13 @@ fn a_state_identified_with_other_calibrations_is_not_resumed() {
         },
         &|config| {
             config.force_torque[0].direction = match config.force_torque[0].direction {
-                Some(Direction::ChildToParent) => Some(Direction::ParentToChild),
-                _ => Some(Direction::ChildToParent),
+                Some(MeasurementDirection::ChildToParent) => {
+                    Some(MeasurementDirection::ParentToChild)
+                }
+                _ => Some(MeasurementDirection::ChildToParent),
             }
         },
-        &|config| config.force_torque[0].frame = Some(SensorFrame::Parent),
+        &|config| config.force_torque[0].frame = Some(MeasurementFrame::Parent),
     ];
     for (number, change) in other.into_iter().enumerate() {
         let mut pipeline = identifying(change);
@@ -879,7 +882,7 @@ fn the_ground_reaction_of_a_fixed_base_cannot_be_declared_absent() {
                 .for_each(|c| c.presence = presence);
         }
     };
-    use proprio_estimator::config::Presence::{Always, Possible};
+    use proprio_estimator::config::Occurrence::{Always, Possible};
     let mut torques = vec![];
     for presence in [Always, Possible] {
         let setup = setup(fixed(presence));
@@ -913,7 +916,7 @@ fn the_ground_reaction_of_a_fixed_base_cannot_be_declared_absent() {
 fn a_repeated_declaration_changes_nothing() {
     let setup = setup(|config| {
         for contact in config.contact.iter_mut().filter(|c| c.name() == "hand") {
-            contact.presence = Presence::Possible;
+            contact.presence = Occurrence::Possible;
         }
         config.output.max_wait_ms = Some(20.0);
     });
@@ -961,7 +964,7 @@ fn a_repeated_declaration_changes_nothing() {
 fn a_possible_contact_is_absent_unless_declared() {
     let possible = |config: &mut Config| {
         for contact in config.contact.iter_mut().filter(|c| c.name() == "hand") {
-            contact.presence = Presence::Possible;
+            contact.presence = Occurrence::Possible;
         }
     };
     let setup = setup(possible);
@@ -1022,7 +1025,7 @@ fn each_mistake_between_configuration_and_model_has_one_clear_message() {
         (
             &|c: &mut Config| {
                 c.force_torque[0].joint = "l_elbow".into();
-                c.force_torque[0].frame = Some(SensorFrame::Parent);
+                c.force_torque[0].frame = Some(MeasurementFrame::Parent);
             },
             "the F/T sensor in joint l_elbow cannot measure in the parent's frame, because the \
              joint moves",
@@ -1101,7 +1104,7 @@ fn what_carries_an_imu_need_not_be_named() {
     assert!(!told(&setup(possible)));
     // What may fly says so.
     assert!(!told(&setup(|config| {
-        config.contact[0].presence = Presence::Possible;
+        config.contact[0].presence = Occurrence::Possible;
     })));
 }
 
@@ -1111,7 +1114,7 @@ fn what_carries_an_imu_need_not_be_named() {
 fn the_base_is_the_link_that_stands() {
     use proprio_dynamics::spatial::Vec3;
     use proprio_dynamics::{FrameMotion, InverseDynamics, JointState as State, Kinematics};
-    use proprio_estimator::config::{Base, Foot, Presence};
+    use proprio_estimator::config::{Base, Foot, Occurrence};
 
     const GRAVITY: [[f64; 3]; 2] = [[0.0, 0.0, -9.80665], [3.0, 0.0, -9.3]];
     let on = |config: &mut Config| {
@@ -1127,7 +1130,7 @@ fn the_base_is_the_link_that_stands() {
             ],
         };
         for contact in &mut config.contact {
-            contact.presence = Presence::Possible;
+            contact.presence = Occurrence::Possible;
         }
     };
     let setup = setup(on);
@@ -1222,7 +1225,7 @@ fn the_base_is_the_link_that_stands() {
 
 #[test]
 fn a_foot_needs_a_contact_that_can_carry() {
-    use proprio_estimator::config::{Base, ContactKind, Foot};
+    use proprio_estimator::config::{Base, ContactModel, Foot};
     let foot = |link: &str, contact: &str| Foot {
         link: link.into(),
         contact: contact.into(),
@@ -1244,32 +1247,32 @@ fn a_foot_needs_a_contact_that_can_carry() {
             "contact \"stand\" is always present",
         ),
     ] {
-        let problem = problem(ContactKind::Wrench, vec![foot("chest", "stand"), second]);
+        let problem = problem(ContactModel::Wrench, vec![foot("chest", "stand"), second]);
         assert!(problem.contains(expected), "{expected}: {problem}");
     }
     for (link, contact, kind, expected) in [
         (
             "chst",
             "stand",
-            ContactKind::Wrench,
+            ContactModel::Wrench,
             "base.foot \"chst\": link: \"chst\" is not a link of the URDF; did you mean \"chest\"?",
         ),
         (
             "chest",
             "stnd",
-            ContactKind::Wrench,
+            ContactModel::Wrench,
             "contact = \"stnd\" is not a contact; did you mean \"stand\"?",
         ),
         (
             "chest",
             "hand",
-            ContactKind::Wrench,
+            ContactModel::Wrench,
             "must be on the same link and of kind \"wrench\"",
         ),
         (
             "chest",
             "stand",
-            ContactKind::Force,
+            ContactModel::Force,
             "must be on the same link and of kind \"wrench\"",
         ),
     ] {
@@ -1280,10 +1283,10 @@ fn a_foot_needs_a_contact_that_can_carry() {
 
 #[test]
 fn the_plan_states_how_many_parameters_each_sensor_can_identify() {
-    use proprio_estimator::config::{Base, Presence};
+    use proprio_estimator::config::{Base, Occurrence};
     let possible = |config: &mut Config| {
         for contact in &mut config.contact {
-            contact.presence = Presence::Possible;
+            contact.presence = Occurrence::Possible;
         }
     };
     // Four links and three revolute joints above the sensor, five and four beyond it; each joint
@@ -1372,7 +1375,7 @@ fn possible_hand_contact(config: &mut Config) {
         .contact
         .iter_mut()
         .find(|contact| contact.name() == "hand");
-    hand.unwrap().presence = Presence::Possible;
+    hand.unwrap().presence = Occurrence::Possible;
 }
 
 /// The estimates of a golden log, with `add(row)` added to the F/T reading of each row [N, Nm].
@@ -1449,7 +1452,7 @@ fn an_undeclared_contact_is_detected() {
     let told = estimates_of(
         |config| {
             possible_hand_contact(config);
-            config.contact.last_mut().unwrap().presence = Presence::Always;
+            config.contact.last_mut().unwrap().presence = Occurrence::Always;
         },
         &log,
         |_| [0.0; 6],
@@ -1610,7 +1613,7 @@ fn an_unexplained_residual_withholds_the_wrench_of_a_known_contact() {
         config.identification.urdf_relative_std = 0.0;
         let hand = config.contact.iter_mut().find(|c| c.name() == "hand");
         let hand = hand.unwrap();
-        (hand.kind, hand.presence) = (ContactKind::Force, Presence::Always);
+        (hand.kind, hand.presence) = (ContactModel::Force, Occurrence::Always);
     };
     let found = estimates_with_added(touched, "icub_left_arm_mujoco.csv", |number| {
         let torque = if (50..100).contains(&number) {
@@ -1719,10 +1722,10 @@ fn an_offset_that_is_not_configured_is_unknown() {
     assert!(std("l_shoulder_roll") > 100.0 && std("l_elbow") < 0.1);
 }
 
-/// Estimates of `events` with `timing = "immediate"`: each is made when its trigger sample arrives.
+/// Estimates of `events` that do not wait: each is made when its trigger sample arrives.
 fn run_immediate(change: impl FnOnce(&mut Config), events: &[Event]) -> (Vec<Estimate>, Pipeline) {
     let setup = setup(|config| {
-        config.output.timing = Some(Timing::Immediate);
+        config.output.max_wait_ms = None;
         config.output.max_torque_std_nm = Some(1000.0);
         change(config);
     });
@@ -1884,9 +1887,9 @@ fn immediate_estimates_depend_on_the_order_of_arrival_alone() {
 /// without taking the step for a motion.
 #[test]
 fn a_changed_zero_is_no_motion() {
-    for timing in [Timing::Aligned, Timing::Immediate] {
+    for max_wait_ms in [Some(1.0), None] {
         let setup = setup(|config| {
-            config.output.timing = Some(timing);
+            config.output.max_wait_ms = max_wait_ms;
             config.output.max_torque_std_nm = Some(1000.0);
         });
         let elbow = setup.robot.channel(Kind::Joint, "l_elbow").unwrap();
@@ -1921,9 +1924,9 @@ fn a_changed_zero_is_no_motion() {
         let marked = largest(&moved(step, Quality::ZERO_CHANGED));
         let unmarked = largest(&moved(step, Quality::GOOD));
         let bound = 1.2 * never.max(always);
-        assert!(marked < bound, "{timing:?} {marked} {bound}");
+        assert!(marked < bound, "{max_wait_ms:?} {marked} {bound}");
         // Nor is a jump that nobody tells of.
-        assert!(unmarked < bound, "{timing:?} {unmarked} {bound}");
+        assert!(unmarked < bound, "{max_wait_ms:?} {unmarked} {bound}");
     }
 }
 

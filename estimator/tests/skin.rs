@@ -4,9 +4,7 @@
 use proprio_dynamics::model::Frame;
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics};
-use proprio_estimator::config::{
-    Config, Contact, ContactKind, Presence, Skin as SkinConfig, Timing,
-};
+use proprio_estimator::config::{Config, ContactModel, ContactSite, Occurrence, TactileSkin};
 use proprio_estimator::offline;
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
@@ -66,22 +64,21 @@ fn taxel_file() -> PathBuf {
 
 /// The arm of the example with exact parameters, and a possible contact of this kind with a skin on
 /// its forearm.
-fn config(kind: ContactKind) -> Config {
+fn config(kind: ContactModel) -> Config {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/icub_left_arm");
     let mut config = Config::load(&folder.join("estimator.toml")).unwrap();
     config.identification.urdf_relative_std = 0.0;
-    config.output.timing = Some(Timing::Aligned);
     config.output.max_wait_ms = Some(20.0);
-    config.contact.last_mut().unwrap().presence = Presence::Possible;
-    config.contact.push(Contact {
+    config.contact.last_mut().unwrap().presence = Occurrence::Possible;
+    config.contact.push(ContactSite {
         name: Some("forearm".into()),
         link: "l_forearm".into(),
         kind,
-        direction: (kind == ContactKind::ForceAlong).then_some([0.0, 0.0, -1.0]),
+        direction: (kind == ContactModel::ForceAlong).then_some([0.0, 0.0, -1.0]),
         position_m: [0.0; 3],
-        presence: Presence::Possible,
+        presence: Occurrence::Possible,
     });
-    config.skin.push(SkinConfig {
+    config.skin.push(TactileSkin {
         channel: "l_forearm_skin".into(),
         link: "l_forearm".into(),
         contact: "forearm".into(),
@@ -275,13 +272,13 @@ fn at(estimates: &[Estimate], ms: i64) -> &Estimate {
 #[test]
 fn a_touch_says_where_a_contact_is() {
     for (kind, force) in [
-        (ContactKind::Force, 8.0),
-        (ContactKind::ForceAlong, 8.0),
-        (ContactKind::Wrench, 8.0),
+        (ContactModel::Force, 8.0),
+        (ContactModel::ForceAlong, 8.0),
+        (ContactModel::Wrench, 8.0),
         // So strong that 3 mm are a moment far above the noise: it still explains the readings.
-        (ContactKind::Force, 60.0),
+        (ContactModel::Force, 60.0),
         // Too weak for the F/T sensor to show it, where masses are known to 20 %.
-        (ContactKind::Force, 0.1),
+        (ContactModel::Force, 0.1),
     ] {
         let (mut config, push) = (config(kind), Push::into_the_skin(force));
         if force < 1.0 {
@@ -324,7 +321,7 @@ fn a_touch_says_where_a_contact_is() {
         let std = touched.standard_deviation[..3]
             .iter()
             .fold(0.0_f64, |a, b| a.max(*b));
-        let is_sharp = force < 5.0 || kind == ContactKind::ForceAlong || std < 0.1 * force;
+        let is_sharp = force < 5.0 || kind == ContactModel::ForceAlong || std < 0.1 * force;
         assert!(is_sharp, "{kind:?}: {std} N");
         eprintln!(
             "{kind:?}, {force} N: {:.1} mm away, deviations up to {largest:.1} of the stated, \
@@ -360,7 +357,7 @@ fn a_touch_says_where_a_contact_is() {
 /// The estimates depend on the stamps alone: not on when the skin's samples arrive.
 #[test]
 fn a_replay_with_a_skin_gives_the_live_estimates() {
-    let setup = setup(&config(ContactKind::ForceAlong));
+    let setup = setup(&config(ContactModel::ForceAlong));
     let push = Push::into_the_skin(5.0);
     let mut late = events(&setup, &push, i64::MAX);
     let expected = run(setup.clone(), &late);
@@ -413,7 +410,7 @@ fn bits(estimates: &[Estimate]) -> Vec<Vec<u64>> {
 /// places gives them to the bit.
 #[test]
 fn a_table_gives_the_live_estimates() {
-    let setup = setup(&config(ContactKind::ForceAlong));
+    let setup = setup(&config(ContactModel::ForceAlong));
     let push = Push::into_the_skin(5.0);
     let all = events(&setup, &push, 2000);
     let hand = setup.robot.contact("hand").unwrap();
@@ -460,7 +457,7 @@ fn a_table_gives_the_live_estimates() {
     let mut out = Vec::new();
     let report = offline::estimate(setup.clone(), text.as_slice(), &mut out, None).unwrap();
     assert_eq!((report.log.bad_rows, report.unused_channels.len()), (0, 0));
-    let mut own = offline::Table::new(Vec::new(), &setup).unwrap();
+    let mut own = offline::EstimateTable::new(Vec::new(), &setup).unwrap();
     for estimate in &live {
         own.write(estimate, None, true).unwrap();
     }
@@ -482,7 +479,7 @@ fn a_table_gives_the_live_estimates() {
 fn a_declared_place_is_as_good_as_a_configured_one() {
     let (place, along) = ([0.01, -0.06, 0.02], [0.3, 0.1, -1.0]);
     let base = |at: [f64; 3], direction: [f64; 3]| {
-        let mut config = config(ContactKind::ForceAlong);
+        let mut config = config(ContactModel::ForceAlong);
         let forearm = config.contact.last_mut().unwrap();
         (forearm.position_m, forearm.direction) = (at, Some(direction));
         config
@@ -605,7 +602,7 @@ fn all_zero(events: &[Event]) -> u64 {
 /// Untouched, nothing is lost.
 #[test]
 fn a_touch_that_is_lost_withholds_what_depends_on_it() {
-    let mut config = config(ContactKind::Force);
+    let mut config = config(ContactModel::Force);
     config.identification.urdf_relative_std = 0.2;
     // It could be taken for a contact of the hand.
     config.contact.retain(|contact| contact.name() != "hand");
@@ -691,7 +688,7 @@ fn a_touch_that_is_lost_withholds_what_depends_on_it() {
 #[test]
 fn each_mistake_about_a_skin_has_one_clear_message() {
     let problem = |change: &dyn Fn(&mut Config)| {
-        let mut config = config(ContactKind::Force);
+        let mut config = config(ContactModel::Force);
         change(&mut config);
         Setup::new(&config).map(|_| ()).unwrap_err()
     };
@@ -736,7 +733,7 @@ fn each_mistake_about_a_skin_has_one_clear_message() {
         assert!(problem.contains(told), "{problem}");
     }
     // Millimetres.
-    let mut config = config(ContactKind::Force);
+    let mut config = config(ContactModel::Force);
     std::fs::write(&config.skin[0].taxels, "-31 -75 8 0 0 1\n").unwrap();
     assert!(
         setup(&config)
@@ -772,7 +769,7 @@ fn each_mistake_about_a_skin_has_one_clear_message() {
 /// Taxels that are given in another frame of the link are where they are in the contact's.
 #[test]
 fn taxels_are_placed_in_the_frame_of_their_contact() {
-    let mut config = config(ContactKind::Force);
+    let mut config = config(ContactModel::Force);
     (config.skin[0].link, config.skin[0].contact) = ("l_hand_palm".into(), "hand".into());
     let setup = setup(&config);
     let palm = setup.robot.model.frame("l_hand_palm").unwrap().pose;
@@ -787,7 +784,7 @@ fn taxels_are_placed_in_the_frame_of_their_contact() {
 /// A plan that says what is read of the skin.
 #[test]
 fn the_plan_states_what_a_skin_shows() {
-    let setup = setup(&config(ContactKind::Force));
+    let setup = setup(&config(ContactModel::Force));
     let plan = setup.to_string();
     // 6 mm / sqrt(12); 3.65 standard deviations of 1 count.
     let told = "reads skin l_forearm_skin: 160 taxels, pressed above 3.6; touches of forearm \
@@ -809,7 +806,7 @@ proptest! {
         states in prop::collection::vec((any::<bool>(), any::<[f64; 7]>()), 20),
         along in any::<bool>(),
     ) {
-        let kind = if along { ContactKind::ForceAlong } else { ContactKind::Force };
+        let kind = if along { ContactModel::ForceAlong } else { ContactModel::Force };
         let setup = setup(&config(kind));
         let forearm = setup.robot.contact("forearm").unwrap();
         let push = Push::into_the_skin(5.0);

@@ -2,7 +2,7 @@
 //! still on an IMU, every channel sampled at the same instants, so that the reason of each number
 //! is plain.
 
-use proprio_estimator::config::{Config, Presence, Timing};
+use proprio_estimator::config::{Config, Occurrence};
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
 use proprio_identification::robot::Channel;
@@ -26,7 +26,7 @@ fn setup(change: impl FnOnce(&mut Config)) -> Setup {
     for ft in &mut config.force_torque {
         (ft.noise_n, ft.noise_nm) = NOISE;
     }
-    config.output.timing = Some(Timing::Aligned);
+    config.output.max_wait_ms = Some(1.0);
     change(&mut config);
     Setup::new(&config).unwrap()
 }
@@ -219,7 +219,7 @@ fn a_frozen_sensor_gives_no_valid_torque() {
 fn a_contact_that_nothing_would_show_is_not_assumed_absent() {
     let setup = setup(|config| {
         let hand = config.contact.last_mut().unwrap();
-        hand.presence = Presence::Possible;
+        hand.presence = Occurrence::Possible;
     });
     let channel = |kind| setup.robot.channels.iter().position(|c| c.kind == kind);
     let (ft, hand) = (channel(Kind::Wrench).unwrap(), setup.robot.contact("hand"));
@@ -345,7 +345,7 @@ fn what_two_unknown_contacts_leave_open_is_undetermined() {
         let mut second = config.contact.last().unwrap().clone();
         second.name = Some("forearm".into());
         second.link = "l_forearm".into();
-        second.presence = Presence::Always;
+        second.presence = Occurrence::Always;
         config.contact.push(second);
     });
     let of = |setup: &Setup| {

@@ -40,7 +40,7 @@ pub enum SimulatedRobotError {
     Gateway(#[from] proprio_gateway::plan::PlanError),
     /// estimator.toml is wrong.
     #[error(transparent)]
-    Estimator(#[from] proprio_estimator::config::ConfigError),
+    Estimator(#[from] proprio_estimator::config::InvalidConfig),
     /// The URDF is wrong.
     #[error("{}: {cause}", .file.display())]
     Model {

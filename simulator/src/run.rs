@@ -148,9 +148,9 @@ pub struct BusSummary {
 /// Runs `robot` for `options.seconds` or until `stop` is set.
 ///
 /// # Errors
-/// An error chain with cause, place and remedy. [`RunOptionsError`] and [`crate::SimulatorError`] at
-/// its root are wrong configurations; other causes are a bus that cannot be
-/// opened or a file that cannot be written.
+/// An error chain with cause, place and remedy. [`RunOptionsError`] and [`crate::SimulatorError`]
+/// at its root are wrong configurations; other causes are a bus that cannot be opened or a file
+/// that cannot be written.
 pub fn run(
     robot: &SimulatedRobot,
     options: &RunOptions,

@@ -19,7 +19,7 @@ use proprio_dynamics::{
     DynamicsError, ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics, Noise,
     SensorCut,
 };
-use proprio_estimator::config::{Base, Contact, ContactKind, Direction, ForceTorque, SensorFrame};
+use proprio_estimator::config::{Base, ContactModel, ContactSite, ForceTorque};
 use proprio_estimator::skin::{TRIANGLE, TRIANGLES, Taxel, TaxelMap};
 use proprio_topics::{Kind, Skin};
 
@@ -745,17 +745,8 @@ fn sensor_cut(
     ft: &ForceTorque,
 ) -> Result<SensorCut, proprio_dynamics::StructureError> {
     let element = model.sensors().iter().find(|s| s.joint == ft.joint);
-    let frame = match ft.frame {
-        Some(SensorFrame::Child) => MeasurementFrame::Child,
-        Some(SensorFrame::Parent) => MeasurementFrame::Parent,
-        Some(SensorFrame::Sensor) => MeasurementFrame::Sensor,
-        None => element.map_or(MeasurementFrame::Child, |e| e.frame),
-    };
-    let direction = match ft.direction {
-        Some(Direction::ChildToParent) => MeasurementDirection::ChildToParent,
-        Some(Direction::ParentToChild) => MeasurementDirection::ParentToChild,
-        None => element.map_or(MeasurementDirection::ChildToParent, |e| e.direction),
-    };
+    let frame = ft.frame.or(element.map(|e| e.frame));
+    let direction = ft.direction.or(element.map(|e| e.direction));
     let pose = match (ft.xyz_m, ft.rpy_rad) {
         (None, None) => element.map_or_else(Pose::identity, |e| e.pose),
         (xyz, rpy) => Pose::from_xyz_rpy(xyz.unwrap_or_default(), rpy.unwrap_or_default()),
@@ -763,8 +754,8 @@ fn sensor_cut(
     SensorCut::new(
         model,
         &ft.joint,
-        frame,
-        direction,
+        frame.unwrap_or(MeasurementFrame::Child),
+        direction.unwrap_or(MeasurementDirection::ChildToParent),
         &pose,
         &Noise {
             force: ft.noise_n,
@@ -774,7 +765,7 @@ fn sensor_cut(
 }
 
 /// A push that is possible for a contact of this kind, in a direction drawn from the seed.
-fn push_wrench(contact: &Contact, seed: u64) -> Wrench {
+fn push_wrench(contact: &ContactSite, seed: u64) -> Wrench {
     let mut random = Random::new(seed, "push", 0);
     let mut unit = || {
         let direction = Vec3::new(random.normal(), random.normal(), random.normal());
@@ -786,14 +777,14 @@ fn push_wrench(contact: &Contact, seed: u64) -> Wrench {
         torque: Vec3::from(contact.position_m).cross(&force),
     };
     match (contact.kind, contact.direction) {
-        (ContactKind::Wrench, _) => Wrench { force, torque },
-        (ContactKind::ForceAlong, Some(direction)) => through(
+        (ContactModel::Wrench, _) => Wrench { force, torque },
+        (ContactModel::ForceAlong, Some(direction)) => through(
             Vec3::from(direction)
                 .try_normalize(1e-9)
                 .unwrap_or_else(Vec3::x)
                 * PUSH.0,
         ),
-        (ContactKind::Force | ContactKind::ForceAlong, _) => through(force),
+        (ContactModel::Force | ContactModel::ForceAlong, _) => through(force),
     }
 }
 

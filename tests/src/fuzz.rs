@@ -3,7 +3,7 @@
 //! `fuzz/`, a fuzzer looks for others that reach more code.
 
 use proprio_dynamics::model::Model;
-use proprio_estimator::config::{Config, Presence};
+use proprio_estimator::config::{Config, Occurrence};
 use proprio_estimator::parameters::{Parameters, Provenance};
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
@@ -233,7 +233,7 @@ fn read_state(bytes: &[u8]) -> bool {
 fn learning() -> Pipeline {
     Pipeline::new(arm(|config| {
         config.identification.enabled = true;
-        config.contact.last_mut().expect("a contact").presence = Presence::Possible;
+        config.contact.last_mut().expect("a contact").presence = Occurrence::Possible;
     }))
 }
 

@@ -2,7 +2,7 @@
 //! simulator's truth for comparison.
 
 use crate::{PATIENCE, now, until};
-use proprio_estimator::offline::Table;
+use proprio_estimator::offline::EstimateTable;
 use proprio_estimator::pipeline::Estimate;
 use proprio_estimator::setup::Setup;
 use proprio_topics::csv::{self, Columns, Series, Value, What};
@@ -256,7 +256,7 @@ impl Recorder {
     /// Never: it writes to memory.
     #[must_use]
     pub fn estimate_rows(&self, setup: &Setup) -> BTreeMap<String, String> {
-        let mut table = Table::new(Vec::new(), setup).expect("memory can be written");
+        let mut table = EstimateTable::new(Vec::new(), setup).expect("memory can be written");
         for estimate in self.estimates.values() {
             table
                 .write(estimate, None, true)

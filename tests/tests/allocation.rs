@@ -16,7 +16,7 @@ use proprio_dynamics::{
     ContactKind, ContactSet, ContactSpec, DynamicsError, ExternalWrench, FrameMotion,
     InverseDynamics, JointState, Kinematics, Noise, SensorCut, Solver, Structure,
 };
-use proprio_estimator::config::{Presence, Skin as SkinConfig};
+use proprio_estimator::config::{Occurrence, TactileSkin};
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::propagation::{Covariance, Propagation};
 use proprio_estimator::setup::Setup;
@@ -467,7 +467,7 @@ fn identification_in_the_pipeline_allocates_nothing_but_in_its_jobs() {
     // Otherwise the hand counts as always touched and nothing can be identified.
     config.contact.iter_mut().for_each(|contact| {
         if contact.name() == "hand" {
-            contact.presence = Presence::Possible;
+            contact.presence = Occurrence::Possible;
         }
     });
     let setup = Setup::new(&config).unwrap();
@@ -528,7 +528,7 @@ fn the_pipeline_allocates_nothing_once_it_runs() {
     let taxels = folder.path().join("taxels.csv");
     std::fs::write(&taxels, "0.01 0.02 0.03 0 0 1\n".repeat(24)).unwrap();
     let mut config = robot.config.clone();
-    config.skin.push(SkinConfig {
+    config.skin.push(TactileSkin {
         channel: "skin".into(),
         link: "l_hand".into(),
         contact: "hand".into(),

@@ -3,7 +3,7 @@
 #![allow(missing_docs)]
 
 use proprio_estimator::config::Config;
-use proprio_estimator::drive::{self, Drive, Signal, Unfit};
+use proprio_estimator::drive::{self, DriveModel, DriveSignal, Unfit};
 use proprio_estimator::offline::{drive_rows, follow};
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::pipeline::Pipeline;
@@ -167,7 +167,7 @@ fn found(arm: &Arm, parameters: &Parameters, summary: &Json) {
             .eq(joints.iter().map(String::as_str))
     );
     for own in parameters.drives() {
-        assert_eq!(own.signal, Signal::Current);
+        assert_eq!(own.signal, DriveSignal::Current);
         let truth = DriveTruth::new(&arm.robot.model, &own.joint);
         let expected = [
             truth.per_ampere,
@@ -379,7 +379,7 @@ fn live(arm: &Arm) {
     );
 }
 
-/// A leg of the Open Dynamic SimulatedRobot Initiative on a force/torque sensor in the ground, real: squats
+/// A leg of the Open Dynamic Robot Initiative on a force/torque sensor in the ground, real: squats
 /// of 23 s (`tests/data/hopper`). Its drives report torques.
 #[test]
 fn the_drive_of_a_real_leg_is_found() {
@@ -406,7 +406,7 @@ fn the_drive_of_a_real_leg_is_found() {
     let halves = [(0.0, 12.0), (12.0, 24.0)];
     let halves = halves.map(|(from, to)| part("knee", from, to).unwrap().unwrap());
     let [first, second] = [0, 1].map(|half: usize| {
-        let own: &Drive = &halves[half];
+        let own: &DriveModel = &halves[half];
         println!(
             "knee, half {half}: constant {:.3} +- {:.3}, noise {:.3} Nm",
             own.parameters[0],

@@ -12,7 +12,7 @@
 use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::Wrench;
 use proprio_estimator::assessment::{Assessment, Assessor, Coverage};
-use proprio_estimator::config::{Config, ForceTorque, Presence};
+use proprio_estimator::config::{Config, ForceTorque, Occurrence};
 use proprio_estimator::export::parameters;
 use proprio_estimator::offline::estimate;
 use proprio_estimator::parameters::{Offset, Parameters, Provenance};
@@ -144,20 +144,20 @@ impl Sessions {
     /// With the F/T offsets in the middle of a session's drift, if a session is named. The hand is
     /// touched only if declared.
     fn setup(&self, urdf: Urdf, offsets_of: Option<&str>) -> Setup {
-        self.setup_for(Presence::Possible, urdf, offsets_of)
+        self.setup_for(Occurrence::Possible, urdf, offsets_of)
     }
 
     /// The same, but the hand may always be touched: torques beyond the sensor depend on its
     /// reading.
     fn setup_touched(&self, urdf: Urdf, offsets_of: Option<&str>) -> Setup {
-        self.setup_for(Presence::Always, urdf, offsets_of)
+        self.setup_for(Occurrence::Always, urdf, offsets_of)
     }
 
-    fn setup_for(&self, hand: Presence, urdf: Urdf, offsets_of: Option<&str>) -> Setup {
+    fn setup_for(&self, hand: Occurrence, urdf: Urdf, offsets_of: Option<&str>) -> Setup {
         Setup::new(&self.config(hand, urdf, offsets_of)).unwrap()
     }
 
-    fn config(&self, hand: Presence, urdf: Urdf, offsets_of: Option<&str>) -> Config {
+    fn config(&self, hand: Occurrence, urdf: Urdf, offsets_of: Option<&str>) -> Config {
         let mut config = Config::load(&self.folder.join("estimator.toml")).unwrap();
         config.contact.last_mut().expect("the hand").presence = hand;
         // Errors are measured here, however large: no torque is withheld as uncertain.
@@ -570,7 +570,7 @@ fn the_cad_is_a_fifth_off_in_every_link_and_physical() {
 /// With on-line identification, and no knowledge of offsets and CAD at the start.
 fn learning(sessions: &Sessions) -> Setup {
     let mut config = Config::load(&sessions.folder.join("estimator.toml")).unwrap();
-    config.contact.last_mut().expect("the hand").presence = Presence::Possible;
+    config.contact.last_mut().expect("the hand").presence = Occurrence::Possible;
     config.identification.enabled = true;
     Setup::new(&config).unwrap()
 }
@@ -744,7 +744,7 @@ fn pushes_that_nobody_declares_are_found_where_they_act() {
             sessions.log("pushed"),
             &sessions.facts["sessions"]["pushed"],
         );
-        let mut config = sessions.config(Presence::Possible, Urdf::Cad, None);
+        let mut config = sessions.config(Occurrence::Possible, Urdf::Cad, None);
         config.identification.enabled = true;
         let mut forearm = config.contact.last().unwrap().clone();
         (forearm.name, forearm.link) = (Some("forearm".into()), "l_forearm".into());
@@ -1028,7 +1028,7 @@ fn a_load_that_is_picked_up_is_noticed_and_learnt() {
             }))
         };
         // The reference knows the arm exactly, and that nothing touches it.
-        let mut exact = sessions.config(Presence::Possible, Urdf::True, Some("payload"));
+        let mut exact = sessions.config(Occurrence::Possible, Urdf::True, Some("payload"));
         exact.contact.retain(|contact| contact.name() != "hand");
         // Such noise explains the load, so that no torque is withheld.
         exact.force_torque[0].noise_n = [1e3; 3];
@@ -1174,7 +1174,7 @@ fn a_state_is_resumed_and_one_that_does_not_fit_is_refused() {
     assert!(refused(&text.replacen("state 3", "state 4", 1)).contains("schema 4"));
     let mut config = Config::load(&sessions.folder.join("estimator.toml")).unwrap();
     config.identification.enabled = true;
-    config.contact.last_mut().unwrap().presence = Presence::Possible;
+    config.contact.last_mut().unwrap().presence = Occurrence::Possible;
     config.robot = "another".into();
     let other = Pipeline::new(Setup::new(&config).unwrap())
         .resume(&text)

@@ -31,7 +31,7 @@ fn shipped(name: &str, sensors: &[&str], identification: &str) -> Setup {
     let mut config = Config::load(&folder.join("estimator.toml")).unwrap();
     let contacts = config.contact.len();
     let tip = &mut config.contact[contacts - 1];
-    tip.presence = proprio_estimator::config::Presence::Possible;
+    tip.presence = proprio_estimator::config::Occurrence::Possible;
     for joint in sensors {
         let text = format!("sensor = \"{joint}.ft\"\njoint = {joint:?}");
         config.force_torque.push(toml::from_str(&text).unwrap());

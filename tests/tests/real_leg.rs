@@ -3,7 +3,7 @@
 //! (`PROPRIO_DATA`) and the folder of the robot's URDF (`PROPRIO_ICUB_MODELS`); skipped with a note
 //! without them.
 
-use proprio_estimator::config::{Config, Presence};
+use proprio_estimator::config::{Config, Occurrence};
 use proprio_estimator::export::parameters;
 use proprio_estimator::offline::estimate;
 use proprio_estimator::reading;
@@ -565,7 +565,7 @@ fn on_line_the_torques_of_a_real_leg_are_what_they_are_from_its_log() {
         .contact
         .iter_mut()
         .find(|contact| contact.name() == "right_foot");
-    foot.expect("the foot's contact").presence = Presence::Possible;
+    foot.expect("the foot's contact").presence = Occurrence::Possible;
 
     let identified = {
         let setup = leg.setup();

@@ -3,7 +3,7 @@
 use crate::folder::{read, with_files};
 use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::RigidInertia;
-use proprio_estimator::config::{Config, ConfigError};
+use proprio_estimator::config::{Config, InvalidConfig};
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
 use proprio_simulator::{PlannedPush, SimulatedRobot, Simulation, SimulationSettings, wrong_urdf};
@@ -146,7 +146,7 @@ impl Experiment {
         fs::write(&file, format!("{head}{table}"))?;
         let mut config = Config::load(&file)?;
         let setup = |config: &Config| {
-            Setup::new(config).map_err(|problem| ConfigError {
+            Setup::new(config).map_err(|problem| InvalidConfig {
                 file: file.clone(),
                 problem,
             })

@@ -51,7 +51,7 @@ use super::watching::ReceivedRun;
 use anyhow::Context;
 use compared::TrueTorques;
 use evaluation::Evaluation;
-use proprio_estimator::offline::Table;
+use proprio_estimator::offline::EstimateTable;
 use proprio_estimator::pipeline::Estimate;
 use proprio_estimator::setup::Setup;
 use std::fs::{self, File};
@@ -89,7 +89,7 @@ fn write_estimates(file: &Path, setup: &Setup, watched: &ReceivedRun) -> anyhow:
         Ok(u32::try_from(values.len())?)
     }
     let out = File::create(file).with_context(|| file.display().to_string())?;
-    let mut table = Table::new(BufWriter::new(out), setup)?;
+    let mut table = EstimateTable::new(BufWriter::new(out), setup)?;
     for seen in &watched.estimates {
         let mut estimate = Estimate::absent(seen.t);
         let (torques, contacts) = (&mut estimate.torques, &mut estimate.contacts);

@@ -1,7 +1,7 @@
 //! The posture of a running robot, and what its sensors measure meanwhile, from shared memory.
 
 use proprio_dynamics::spatial::{Vec3, Wrench};
-use proprio_estimator::check::{Measured, Posture};
+use proprio_estimator::check::{Posture, PostureReadings};
 use proprio_estimator::setup::Setup;
 use proprio_identification::robot::ChannelRole;
 use proprio_topics::Nanos;
@@ -76,7 +76,7 @@ pub(crate) fn posture(setup: &Setup, domain: &DomainConfig) -> Result<Option<Pos
         }
     }
     let mut position = vec![f64::NAN; setup.robot.model.dof_count()];
-    let mut measured = Measured {
+    let mut measured = PostureReadings {
         wrenches: vec![Wrench::zero(); setup.robot.structure.sensors().len()],
         proper_acceleration: None,
         moved,

@@ -6,7 +6,7 @@ use crate::convert::is_file;
 use crate::samples;
 use anyhow::Context;
 use proprio_dynamics::spatial::Wrench;
-use proprio_estimator::drive::{self, Drive, Row, Signal, Unfit};
+use proprio_estimator::drive::{self, DriveModel, DriveRow, DriveSignal, Unfit};
 use proprio_estimator::offline::drive_rows;
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::setup::Setup;
@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 const SAME_UNIT: f64 = 0.3;
 
 /// A joint, and its drive or why there is none.
-pub(super) type Found = (String, Result<Drive, Unfit>);
+pub(super) type Found = (String, Result<DriveModel, Unfit>);
 
 /// The drives of all joints whose drives report something, from the training logs `files`.
 pub(super) fn identify(
@@ -33,7 +33,7 @@ pub(super) fn identify(
 ) -> anyhow::Result<Vec<Found>> {
     let mut setup = setup.clone();
     setup.apply(parameters)?;
-    let mut logs: Vec<Vec<Vec<Row>>> = Vec::new();
+    let mut logs: Vec<Vec<Vec<DriveRow>>> = Vec::new();
     for ((file, role), log) in files.iter().zip(&outcome.logs) {
         if *role == LogRole::Train && reports(file)? {
             let mut setup = setup.clone();
@@ -45,7 +45,7 @@ pub(super) fn identify(
     }
     let robot = &setup.robot;
     let of_joint = |dof: usize| {
-        let own: Vec<Vec<Row>> = (logs.iter_mut())
+        let own: Vec<Vec<DriveRow>> = (logs.iter_mut())
             .filter_map(|log| log.get_mut(dof).map(std::mem::take))
             .collect();
         let joint = robot.model.dof_name(dof);
@@ -81,7 +81,7 @@ fn set_offsets(setup: &mut Setup, log: &LogOutcome) {
 
 /// For summary.json.
 pub(super) fn in_json(found: &[Found]) -> Json {
-    let one = |result: &Result<Drive, Unfit>| match result {
+    let one = |result: &Result<DriveModel, Unfit>| match result {
         Err(unfit) => json!({ "reason": unfit.to_string() }),
         Ok(drive) => {
             let [constant, coulomb, viscous, load, rotor, offset] = drive.parameters;
@@ -115,7 +115,7 @@ pub(super) fn warnings(found: &[Found]) -> Vec<String> {
         Ok(drive) => {
             let (constant, deviation) = (drive.parameters[0], drive.deviations()[0]);
             let is_off = (constant - 1.0).abs() > SAME_UNIT + 3.0 * deviation;
-            (drive.signal == Signal::Torque && is_off).then(|| {
+            (drive.signal == DriveSignal::Torque && is_off).then(|| {
                 format!(
                     "the torque of {joint} is {constant:.3} +- {deviation:.3} times what its drive \
                      reports: it reports in another unit, on the motor's side of the gear, or with \

@@ -6,7 +6,7 @@ use super::logs::{names, open, read};
 use super::summary::severity;
 use anyhow::{Context, bail};
 use proprio_dynamics::spatial::Mat3;
-use proprio_estimator::config::ConfigError;
+use proprio_estimator::config::InvalidConfig;
 use proprio_estimator::export;
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::setup::{Setup, frame};
@@ -37,7 +37,7 @@ pub(super) fn run(
         configured = config.parameters.take();
         config.identification.enabled = false;
     })?;
-    let frame = frame(&setup.robot.model, name).map_err(|problem| ConfigError {
+    let frame = frame(&setup.robot.model, name).map_err(|problem| InvalidConfig {
         file: config_file.to_owned(),
         problem: format!("--payload: {problem}"),
     })?;
@@ -82,7 +82,7 @@ fn without_payload(
 ) -> anyhow::Result<Parameters> {
     let is_toml = |file: &PathBuf| file.extension().is_some_and(|word| word == "toml");
     match files {
-        [] => Err(ConfigError {
+        [] => Err(InvalidConfig {
             file: config.to_owned(),
             problem: "a payload is what a robot weighs more than without it: give the parameters \
                       or a log of the robot without it with --reference, or name its parameters \

@@ -5,7 +5,7 @@ use crate::convert::{Configured, input, unfit};
 use crate::names::find;
 use crate::samples;
 use anyhow::{Context, anyhow, bail};
-use proprio_estimator::offline::{OfflineError, follow};
+use proprio_estimator::offline::{EstimationError, follow};
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::plan::Plan;
@@ -86,7 +86,7 @@ impl Log<'_> {
                 is_stamped,
                 spells,
             }),
-            Err(error @ OfflineError::MissingChannels(_)) => {
+            Err(error @ EstimationError::MissingChannels(_)) => {
                 Err(unfit(&self.config, self.file, &error).into())
             }
             Err(error) => Err(error).with_context(|| self.file.display().to_string()),

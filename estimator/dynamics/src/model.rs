@@ -207,7 +207,8 @@ struct JointFacts {
 }
 
 /// The frame in which an F/T sensor measures: its axes, and the origin as the point of its torque.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum MeasurementFrame {
     /// The frame of the joint's child link.
     Child,
@@ -218,7 +219,8 @@ pub enum MeasurementFrame {
 }
 
 /// Which of the two opposite wrenches an F/T sensor reports.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum MeasurementDirection {
     /// The wrench that the child exerts on the parent.
     ChildToParent,

@@ -74,7 +74,8 @@ pub enum PayloadError {
 
 /// Identifies what a frame of the robot carries in these logs.
 ///
-/// `inputs`: as for [`crate::identify`]. `robot` has the parameters and calibrations that were identified without the payload.
+/// `inputs`: as for [`crate::identify`]. `robot` has the parameters and calibrations that were
+/// identified without the payload.
 ///
 /// # Errors
 /// [`PayloadError`].

@@ -36,9 +36,9 @@
 //! of the prior.
 //!
 //! # The weight
-//! [`MapEstimate::next_tau`] maximises the evidence. The prior in the ten parameters of a link, `exp(-D /
-//! (2 tau^2))`, is a Wishart distribution (`n = 5 + 1/tau^2` degrees of freedom, scale `tau^2 J0`,
-//! mode at CAD). Its mean divergence is known:
+//! [`MapEstimate::next_tau`] maximises the evidence. The prior in the ten parameters of a link,
+//! `exp(-D / (2 tau^2))`, is a Wishart distribution (`n = 5 + 1/tau^2` degrees of freedom, scale
+//! `tau^2 J0`, mode at CAD). Its mean divergence is known:
 //!
 //! ```text
 //! e(tau) = 20 tau^2 - sum_{i=0..3} digamma((n - i) / 2) - 4 log(2 tau^2)

@@ -1,11 +1,11 @@
 //! The motion that lessens the deviations of some torques the most.
 //!
 //! Criterion: the sum of the logarithms of the deviations, over the states of a [`Workspace`],
-//! after the motion ([`Forecast`]). Its numbers ([`FourierSeries::within`]) are found by an evolution
-//! strategy: from the best of some random motions, with the mean of the best of each generation
-//! and a step that the path of the mean adapts (Hansen, Ostermeier, "Completely derandomized
-//! self-adaptation in evolution strategies", 2001, without its covariance matrix). It needs no
-//! derivatives, which limits and boxes do not have.
+//! after the motion ([`Forecast`]). Its numbers ([`FourierSeries::within`]) are found by an
+//! evolution strategy: from the best of some random motions, with the mean of the best of each
+//! generation and a step that the path of the mean adapts (Hansen, Ostermeier, "Completely
+//! derandomized self-adaptation in evolution strategies", 2001, without its covariance matrix). It
+//! needs no derivatives, which limits and boxes do not have.
 
 use crate::knowledge::at_rest;
 use crate::motion::{Fence, FourierSeries, JointLimits, harmonics, reach, within};

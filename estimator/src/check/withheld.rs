@@ -188,14 +188,14 @@ fn rebuilt(mut setup: Setup) -> Setup {
 }
 
 /// The last estimate of a trial.
-struct Outcome {
+struct TrialEnd {
     torques: Vec<JointTorque>,
     /// Per contact.
     contacts: Vec<Reason>,
 }
 
 /// Runs the pipeline on perfect samples of the robot at rest.
-fn trial(setup: &Setup, still: &Still) -> Outcome {
+fn trial(setup: &Setup, still: &Still) -> TrialEnd {
     let mut pipeline = Pipeline::new(setup.clone());
     let robot = &setup.robot;
     let readings: Vec<Reading> = (robot.channels.iter())
@@ -216,7 +216,7 @@ fn trial(setup: &Setup, still: &Still) -> Outcome {
         pipeline.declare(contact, Nanos::ZERO, &ContactState::configured(true));
     }
     let period = Nanos((robot.max_silence.0 / 4).clamp(1, PERIOD.0));
-    let mut last = Outcome {
+    let mut last = TrialEnd {
         torques: Vec::new(),
         contacts: Vec::new(),
     };
@@ -246,7 +246,7 @@ fn trial(setup: &Setup, still: &Still) -> Outcome {
         }
         while let Some(estimate) = pipeline.poll() {
             let reason = |c: &proprio_topics::ContactWrench| c.reason.get().unwrap_or_default();
-            last = Outcome {
+            last = TrialEnd {
                 torques: estimate.torques.joints().to_vec(),
                 contacts: estimate.contacts.contacts().iter().map(reason).collect(),
             };

@@ -6,13 +6,13 @@ use crate::pipeline::{Job, Pipeline};
 use anyhow::Context;
 use proprio_identification::online::{Hypothesis, Online, Paused};
 use proprio_identification::robot::Robot;
-use proprio_topics::Nanos;
 use proprio_topics::ipc::monotonic;
+use proprio_topics::{IdentificationHealth, Nanos};
 use std::path::PathBuf;
 use std::sync::mpsc;
 
 /// Reports what is likelier than the configuration.
-pub(super) fn report_leading(group: Option<&str>, likelier: Option<Hypothesis>, robot: &Robot) {
+fn report_leading(group: Option<&str>, likelier: Option<Hypothesis>, robot: &Robot) {
     match likelier {
         Some(hypothesis) => tracing::warn!(
             group,
@@ -94,9 +94,9 @@ pub(super) struct IdentificationThread {
     thread: Option<std::thread::JoinHandle<()>>,
     /// Per component, what was last reported: why it pauses, its number of changes, and what is
     /// likelier than the configuration.
-    pub(super) reported: Vec<(Paused, u64, Option<Hypothesis>)>,
+    reported: Vec<(Paused, u64, Option<Hypothesis>)>,
     /// Per component, the names of its F/T sensors.
-    pub(super) groups: Vec<String>,
+    groups: Vec<String>,
 }
 
 impl IdentificationThread {
@@ -165,6 +165,52 @@ impl IdentificationThread {
             reported: vec![(Paused::No, 0, None); groups.len()],
             groups,
         })
+    }
+
+    /// The sums over all components for the health message. Reports what has changed since the last
+    /// one.
+    pub(super) fn health(&mut self, online: &Online, robot: &Robot) -> IdentificationHealth {
+        let mut sum = IdentificationHealth {
+            groups: u32::try_from(self.reported.len()).unwrap_or(0),
+            ..IdentificationHealth::default()
+        };
+        for (component, (reported, changes, leading)) in self.reported.iter_mut().enumerate() {
+            let Some((paused, counts)) = online.state(component) else {
+                continue;
+            };
+            sum.paused += u32::from(paused != Paused::No);
+            sum.learnt += counts.learnt;
+            sum.still += counts.still;
+            sum.contact += counts.contact;
+            sum.outlier += counts.outlier;
+            sum.suspected += counts.suspected;
+            sum.stale += counts.stale;
+            sum.saturated += counts.saturated;
+            sum.device_fault += counts.device_fault;
+            sum.unseen += counts.unseen;
+            sum.offset_changes += counts.offset_changes;
+            sum.load_changes += counts.load_changes;
+            sum.unknown_changes += counts.changes - counts.offset_changes - counts.load_changes;
+            // Common to all components.
+            sum.late = counts.late;
+            sum.failed += counts.failed;
+            let group = self.groups.get(component).map(String::as_str);
+            if std::mem::replace(reported, paused) != paused {
+                tracing::info!(group, "{}", paused.describe(robot));
+            }
+            if std::mem::replace(changes, counts.changes) != counts.changes
+                && let Some(change) = online.last_change(component)
+            {
+                tracing::warn!(group, "{change}");
+            }
+            let likelier = online.solution().components.get(component);
+            let likelier = likelier.and_then(|own| own.leading);
+            let kind = likelier.map(Hypothesis::without_estimate);
+            if std::mem::replace(leading, kind) != kind {
+                report_leading(group, likelier, robot);
+            }
+        }
+        sum
     }
 
     /// A job that has been run. Reports once if the thread has ended.

@@ -83,11 +83,11 @@
 //! sensors: 426 columns, 91 000 numbers) has less than 1 MB.
 
 use super::{
-    Calibrated, Friction, Link, Offset, Parameters, ParametersError, Provenance, Rotor, Span, UNIT,
-    nanoseconds,
+    Friction, LinkRecord, Offset, Parameters, ParametersError, Provenance, Rotor,
+    SensorCalibration, UNIT, UsedLog, nanoseconds,
 };
 use crate::config::exactly;
-use crate::drive::{Drive, Signal};
+use crate::drive::{DriveModel, DriveSignal};
 use crate::files;
 use nalgebra::Matrix6;
 use proprio_dynamics::calibration::{Calibration, Gain, Kind, force_first, gain_from_force_first};
@@ -133,7 +133,7 @@ impl Parameters {
         if schema != 1 {
             return Err(ParametersError::Schema(schema));
         }
-        let file: File = toml::from_str(text).map_err(damaged)?;
+        let file: ParametersFile = toml::from_str(text).map_err(damaged)?;
         file.parameters()
     }
 
@@ -149,9 +149,6 @@ impl Parameters {
 impl fmt::Display for Parameters {
     /// The text of the file.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let text = |s: &str| toml::Value::String(s.to_owned()).to_string();
-        let moment = |w: &Wrench| -> [f64; 3] { w.torque.into() };
-        let force = |w: &Wrench| -> [f64; 3] { w.force.into() };
         writeln!(
             f,
             "# The identified parameters of a robot. `proprio estimate --parameters`, and the\n\
@@ -170,7 +167,7 @@ impl fmt::Display for Parameters {
         if let Some(tau) = self.provenance.tau {
             writeln!(f, "tau = {tau:?}")?;
         }
-        for Span { file, start, end } in &self.provenance.logs {
+        for UsedLog { file, start, end } in &self.provenance.logs {
             writeln!(
                 f,
                 "\n[[provenance.log]]\nfile = {}\nstart_ns = {}\nend_ns = {}",
@@ -179,114 +176,18 @@ impl fmt::Display for Parameters {
                 end.0
             )?;
         }
-        for (number, link) in self.links.iter().enumerate() {
-            writeln!(f, "\n[[link]]\nname = {}", text(&link.name))?;
-            if let (Some(joint), Some(parent)) = (&link.joint, &link.parent) {
-                writeln!(f, "joint = {}\nparent = {}", text(joint), text(parent))?;
-            }
-            writeln!(f, "placement = {:?}", link.placement)?;
-            if let Some(axis) = link.axis {
-                writeln!(f, "axis = {axis:?}")?;
-            }
-            writeln!(f, "cad = {:?}", link.cad)?;
-            if let (Some(identified), Some(deviation)) = (link.identified, self.deviation(number)) {
-                writeln!(f, "identified = {identified:?}\nstd = {deviation:?}")?;
-            }
-        }
+        self.links.iter().try_for_each(|link| link.write(f))?;
         for (place, sensor) in self.sensors.iter().enumerate() {
             let deviation = self.offset_deviation(place).unwrap_or_default();
-            writeln!(
-                f,
-                "\n[[sensor]]\nname = {}\noffset_n = {:?}\noffset_nm = {:?}\nstd_n = {:?}\nstd_nm \
-                 = {:?}\ndrift_n = {:?}\ndrift_nm = {:?}\nknown_ns = {}\nnoise_n = {:?}\nnoise_nm \
-                 = {:?}",
-                text(&sensor.sensor),
-                force(&sensor.reading),
-                moment(&sensor.reading),
-                force(&deviation),
-                moment(&deviation),
-                force(&sensor.drift),
-                moment(&sensor.drift),
-                sensor.known.0,
-                force(&sensor.noise),
-                moment(&sensor.noise)
-            )?;
-            let Some(Calibrated { calibration, kind }) = &sensor.calibrated else {
-                continue;
-            };
-            writeln!(f, "gain = {:?}", calibration.gain_force_first())?;
-            let gains = kind.count() - 6 * usize::from(kind.temperature);
-            let (gains, kelvins) = self
-                .calibration_deviation(place)
-                .split_at_checked(gains)
-                .unwrap_or_default();
-            if kind.gain != Gain::None {
-                writeln!(f, "gain_std = {:?}", force_first(gains))?;
-            }
-            if let Some(reference) = calibration.reference() {
-                let per_kelvin = calibration.per_kelvin();
-                writeln!(
-                    f,
-                    "temperature_n_per_k = {:?}\ntemperature_nm_per_k = {:?}\nreference_celsius = \
-                     {reference:?}",
-                    force(per_kelvin),
-                    moment(per_kelvin)
-                )?;
-            }
-            if let [tx, ty, tz, fx, fy, fz] = kelvins {
-                writeln!(
-                    f,
-                    "temperature_std_n_per_k = {:?}\ntemperature_std_nm_per_k = {:?}",
-                    [fx, fy, fz],
-                    [tx, ty, tz]
-                )?;
-            }
+            sensor.write(f, &deviation, self.calibration_deviation(place))?;
         }
-        for joint in &self.joints {
-            writeln!(
-                f,
-                "\n[[joint]]\nname = {}\ncoulomb_nm = {:?}\nviscous_nms = {:?}\noffset_nm = {:?}",
-                text(&joint.joint),
-                joint.coulomb,
-                joint.viscous,
-                joint.offset
-            )?;
-            if let Some(Rotor { inertia, deviation }) = joint.rotor {
-                writeln!(
-                    f,
-                    "rotor_inertia_kgm2 = {inertia:?}\nrotor_inertia_std_kgm2 = {deviation:?}"
-                )?;
-            }
-        }
+        self.joints.iter().try_for_each(|joint| joint.write(f))?;
         for drive in &self.drives {
-            let [constant, coulomb, viscous, load, rotor, offset] = drive.parameters;
-            let signal = match drive.signal {
-                Signal::Torque => "torque",
-                Signal::Current => "current",
-            };
-            let std: [f64; 6] = std::array::from_fn(|i| drive.covariance[(i, i)].max(0.0).sqrt());
-            let [relative, inherited] = drive.inherited;
-            let correlation: Vec<f64> = pairs()
-                .map(|(i, j)| match std[i] * std[j] {
-                    0.0 => 0.0,
-                    // Rounded, so that a file that is read and written again does not change.
-                    most => (UNIT * drive.covariance[(i, j)] / most).round() / UNIT,
-                })
-                .collect();
-            writeln!(
-                f,
-                "\n[[drive]]\njoint = {}\nsignal = \"{signal}\"\nconstant = {constant:?}\n\
-                 coulomb_nm = {coulomb:?}\nviscous_nms = {viscous:?}\nload = {load:?}\n\
-                 rotor_inertia_kgm2 = {rotor:?}\noffset_nm = {offset:?}\nstd = {std:?}\n\
-                 correlation = {correlation:?}\ninherited_relative = {relative:?}\n\
-                 inherited_nm = {inherited:?}\nnoise_nm = {:?}",
-                text(&drive.joint),
-                drive.noise
-            )?;
+            write_drive(f, drive)?;
         }
         f.write_str("\n[correlation]\nroot = [\n")?;
         let mut numbers = self.correlation.as_slice();
-        for column in 0..self.deviations.len() {
+        for column in 0..self.deviations().count() {
             let (own, rest) = numbers
                 .split_at_checked(column + 1)
                 .unwrap_or((numbers, &[]));
@@ -301,6 +202,118 @@ impl fmt::Display for Parameters {
     }
 }
 
+/// A string as TOML has it.
+fn text(string: &str) -> String {
+    toml::Value::String(string.to_owned()).to_string()
+}
+
+/// The two lines of a wrench: `<key>_n<per> = ...`, `<key>_nm<per> = ...`.
+fn write_wrench(f: &mut fmt::Formatter<'_>, [key, per]: [&str; 2], wrench: &Wrench) -> fmt::Result {
+    let force: [f64; 3] = wrench.force.into();
+    let torque: [f64; 3] = wrench.torque.into();
+    writeln!(f, "{key}_n{per} = {force:?}\n{key}_nm{per} = {torque:?}")
+}
+
+impl LinkRecord {
+    fn write(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "\n[[link]]\nname = {}", text(&self.name))?;
+        if let (Some(joint), Some(parent)) = (&self.joint, &self.parent) {
+            writeln!(f, "joint = {}\nparent = {}", text(joint), text(parent))?;
+        }
+        writeln!(f, "placement = {:?}", self.placement)?;
+        if let Some(axis) = self.axis {
+            writeln!(f, "axis = {axis:?}")?;
+        }
+        writeln!(f, "cad = {:?}", self.cad)?;
+        if let (Some(identified), Some(std)) = (self.identified, self.std) {
+            writeln!(f, "identified = {identified:?}\nstd = {std:?}")?;
+        }
+        Ok(())
+    }
+}
+
+impl Offset {
+    /// Writes it with its standard deviation, and its calibration with those of its unknowns.
+    fn write(
+        &self,
+        f: &mut fmt::Formatter<'_>,
+        deviation: &Wrench,
+        of_calibration: &[f64],
+    ) -> fmt::Result {
+        writeln!(f, "\n[[sensor]]\nname = {}", text(&self.sensor))?;
+        write_wrench(f, ["offset", ""], &self.reading)?;
+        write_wrench(f, ["std", ""], deviation)?;
+        write_wrench(f, ["drift", ""], &self.drift)?;
+        writeln!(f, "known_ns = {}", self.known.0)?;
+        write_wrench(f, ["noise", ""], &self.noise)?;
+        let Some(SensorCalibration { calibration, kind }) = &self.calibrated else {
+            return Ok(());
+        };
+        writeln!(f, "gain = {:?}", calibration.gain_force_first())?;
+        let gains = kind.count() - 6 * usize::from(kind.temperature);
+        let (gains, kelvins) = of_calibration.split_at_checked(gains).unwrap_or_default();
+        if kind.gain != Gain::None {
+            writeln!(f, "gain_std = {:?}", force_first(gains))?;
+        }
+        if let Some(reference) = calibration.reference() {
+            write_wrench(f, ["temperature", "_per_k"], calibration.per_kelvin())?;
+            writeln!(f, "reference_celsius = {reference:?}")?;
+        }
+        if let Ok(kelvins) = <[f64; 6]>::try_from(kelvins) {
+            let kelvins = Wrench::from_torque_first(kelvins);
+            write_wrench(f, ["temperature_std", "_per_k"], &kelvins)?;
+        }
+        Ok(())
+    }
+}
+
+impl Friction {
+    fn write(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "\n[[joint]]\nname = {}\ncoulomb_nm = {:?}\nviscous_nms = {:?}\noffset_nm = {:?}",
+            text(&self.joint),
+            self.coulomb,
+            self.viscous,
+            self.offset
+        )?;
+        match self.rotor {
+            Some(Rotor { inertia, deviation }) => writeln!(
+                f,
+                "rotor_inertia_kgm2 = {inertia:?}\nrotor_inertia_std_kgm2 = {deviation:?}"
+            ),
+            None => Ok(()),
+        }
+    }
+}
+
+fn write_drive(f: &mut fmt::Formatter<'_>, drive: &DriveModel) -> fmt::Result {
+    let [constant, coulomb, viscous, load, rotor, offset] = drive.parameters;
+    let signal = match drive.signal {
+        DriveSignal::Torque => "torque",
+        DriveSignal::Current => "current",
+    };
+    let std: [f64; 6] = std::array::from_fn(|i| drive.covariance[(i, i)].max(0.0).sqrt());
+    let [relative, inherited] = drive.inherited;
+    let correlation: Vec<f64> = pairs()
+        .map(|(i, j)| match std[i] * std[j] {
+            0.0 => 0.0,
+            // Rounded, so that a file that is read and written again does not change.
+            most => (UNIT * drive.covariance[(i, j)] / most).round() / UNIT,
+        })
+        .collect();
+    writeln!(
+        f,
+        "\n[[drive]]\njoint = {}\nsignal = \"{signal}\"\nconstant = {constant:?}\n\
+                 coulomb_nm = {coulomb:?}\nviscous_nms = {viscous:?}\nload = {load:?}\n\
+                 rotor_inertia_kgm2 = {rotor:?}\noffset_nm = {offset:?}\nstd = {std:?}\n\
+                 correlation = {correlation:?}\ninherited_relative = {relative:?}\n\
+                 inherited_nm = {inherited:?}\nnoise_nm = {:?}",
+        text(&drive.joint),
+        drive.noise
+    )
+}
+
 #[derive(Deserialize)]
 struct Version {
     schema: i64,
@@ -308,13 +321,13 @@ struct Version {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct File {
+struct ParametersFile {
     #[serde(rename = "schema")]
     _schema: i64,
     robot: String,
     provenance: Provenance,
     #[serde(default)]
-    link: Vec<FileLink>,
+    link: Vec<LinkRecord>,
     #[serde(default)]
     sensor: Vec<FileSensor>,
     #[serde(default)]
@@ -325,50 +338,37 @@ struct File {
     correlation: Correlation,
 }
 
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct FileLink {
-    name: String,
-    joint: Option<String>,
-    parent: Option<String>,
-    placement: Numbers<12>,
-    axis: Option<Numbers<3>>,
-    cad: Numbers<10>,
-    identified: Option<Numbers<10>>,
-    std: Option<Numbers<10>>,
-}
-
 #[derive(Clone, Copy, Deserialize)]
 #[serde(transparent)]
-struct Numbers<const N: usize>(#[serde(deserialize_with = "exactly")] [f64; N]);
+struct Exactly<const N: usize>(#[serde(deserialize_with = "exactly")] [f64; N]);
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct FileSensor {
     name: String,
-    offset_n: Numbers<3>,
-    offset_nm: Numbers<3>,
-    std_n: Numbers<3>,
-    std_nm: Numbers<3>,
-    drift_n: Numbers<3>,
-    drift_nm: Numbers<3>,
+    offset_n: Exactly<3>,
+    offset_nm: Exactly<3>,
+    std_n: Exactly<3>,
+    std_nm: Exactly<3>,
+    drift_n: Exactly<3>,
+    drift_nm: Exactly<3>,
     #[serde(with = "nanoseconds", rename = "known_ns")]
     known: Nanos,
-    noise_n: Option<Numbers<3>>,
-    noise_nm: Option<Numbers<3>>,
+    noise_n: Option<Exactly<3>>,
+    noise_nm: Option<Exactly<3>>,
     gain: Option<Vec<f64>>,
     gain_std: Option<Vec<f64>>,
-    temperature_n_per_k: Option<Numbers<3>>,
-    temperature_nm_per_k: Option<Numbers<3>>,
-    temperature_std_n_per_k: Option<Numbers<3>>,
-    temperature_std_nm_per_k: Option<Numbers<3>>,
+    temperature_n_per_k: Option<Exactly<3>>,
+    temperature_nm_per_k: Option<Exactly<3>>,
+    temperature_std_n_per_k: Option<Exactly<3>>,
+    temperature_std_nm_per_k: Option<Exactly<3>>,
     reference_celsius: Option<f64>,
 }
 
 impl FileSensor {
     /// Its calibration, if it was identified, and the standard deviations of the uncertain
     /// quantities, in the order of their columns.
-    fn calibrated(&self) -> Result<(Option<Calibrated>, Vec<f64>), ParametersError> {
+    fn calibrated(&self) -> Result<(Option<SensorCalibration>, Vec<f64>), ParametersError> {
         let damaged = |what: &str| {
             Err(ParametersError::Damaged(format!(
                 "sensor {}: {what}",
@@ -403,18 +403,16 @@ impl FileSensor {
             36 => Gain::Full,
             _ => return damaged("gain_std must have 36 numbers, or the 6 of a diagonal"),
         };
-        let numbers =
-            |given: &Option<Numbers<3>>| given.as_ref().map_or([0.0; 3], |numbers| numbers.0);
         let mut deviations = force_first(gain_std);
         if stds {
-            deviations.extend(numbers(&self.temperature_std_nm_per_k));
-            deviations.extend(numbers(&self.temperature_std_n_per_k));
+            deviations.extend(or_zero(self.temperature_std_nm_per_k));
+            deviations.extend(or_zero(self.temperature_std_n_per_k));
         }
         let per_kelvin = Wrench::from_parts(
-            numbers(&self.temperature_n_per_k),
-            numbers(&self.temperature_nm_per_k),
+            or_zero(self.temperature_n_per_k),
+            or_zero(self.temperature_nm_per_k),
         );
-        let calibrated = Calibrated {
+        let calibrated = SensorCalibration {
             calibration: Calibration::new(gain, per_kelvin, self.reference_celsius),
             kind: Kind {
                 gain: kind,
@@ -423,6 +421,21 @@ impl FileSensor {
         };
         Ok((Some(calibrated), deviations))
     }
+
+    fn offset(self, calibrated: Option<SensorCalibration>) -> Offset {
+        Offset {
+            calibrated,
+            sensor: self.name,
+            reading: Wrench::from_parts(self.offset_n.0, self.offset_nm.0),
+            drift: Wrench::from_parts(self.drift_n.0, self.drift_nm.0),
+            known: self.known,
+            noise: Wrench::from_parts(or_zero(self.noise_n), or_zero(self.noise_nm)),
+        }
+    }
+}
+
+fn or_zero(numbers: Option<Exactly<3>>) -> [f64; 3] {
+    numbers.map_or([0.0; 3], |numbers| numbers.0)
 }
 
 #[derive(Deserialize)]
@@ -462,29 +475,29 @@ impl FileJoint {
 #[serde(deny_unknown_fields)]
 struct FileDrive {
     joint: String,
-    signal: Signal,
+    signal: DriveSignal,
     constant: f64,
     coulomb_nm: f64,
     viscous_nms: f64,
     load: f64,
     rotor_inertia_kgm2: f64,
     offset_nm: f64,
-    std: Numbers<6>,
-    correlation: Numbers<15>,
+    std: Exactly<6>,
+    correlation: Exactly<15>,
     inherited_relative: f64,
     inherited_nm: f64,
     noise_nm: f64,
 }
 
 impl FileDrive {
-    fn drive(self) -> Drive {
+    fn drive(self) -> DriveModel {
         let std = self.std.0;
         let mut covariance = Matrix6::from_diagonal(&std.map(|std| std * std).into());
         for ((i, j), correlation) in pairs().zip(self.correlation.0) {
             covariance[(i, j)] = correlation * std[i] * std[j];
             covariance[(j, i)] = covariance[(i, j)];
         }
-        Drive {
+        DriveModel {
             joint: self.joint,
             signal: self.signal,
             parameters: [
@@ -513,103 +526,72 @@ struct Correlation {
     root: Vec<Vec<i32>>,
 }
 
-impl File {
+impl ParametersFile {
     fn parameters(self) -> Result<Parameters, ParametersError> {
-        let mut deviations = Vec::new();
-        for link in &self.link {
-            match (&link.identified, &link.std) {
-                (Some(_), Some(std)) => deviations.extend(std.0),
-                (None, None) => {}
-                _ => {
-                    return Err(ParametersError::Damaged(format!(
-                        "link {}: only one of identified and std is given",
-                        link.name
-                    )));
-                }
-            }
-        }
-        for sensor in &self.sensor {
-            deviations.extend(sensor.std_nm.0.iter().chain(&sensor.std_n.0));
-        }
-        let mut calibrations = Vec::new();
-        for sensor in &self.sensor {
-            let (calibrated, own) = sensor.calibrated()?;
-            calibrations.push(calibrated);
-            deviations.extend(own);
-        }
-        let root = &self.correlation.root;
-        let whole = root.len() == deviations.len()
-            && root
-                .iter()
-                .zip(1..)
-                .all(|(column, length)| column.len() == length);
-        if !whole {
+        let is_half = |link: &&LinkRecord| link.identified.is_some() != link.std.is_some();
+        if let Some(LinkRecord { name, .. }) = self.link.iter().find(is_half) {
             return Err(ParametersError::Damaged(format!(
-                "correlation.root must have {} columns, one for each identified parameter, each \
-                 one number longer than the one before",
-                deviations.len()
+                "link {name}: only one of identified and std is given"
             )));
         }
-        for (number, (column, deviation)) in root.iter().zip(&deviations).enumerate() {
-            let length = column
-                .iter()
-                .map(|&n| (f64::from(n) / UNIT).powi(2))
-                .sum::<f64>()
-                .sqrt();
-            let expected = if *deviation > 0.0 { 1.0 } else { 0.0 };
-            if (length - expected).abs() > 1e-6 {
-                return Err(ParametersError::Damaged(format!(
-                    "correlation.root: column {number} has length {length}, not {expected}"
-                )));
-            }
+        let offsets = self.sensor.iter();
+        let mut sensor_deviations: Vec<f64> = offsets
+            .flat_map(|sensor| [sensor.std_nm.0, sensor.std_n.0])
+            .flatten()
+            .collect();
+        let mut sensors = Vec::new();
+        for sensor in self.sensor {
+            let (calibrated, of_calibration) = sensor.calibrated()?;
+            sensor_deviations.extend(of_calibration);
+            sensors.push(sensor.offset(calibrated));
         }
         let parameters = Parameters {
             robot: self.robot,
             provenance: self.provenance,
-            links: self
-                .link
-                .into_iter()
-                .map(|link| Link {
-                    name: link.name,
-                    joint: link.joint,
-                    parent: link.parent,
-                    placement: link.placement.0,
-                    axis: link.axis.map(|axis| axis.0),
-                    cad: link.cad.0,
-                    identified: link.identified.map(|numbers| numbers.0),
-                })
-                .collect(),
-            sensors: self
-                .sensor
-                .into_iter()
-                .zip(calibrations)
-                .map(|(sensor, calibrated)| Offset {
-                    calibrated,
-                    sensor: sensor.name,
-                    reading: Wrench::from_parts(sensor.offset_n.0, sensor.offset_nm.0),
-                    drift: Wrench::from_parts(sensor.drift_n.0, sensor.drift_nm.0),
-                    known: sensor.known,
-                    noise: {
-                        let of =
-                            |noise: Option<Numbers<3>>| noise.map_or([0.0; 3], |noise| noise.0);
-                        Wrench::from_parts(of(sensor.noise_n), of(sensor.noise_nm))
-                    },
-                })
-                .collect(),
+            links: self.link,
+            sensors,
             joints: self
                 .joint
                 .into_iter()
                 .map(FileJoint::friction)
                 .collect::<Result<_, _>>()?,
             drives: self.drive.into_iter().map(FileDrive::drive).collect(),
+            sensor_deviations,
             correlation: self.correlation.root.concat(),
-            deviations,
         };
+        self.correlation.check(&parameters)?;
         match parameters.check() {
             Err(error @ (ParametersError::Value(_) | ParametersError::Inconsistent { .. })) => {
                 Err(ParametersError::Damaged(error.to_string()))
             }
             other => other.map(|()| parameters),
         }
+    }
+}
+
+impl Correlation {
+    /// Checks that there is one column of unit length for each identified parameter.
+    fn check(&self, parameters: &Parameters) -> Result<(), ParametersError> {
+        let deviations: Vec<f64> = parameters.deviations().copied().collect();
+        let mut lengths = self.root.iter().zip(1..);
+        let is_triangle = lengths.all(|(column, length)| column.len() == length);
+        if self.root.len() != deviations.len() || !is_triangle {
+            return Err(ParametersError::Damaged(format!(
+                "correlation.root must have {} columns, one for each identified parameter, each \
+                 one number longer than the one before",
+                deviations.len()
+            )));
+        }
+        for (number, (column, deviation)) in self.root.iter().zip(deviations).enumerate() {
+            let squares = column.iter().map(|&n| (f64::from(n) / UNIT).powi(2));
+            let length = squares.sum::<f64>().sqrt();
+            let expected = if deviation > 0.0 { 1.0 } else { 0.0 };
+            if (length - expected).abs() > 1e-6 {
+                return Err(ParametersError::Damaged(format!(
+                    "correlation.root: column {number} has length {length}, not {expected}"
+                )));
+            }
+        }
+        Ok(())
     }
 }

@@ -9,7 +9,7 @@
 //! replay has the same touches ([`Contacts::new`]).
 
 use crate::setup::Setup;
-use crate::skin::{Patch, Taken, Touch};
+use crate::skin::{TactilePatch, Taken, TouchSum};
 use proprio_dynamics::spatial::Vec3;
 use proprio_dynamics::{ContactKind, ContactSet, ContactSpec, PlaceStd, Structure};
 use proprio_identification::Robot;
@@ -67,7 +67,7 @@ struct Declared {
 /// The contacts of the pipeline.
 pub(super) struct Contacts {
     declarations: Vec<Declarations>,
-    patches: Vec<Patch>,
+    patches: Vec<TactilePatch>,
     /// The number of the first patch's channel.
     first_channel: usize,
     configured: Vec<Place>,
@@ -90,7 +90,7 @@ impl Contacts {
         let configured: Vec<Place> = specs.map(Place::configured).collect();
         Self {
             declarations: vec![Declarations::default(); count],
-            patches: setup.skins.iter().cloned().map(Patch::new).collect(),
+            patches: setup.skins.iter().cloned().map(TactilePatch::new).collect(),
             first_channel: setup.robot.channels.len(),
             places: configured.clone(),
             configured,
@@ -232,8 +232,8 @@ impl Contacts {
         self.declarations.get(contact)?.at(t)
     }
 
-    fn touch(&self, contact: usize, t: Nanos) -> Touch {
-        let mut touch = Touch::default();
+    fn touch(&self, contact: usize, t: Nanos) -> TouchSum {
+        let mut touch = TouchSum::default();
         let own = self.patches.iter().enumerate();
         for (number, patch) in own.filter(|(_, patch)| patch.contact() == contact) {
             patch.add_touch(number, t.saturating_sub(self.delay), &mut touch);

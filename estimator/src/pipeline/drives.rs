@@ -1,7 +1,7 @@
 //! Compares the estimated torques with those that the joints' drives report ([`crate::drive`]). No
 //! estimate depends on it.
 
-use crate::drive::{Drive, Row};
+use crate::drive::{DriveModel, DriveRow};
 use crate::history::History;
 use crate::setup::Setup;
 use proprio_dynamics::{Dependence, JointState};
@@ -43,7 +43,7 @@ struct Watched {
     /// Torque and current.
     reports: History<2, KEPT>,
     /// None while it is to be identified.
-    drive: Option<Drive>,
+    drive: Option<DriveModel>,
     comparison: Comparison,
 }
 
@@ -163,12 +163,12 @@ impl Drives {
 
     /// What joints and drives do, per degree of freedom whose torque is valid and whose drive
     /// reports something.
-    pub(super) fn rows(&self, at: Instant<'_>) -> impl Iterator<Item = (usize, Row)> {
+    pub(super) fn rows(&self, at: Instant<'_>) -> impl Iterator<Item = (usize, DriveRow)> {
         let joints = at.joints().filter(|(_, torque)| torque.valid == 1);
         joints.filter_map(move |(dof, torque)| {
             let watched = self.watched.get(dof)?.as_ref()?;
             let [velocity, acceleration] = at.motion(dof);
-            let row = Row {
+            let row = DriveRow {
                 t: at.t,
                 report: at.report(watched).ok()?,
                 torque: torque.torque,

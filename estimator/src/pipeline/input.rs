@@ -3,7 +3,6 @@
 use super::Pipeline;
 use super::buffers::{ChannelBuffer, Sanity};
 use super::prediction::Predictor;
-use crate::config::Timing;
 use crate::differentiate::Window;
 use crate::history::History;
 use crate::skin::Taken;
@@ -26,7 +25,7 @@ impl Pipeline {
             drives.push(dof, t, [j.torque, j.current], quality);
         }
         // Estimates that do not wait go by the order of arrival: no sample is late.
-        let waits = self.setup.timing == Timing::Aligned;
+        let waits = self.setup.waits;
         let newest = buffer.newest().unwrap_or(Nanos::MIN);
         let arrival = Arrival {
             t,
@@ -109,7 +108,7 @@ impl Pipeline {
         // Taken, but too late for a released instant: a replay would use it there.
         let until = Nanos(self.setup.max_wait.0 / 2);
         let is_late = t < self.released.saturating_sub(until);
-        self.counts.late += u64::from(self.setup.timing == Timing::Aligned && is_late);
+        self.counts.late += u64::from(self.setup.waits && is_late);
     }
 
     /// Takes a reading of a skin, whose channels follow those of the robot.
@@ -123,7 +122,7 @@ impl Pipeline {
             Taken::Yes => {
                 self.counts.taken += 1;
                 // Taken, but too late for a released instant: a replay would use it there.
-                let waits = self.setup.timing == Timing::Aligned;
+                let waits = self.setup.waits;
                 let late = waits && self.contacts.is_late(t, self.released);
                 self.counts.late += u64::from(late);
             }
@@ -139,7 +138,7 @@ impl Pipeline {
             return;
         }
         // Too late for instants that are already released; it counts from the next one on.
-        let waits = self.setup.timing == Timing::Aligned;
+        let waits = self.setup.waits;
         self.counts.late += u64::from(waits && t <= self.released);
         let is_good = self.contacts.declare(contact, t, state);
         self.counts.not_finite += u64::from(!is_good);

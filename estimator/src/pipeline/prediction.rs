@@ -1,5 +1,5 @@
 //! Wrenches and proper accelerations at an instant after their last sample, for estimates that do
-//! not wait for it (`timing = "immediate"`).
+//! not wait for it.
 
 use crate::differentiate::{Grid, Settings, Window};
 use proprio_topics::Nanos;

@@ -157,8 +157,8 @@ pub(crate) struct Residuals {
     pub ranges: Vec<Range<usize>>,
     /// Per block, the smoothed nuisance parameters, a column per set.
     pub nuisance: Vec<NuisanceEstimate>,
-    /// How noise is shared among channels ([`MeasurementRows::add_shares`]): the mean over observations, a row
-    /// per channel.
+    /// How noise is shared among channels ([`MeasurementRows::add_shares`]): the mean over
+    /// observations, a row per channel.
     pub shares: DMatrix<f64>,
     /// Per channel, the number of observations in which any row has it.
     pub seen: Vec<f64>,

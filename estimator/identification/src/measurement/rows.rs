@@ -154,10 +154,10 @@ impl MeasurementRows {
     }
 
     /// Adds `diag(v) N^T W^-1 N` to `sum` (channels by channels, row by row): how
-    /// [`MeasurementRows::channel_noise`] shares the noise of the rows among the channels. The diagonal is the
-    /// share of a channel's variance that its most likely noise has, `(v - posterior variance) /
-    /// v`: one if the rows separate the channel from all others, less if it appears only mixed with
-    /// others.
+    /// [`MeasurementRows::channel_noise`] shares the noise of the rows among the channels. The
+    /// diagonal is the share of a channel's variance that its most likely noise has, `(v -
+    /// posterior variance) / v`: one if the rows separate the channel from all others, less if it
+    /// appears only mixed with others.
     pub(crate) fn add_shares(&self, variances: &[f64], sum: &mut [f64]) {
         let (m, channels) = (self.count, self.channels);
         let mut white = self.n.clone();

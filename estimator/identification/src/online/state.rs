@@ -225,8 +225,8 @@ fn checked(text: &str) -> Result<std::str::Lines<'_>, StateError> {
 }
 
 impl Online {
-    /// Resumes a state of [`SolutionJob::state`], before the first observation. A solution is in use at
-    /// once, with unknown offsets. Solves, and allocates.
+    /// Resumes a state of [`SolutionJob::state`], before the first observation. A solution is in
+    /// use at once, with unknown offsets. Solves, and allocates.
     ///
     /// # Errors
     /// [`StateError`]. Nothing is changed then.

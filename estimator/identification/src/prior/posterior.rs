@@ -176,10 +176,10 @@ impl Posterior {
         Ok(self.finish(state, end, tau))
     }
 
-    /// As [`Posterior::fit`], starting from a guess in the form of [`MapEstimate::x`], down to this squared
-    /// Newton decrement. The cost may exceed its minimum by half of the decrement; at one standard
-    /// deviation it exceeds it by one half. Starts from CAD if the guess is not physical, or a step
-    /// from it leaves the feasible set.
+    /// As [`Posterior::fit`], starting from a guess in the form of [`MapEstimate::x`], down to this
+    /// squared Newton decrement. The cost may exceed its minimum by half of the decrement; at one
+    /// standard deviation it exceeds it by one half. Starts from CAD if the guess is not physical,
+    /// or a step from it leaves the feasible set.
     pub(crate) fn fit_from(
         &self,
         x: &[f64],

@@ -2,9 +2,9 @@
 //! figures for each log, and findings.
 //!
 //! Plain data: `parameters.toml`, `summary.json` and `report.html` are written from it. What can be
-//! serialised has the keys of `summary.json`, without the name that is a key there itself. Units are
-//! SI, angles in radians; a vector over channels of an F/T sensor is in the order of samples and
-//! logs, `[fx fy fz tx ty tz]` [N, Nm]; ten parameters of a link are `[m, h_x, h_y, h_z, I_xx,
+//! serialised has the keys of `summary.json`, without the name that is a key there itself. Units
+//! are SI, angles in radians; a vector over channels of an F/T sensor is in the order of samples
+//! and logs, `[fx fy fz tx ty tz]` [N, Nm]; ten parameters of a link are `[m, h_x, h_y, h_z, I_xx,
 //! I_xy, I_xz, I_yy, I_yz, I_zz]` about its origin ([`proprio_dynamics::spatial`]).
 
 use crate::dataset::LogRole;
