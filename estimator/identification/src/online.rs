@@ -468,7 +468,8 @@ mod tests {
             .collect();
         let gravity = Vec3::new(0.0, 0.0, -9.81);
         let mut robot = Robot::standing("r", model, "l0", &gravity, &cuts, &[]).unwrap();
-        robot.base = BaseMotion::Imu(Pose::identity());
+        // In free flight.
+        (robot.base, robot.always) = (BaseMotion::Imu(Pose::identity()), ContactSet::default());
         robot
     }
 
