@@ -1,4 +1,6 @@
-//! The `proprio` command with all subcommands. `proprio --help` lists them.
+#![doc = include_str!("../README.md")]
+// The comments are the text of --help, where units stand in brackets as they are.
+#![allow(rustdoc::broken_intra_doc_links, rustdoc::invalid_html_tags)]
 
 #[macro_use]
 mod print;

@@ -28,8 +28,8 @@ pub enum EncodeError {
 }
 
 /// The device's own side of its protocol: answers commands and encodes readings, as the hardware
-/// does. After power-on it waits for its start command; one whose [`Spec`] says [`Mode::Listen`]
-/// has been started by another program.
+/// does. After power-on it waits for its start command; one whose [`Spec`] says
+/// [`Mode::Listen`](crate::Mode::Listen) has been started by another program.
 ///
 /// Boards differ in when they send. One that *streams* has a [`Board::period`], and its readings
 /// are encoded then. One that is *polled* has none: it answers a request in [`Board::on_frame`]

@@ -94,7 +94,7 @@ mod grid;
 mod values;
 
 pub use estimate::{
-    Estimate, MAX_SAMPLES, MIN_SAMPLES, Pushed, Refused, Settings, SettingsError, Unavailable,
+    MAX_SAMPLES, MIN_SAMPLES, Pushed, Refused, Settings, SettingsError, SignalEstimate, Unavailable,
 };
 pub use grid::Grid;
 
@@ -337,7 +337,7 @@ impl<const D: usize> Window<D> {
     ///
     /// # Errors
     /// See [`Unavailable`].
-    pub fn at(&self, t: Nanos) -> Result<Estimate<D>, Unavailable> {
+    pub fn at(&self, t: Nanos) -> Result<SignalEstimate<D>, Unavailable> {
         self.at_using(t, Nanos::MAX)
     }
 
@@ -350,7 +350,7 @@ impl<const D: usize> Window<D> {
     ///
     /// # Errors
     /// See [`Unavailable`].
-    pub fn at_using(&self, t: Nanos, until: Nanos) -> Result<Estimate<D>, Unavailable> {
+    pub fn at_using(&self, t: Nanos, until: Nanos) -> Result<SignalEstimate<D>, Unavailable> {
         self.at_sharing(t, until, &mut Grid::new())
     }
 
@@ -364,7 +364,7 @@ impl<const D: usize> Window<D> {
         t: Nanos,
         until: Nanos,
         grid: &mut Grid,
-    ) -> Result<Estimate<D>, Unavailable> {
+    ) -> Result<SignalEstimate<D>, Unavailable> {
         let skipped = self.skipped_for(t, until);
         let Some((newest, origin)) = self.get(skipped) else {
             return Err(match self.oldest() {

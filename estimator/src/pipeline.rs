@@ -40,7 +40,9 @@
 //! ([`proprio_dynamics::calibration`]), by the last temperature of their board stamped before
 //! `t - max_wait / 2`, however old: temperature changes slowly. Before the first temperature, the
 //! board is taken to be at its reference temperature. While there is none, or it is older than a
-//! minute, the variance of the offset is increased ([`Calibration::temperature_variance`]).
+//! minute, the variance of the offset is increased ([`temperature_variance`]).
+//!
+//! [`temperature_variance`]: proprio_dynamics::calibration::Calibration::temperature_variance
 //!
 //! # Immediate estimates
 //! Without `max_wait_ms` nothing waits: the trigger's sample releases its estimate. Every

@@ -1,11 +1,6 @@
-//! The reader for control loops ([`RobotReader`]) with a C interface: `include/proprio.h` is made
-//! from this file, and its comments are those here.
-//!
-//! `values.rs` has the values, this file the functions. This layer adds nothing but C's types:
-//! handles are numbers, a result is a status, a value in the caller's memory and, if wanted, the
-//! reason. No panic leaves it, and a null pointer is an answer
-//! ([`proprio_status::PROPRIO_UNKNOWN`], false, nothing done), not undefined behaviour.
-
+#![doc = include_str!("../README.md")]
+// The comments are those of the C header, where units stand in brackets as they are.
+#![allow(rustdoc::broken_intra_doc_links)]
 // Names are those of the header. It has no links.
 #![allow(non_camel_case_types, rustdoc::bare_urls)]
 // Pointers from C.

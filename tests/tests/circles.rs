@@ -1,5 +1,6 @@
 //! There are no dependency cycles between the source files of any crate. To understand a file, a
-//! reader needs only the files that it depends on.
+//! reader needs only the files that it depends on. And a type's name stands for one thing in its
+//! crate.
 //!
 //! A file depends on another if it uses a name that is defined there. Names are followed through
 //! imports, aliases, globs and re-exports to their definitions. A re-export (`pub use`) and the
@@ -300,6 +301,37 @@ fn crates() -> Vec<PathBuf> {
     roots.filter(|file| file.exists()).collect()
 }
 
+/// The names of types that are defined in several modules. (Constants are in capitals, functions in
+/// small letters.)
+fn repeated(sources: &Sources) -> Vec<String> {
+    let mut places = BTreeMap::<&str, Vec<String>>::new();
+    for module in sources.modules.values() {
+        let file = sources.files[module.file].display().to_string();
+        for item in &module.items {
+            if item.contains(char::is_uppercase) && item.contains(char::is_lowercase) {
+                places.entry(item).or_default().push(file.clone());
+            }
+        }
+    }
+    let several = places.into_iter().filter(|(_, files)| files.len() > 1);
+    several
+        .map(|(name, files)| format!("{name}: {}", files.join(", ")))
+        .collect()
+}
+
+#[test]
+fn a_type_name_stands_for_one_thing_in_its_crate() {
+    let found: Vec<String> = (crates().iter())
+        .flat_map(|file| repeated(&Sources::read(file)))
+        .collect();
+    assert!(found.is_empty(), "{}", found.join("\n"));
+    let b = "pub struct A;\nconst C: u8 = 1;\nfn f() {}\n#[cfg(test)]\nmod tests { struct T; }\n";
+    let a = "enum A {}\nconst C: u8 = 2;\nfn f() {}\n#[cfg(test)]\nmod tests { struct T; }\n";
+    let folder = written(&[("lib.rs", "mod a;\nmod b;\n"), ("a.rs", a), ("b.rs", b)]);
+    let found = repeated(&Sources::read(&folder.path().join("lib.rs")));
+    assert!(found.len() == 1 && found[0].starts_with("A: "), "{found:?}");
+}
+
 #[test]
 fn no_file_stands_on_one_that_stands_on_it() {
     let crates = crates();
@@ -312,13 +344,19 @@ fn no_file_stands_on_one_that_stands_on_it() {
 }
 
 /// A crate of these files in a new folder.
-fn example(files: &[(&str, &str)]) -> Vec<String> {
+fn written(files: &[(&str, &str)]) -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("a folder");
     for (file, text) in files {
         let file = folder.path().join(file);
         std::fs::create_dir_all(file.parent().expect("a folder")).expect("a folder");
         std::fs::write(file, text).expect("a file");
     }
+    folder
+}
+
+/// The circles of a crate of these files.
+fn example(files: &[(&str, &str)]) -> Vec<String> {
+    let folder = written(files);
     let told = Sources::read(&folder.path().join("lib.rs")).circles();
     let place = format!("{}/", folder.path().display());
     told.into_iter()

@@ -1,11 +1,4 @@
-//! `proprio-ros2`: publishes what a running robot measures, estimates and complains of to ROS 2,
-//! without an installation of ROS. docs/book/src/read/ros2.md tells how it is used.
-//!
-//! ```text
-//! shared memory -> Listener -> Messages -> Node: legal names, rate, quality of service -> DDS
-//! ```
-//!
-//! It starts before the robot's daemons or after them, and outlives them.
+#![doc = include_str!("../README.md")]
 
 mod names;
 mod network;

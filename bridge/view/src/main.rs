@@ -1,13 +1,4 @@
-//! `proprio-view`: shows a running robot in Foxglove, or in any client of its WebSocket protocol.
-//!
-//! ```text
-//! shared memory -> Listener -> Messages -> Topics -> WebSocket
-//!                     |                      ^
-//!                     +---> model, arrows ---+
-//! ```
-//!
-//! `proprio_bridge` hears the robot and words most messages; [`model`] adds the transforms of the
-//! URDF's links, [`arrows`] the contact forces in them, and [`server`] sends what is due.
+#![doc = include_str!("../README.md")]
 
 mod arrows;
 mod model;

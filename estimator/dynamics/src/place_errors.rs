@@ -24,9 +24,9 @@ use nalgebra::Matrix6;
 /// How well the place of a contact is known.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PlaceStd {
-    /// Standard deviation of its position, each axis [m].
+    /// Standard deviation of its position, each axis \[m\].
     pub position: f64,
-    /// Standard deviation of a `ForceAlong`'s direction, each axis across it [rad].
+    /// Standard deviation of a `ForceAlong`'s direction, each axis across it \[rad\].
     pub direction: f64,
 }
 

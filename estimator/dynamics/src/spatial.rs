@@ -182,7 +182,7 @@ impl Motion {
         }
     }
 
-    /// Power of `wrench` along this motion, both in the same frame: `omega . n + v . f` [W].
+    /// Power of `wrench` along this motion, both in the same frame: `omega . n + v . f` \[W\].
     #[inline]
     pub fn dot(&self, wrench: &Wrench) -> f64 {
         self.angular.dot(&wrench.torque) + self.linear.dot(&wrench.force)
@@ -245,9 +245,9 @@ impl Mul<f64> for Motion {
 /// the point, and linear).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Wrench {
-    /// Torque about the origin of the frame in use [Nm].
+    /// Torque about the origin of the frame in use \[Nm\].
     pub torque: Vec3,
-    /// Force [N].
+    /// Force \[N\].
     pub force: Vec3,
 }
 
@@ -268,7 +268,7 @@ impl Wrench {
     }
 
     /// A wrench from its force and torque parts, in the order of samples and logs: `[fx fy fz]`
-    /// [N], `[tx ty tz]` [Nm].
+    /// \[N\], `[tx ty tz]` \[Nm\].
     pub fn from_parts(force: [f64; 3], torque: [f64; 3]) -> Self {
         Self {
             torque: Vec3::from(torque),
@@ -386,7 +386,7 @@ pub fn stack(upper: &Vec3, lower: &Vec3) -> Vector6<f64> {
 pub struct Pose {
     /// Rotation `r_ab`: its columns are the axes of `b` in `a`.
     pub rotation: Mat3,
-    /// Origin of `b` in `a` [m].
+    /// Origin of `b` in `a` \[m\].
     pub translation: Vec3,
 }
 
@@ -399,7 +399,7 @@ impl Pose {
         }
     }
 
-    /// A pose from the URDF's `xyz` [m] and `rpy` [rad]: fixed-axis roll, pitch, yaw,
+    /// A pose from the URDF's `xyz` \[m\] and `rpy` \[rad\]: fixed-axis roll, pitch, yaw,
     /// `R = Rz(yaw) Ry(pitch) Rx(roll)`.
     pub fn from_xyz_rpy(xyz: [f64; 3], rpy: [f64; 3]) -> Self {
         let [(sr, cr), (sp, cp), (sy, cy)] = rpy.map(f64::sin_cos);

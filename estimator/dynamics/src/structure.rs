@@ -23,9 +23,9 @@ use crate::spatial::{Motion, Pose, Vec3, Wrench};
 /// Channels are assumed independent.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Noise {
-    /// Of the force [N].
+    /// Of the force \[N\].
     pub force: [f64; 3],
-    /// Of the torque [Nm].
+    /// Of the torque \[Nm\].
     pub torque: [f64; 3],
 }
 
@@ -196,7 +196,7 @@ pub struct ContactSpec {
     pub frame: Frame,
     /// What is unknown.
     pub kind: ContactKind,
-    /// Position of the contact in that frame [m]: the point where forces act, and about which the
+    /// Position of the contact in that frame \[m\]: the point where forces act, and about which the
     /// minimum norm takes the contact's torque.
     pub position: Vec3,
 }
@@ -300,7 +300,7 @@ impl Structure {
     /// the weight of 0.1 Nm.
     pub const LENGTH_SCALE: f64 = 0.1;
 
-    /// Cuts a model at its sensors. `length_scale` [m] compares forces and torques where contacts
+    /// Cuts a model at its sensors. `length_scale` \[m\] compares forces and torques where contacts
     /// leave more than six unknowns.
     ///
     /// # Errors
@@ -359,7 +359,7 @@ impl Structure {
         &self.contacts
     }
 
-    /// Moves a contact: its position [m] and, for [`ContactKind::ForceAlong`], its direction (of
+    /// Moves a contact: its position \[m\] and, for [`ContactKind::ForceAlong`], its direction (of
     /// any length; `None`: as it is), in its frame. A later solution is for this place. Does not
     /// allocate.
     ///
@@ -547,7 +547,7 @@ impl Structure {
         self.places[link].parent
     }
 
-    /// Length that compares forces with torques where there is no sensor noise to do so [m].
+    /// Length that compares forces with torques where there is no sensor noise to do so \[m\].
     pub fn length_scale(&self) -> f64 {
         self.length_scale
     }

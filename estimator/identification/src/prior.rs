@@ -19,10 +19,11 @@
 //!
 //! # Coordinates
 //! With `J0 = C C^T` and `J = C (1 + U) C^T`, the coordinates of a link are the ten entries of the
-//! symmetric `U`. In them the Hessian of the prior at CAD is the unit matrix: `D = tr U - log det(1
-//! + U) = 1/2 |U|^2 - ...`, and at `U` it is `K -> (1 + U)^-1 K (1 + U)^-1`. A column-pivoted QR of
-//! the data in these coordinates gives `R = Q diag(s) T`, with `T` unit triangular and entries of
-//! order one. With `y = T u` a Newton step solves
+//! symmetric `U`. In them the Hessian of the prior at CAD is the unit matrix:
+//! `D = tr U - log det(1 + U) = 1/2 |U|^2 - ...`, and at `U` it is
+//! `K -> (1 + U)^-1 K (1 + U)^-1`. A column-pivoted QR of the data in these coordinates gives
+//! `R = Q diag(s) T`, with `T` unit triangular and entries of order one. With
+//! `y = T u` a Newton step solves
 //!
 //! ```text
 //! (diag(s)^2 + T^-T H T^-1) dy = -gradient
@@ -79,11 +80,11 @@ pub use posterior::{MapEstimate, Posterior};
 type Matrix10 = SMatrix<f64, 10, 10>;
 type Vector10 = SVector<f64, 10>;
 
-/// The least mass of a link in CAD [kg]. Smaller masses are raised.
+/// The least mass of a link in CAD \[kg\]. Smaller masses are raised.
 pub const LEAST_MASS: f64 = 0.02;
 
-/// The least radius of gyration in CAD, in any direction about the centre of mass [m]. Smaller ones
-/// are raised.
+/// The least radius of gyration in CAD, in any direction about the centre of mass \[m\]. Smaller
+/// ones are raised.
 pub const LEAST_RADIUS: f64 = 0.02;
 
 /// The greatest weight `tau`, which also is the default without knowledge of CAD's quality.
@@ -149,7 +150,7 @@ pub enum PriorError {
 pub struct Floor {
     /// The link.
     pub link: usize,
-    /// Its mass in CAD [kg]; raised if below [`LEAST_MASS`].
+    /// Its mass in CAD \[kg\]; raised if below [`LEAST_MASS`].
     pub mass: f64,
     /// The least second moment of mass about the centre of mass in CAD, over all directions [kg
     /// m^2].

@@ -361,8 +361,8 @@ impl Robot {
     }
 
     /// The possible motions while the estimator runs, which determine the parameters that its
-    /// sensors can identify at all ([`Identifiable`]). A robot with several feet is assumed to
-    /// stand on the first.
+    /// sensors can identify at all ([`proprio_dynamics::regressor::identifiable`]). A robot with
+    /// several feet is assumed to stand on the first.
     #[must_use]
     pub fn regime(&self) -> Regime {
         let fixed = |motion: &FrameMotion| BaseRegime::Fixed(-motion.proper_acceleration);

@@ -46,7 +46,7 @@ pub struct Task<'a> {
     pub limits: Vec<Option<JointLimits>>,
     /// Where points of links stay.
     pub fences: Vec<Fence>,
-    /// The duration of the motion [s].
+    /// The duration of the motion \[s\].
     pub seconds: f64,
     /// The degrees of freedom of which the torques matter.
     pub wanted: Vec<usize>,

@@ -24,10 +24,10 @@ use proprio_dynamics::{DynamicsError, FrameMotion, JointState, Kinematics};
 use proprio_identification::Robot;
 use std::f64::consts::TAU;
 
-/// Time in which a motion is faded in, and out [s]; a quarter of a short one.
+/// Time in which a motion is faded in, and out \[s\]; a quarter of a short one.
 pub const FADE: f64 = 1.5;
 
-/// The fastest harmonic [Hz]: the slowest joints and the derivatives of encoders follow it.
+/// The fastest harmonic \[Hz\]: the slowest joints and the derivatives of encoders follow it.
 pub const FASTEST: f64 = 0.7;
 
 /// Number of periods of a motion.
@@ -62,7 +62,7 @@ pub struct Fence {
     pub points: Vec<Frame>,
     /// The frame in whose axes the walls are.
     pub base: Frame,
-    /// The walls: least x, y, z [m].
+    /// The walls: least x, y, z \[m\].
     pub least: [f64; 3],
     /// The greatest.
     pub greatest: [f64; 3],
@@ -109,7 +109,7 @@ impl<'a> Outside<'a> {
     }
 }
 
-/// Positions of the points of a box at random postures: least and greatest x, y, z [m].
+/// Positions of the points of a box at random postures: least and greatest x, y, z \[m\].
 ///
 /// # Errors
 /// A posture is of another robot.

@@ -30,7 +30,7 @@ const SEED: u64 = 1;
 /// A joint without velocity limit moves as fast as this in the workspace [rad/s or m/s].
 const SPEED: [f64; 2] = [2.0, 0.3];
 
-/// A joint reaches its velocity limit within this time [s].
+/// A joint reaches its velocity limit within this time \[s\].
 pub const RISE: f64 = 0.5;
 
 /// Positions, velocities and accelerations of all joints, by degree of freedom.

@@ -2,13 +2,13 @@
 
 use proprio_topics::Nanos;
 
-/// Largest number of samples in a [`Window`].
+/// Largest number of samples in a [`super::Window`].
 pub const MAX_SAMPLES: usize = 128;
 
 /// Smallest number of samples for an estimate: a second derivative needs three.
 pub const MIN_SAMPLES: usize = 3;
 
-/// The settings of a [`Window`].
+/// The settings of a [`super::Window`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
     /// Peak error of a sample, in its own unit: half the least significant bit, plus the peak of
@@ -56,7 +56,7 @@ pub enum SettingsError {
     Duration(Nanos),
 }
 
-/// What [`Window::push`] did with a sample that it took.
+/// What [`super::Window::push`] did with a sample that it took.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Pushed {
     /// Added to the window.
@@ -68,7 +68,7 @@ pub enum Pushed {
     },
 }
 
-/// Why [`Window::push`] refused a sample; the window is as before.
+/// Why [`super::Window::push`] refused a sample; the window is as before.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Refused {
@@ -118,7 +118,7 @@ pub enum Unavailable {
 /// window, and the change of the estimate with a polynomial of one degree more, which estimates the
 /// truncation error.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Estimate<const D: usize> {
+pub struct SignalEstimate<const D: usize> {
     /// The signal, in its own unit.
     pub value: [f64; D],
     /// Its first derivative \[unit/s\].
@@ -138,7 +138,7 @@ pub struct Estimate<const D: usize> {
     pub ahead: Nanos,
 }
 
-impl<const D: usize> Estimate<D> {
+impl<const D: usize> SignalEstimate<D> {
     pub(crate) const NONE: Self = Self {
         value: [f64::NAN; D],
         first: [f64::NAN; D],

@@ -4,7 +4,7 @@ use crate::differentiate::basis::{
     CANDIDATES, FIRST_DEGREE, KAPPA, LANES, NONE, PerWindow, SHORTEST, STRETCH, TERMS, TOLERANCE,
     set, vector,
 };
-use crate::differentiate::estimate::Estimate;
+use crate::differentiate::estimate::SignalEstimate;
 use crate::differentiate::grid::Grid;
 use proprio_topics::Nanos;
 use pulp::{Simd, WithSimd};
@@ -28,15 +28,15 @@ pub(crate) struct Values<'a, const D: usize> {
 }
 
 impl<const D: usize> WithSimd for Values<'_, D> {
-    type Output = Estimate<D>;
+    type Output = SignalEstimate<D>;
 
     /// The three steps described in the parent module.
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) -> Estimate<D> {
+    fn with_simd<S: Simd>(self, simd: S) -> SignalEstimate<D> {
         self.grid.make(simd, self.stamps);
         self.grid.place(simd, self.time);
         let grid = &*self.grid;
-        let mut estimate = Estimate::NONE;
+        let mut estimate = SignalEstimate::NONE;
         for component in 0..D {
             let own = self.roughness_square[component];
             let variance = sum(own) / own.len().max(1) as f64;
@@ -124,7 +124,7 @@ struct Component<'a> {
 
 impl Component<'_> {
     #[inline(always)]
-    fn estimate<S: Simd, const D: usize>(&self, simd: S, estimate: &mut Estimate<D>) {
+    fn estimate<S: Simd, const D: usize>(&self, simd: S, estimate: &mut SignalEstimate<D>) {
         let (mut degree, mut end, mut longest) = (0, 0, 0.0);
         for (d, stretch) in STRETCH.into_iter().enumerate() {
             // A degree is not tried if the span of all samples is too short for it.
@@ -234,7 +234,7 @@ impl Component<'_> {
         &self,
         simd: S,
         end: usize,
-        estimate: &mut Estimate<D>,
+        estimate: &mut SignalEstimate<D>,
     ) {
         let (grid, bases) = (self.grid, &self.grid.bases);
         let component = self.component;

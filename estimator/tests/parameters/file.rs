@@ -34,7 +34,7 @@ fn a_file_reads_back_as_what_was_written() {
     // A file from before rotors were identified.
     let older: String = text
         .lines()
-        .filter(|line| !line.starts_with("rotor_inertia_kgm2 = 0.07"))
+        .filter(|line| !line.starts_with("rotor_inertia_kgm2 = 0.08"))
         .filter(|line| !line.starts_with("rotor_inertia_std"))
         .flat_map(|line| [line, "\n"])
         .collect();

@@ -91,7 +91,7 @@ fn identified(setup: &Setup, random: &mut Random) -> Parameters {
             viscous: 1e-3,
             offset: -0.25,
             rotor: Some(Rotor {
-                inertia: 0.07,
+                inertia: 0.08,
                 deviation: 2e-3,
             }),
         }])

@@ -1,34 +1,4 @@
-//! The interface between Proprio's processes: the samples and estimates they exchange, the names of
-//! the services that carry them, and their quality of service. A consumer of Proprio depends on
-//! this crate alone.
-//!
-//! - [`reading`]: what a device measured, in SI units: [`Reading`] and its variants.
-//! - [`sample`]: a reading with its channel number and its [`Header`] (time stamp, quality,
-//!   sequence number).
-//! - [`estimate`]: joint torques and contact wrenches, each with a validity flag and, if it is not
-//!   valid, the reason.
-//! - [`budget`]: what a torque rests on, and how much of its variance each input causes.
-//! - [`drive`]: the torques that drives report, beside the estimated ones.
-//! - [`inertia`]: identified inertial parameters and F/T offsets, with their standard deviations
-//!   and the amount of data they come from.
-//! - [`description`]: what the channel, joint and contact numbers mean.
-//! - [`health`]: state and counters of gateway and estimator.
-//! - [`code`]: enumerations as they stand in shared memory: numbers that a reader checks.
-//! - [`time`]: instants and durations as integer nanoseconds.
-//! - `csv` (feature `csv`): the same samples as a text table.
-//! - `ipc` (feature `ipc`): the ports: a domain in shared memory, writers and readers. `realtime`:
-//!   scheduling of the threads that use them.
-//!
-//! Every type that crosses a process boundary is `repr(C)` and holds only integers and floating
-//! point numbers, for which every pattern of bits is legal (`zerocopy::FromBytes` proves it). Its
-//! size is asserted here at compile time. The version of its layout is part of its type name,
-//! because the transport compares only names, sizes and alignments.
-//!
-//! # Conventions
-//! Angles in rad, forces in N, torques in Nm, right-handed frames. *Absent is not zero*: a quantity
-//! that a device does not report is NaN. Whether a missing sample is overdue is the reader's
-//! [`Freshness`](ipc::Freshness). An estimate that must not be used is withheld: NaN, with `valid =
-//! 0` and the reason.
+#![doc = include_str!("../README.md")]
 #![no_std]
 #[cfg(any(feature = "std", test))]
 extern crate std;

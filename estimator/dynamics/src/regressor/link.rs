@@ -24,7 +24,7 @@ pub type LinkRows = [[f64; LINK_PARAMETERS]; 6];
 ///       [ a    S(alpha)+S(omega)^2   0                           ]
 /// ```
 ///
-/// Rows: torque [Nm] about the origin of the link's frame and force [N], in the link's axes.
+/// Rows: torque \[Nm\] about the origin of the link's frame and force \[N\], in the link's axes.
 /// Columns: `[m, h, (I_xx I_xy I_xz I_yy I_yz I_zz)]`.
 ///
 /// `motion` is that of the link's frame in its own axes; `a` is its proper acceleration, so gravity

@@ -359,8 +359,7 @@ struct Signed {
 /// # Noise between sub-trees
 /// A sensor is between two sub-trees, so its noise is in the equations of both, with opposite
 /// signs: the rows of neighbours are correlated, whitened or not. Least squares on all sub-trees
-/// needs the covariance of the whole stack ([`StackedRegressor::write_covariance`]), or of all rows
-/// that remain without contacts ([`StackedRegressor::write_projected_covariance`]). Rows of
+/// needs the covariance of the whole stack, or of all rows that remain without contacts. Rows of
 /// sub-trees that share no sensor are uncorrelated.
 ///
 /// That covariance is singular if some combination of rows contains no sensor. Summed over all

@@ -23,8 +23,8 @@ struct Hop {
 ///
 /// - Rows 0 to 5, `Y_n`: the wrench by the environment on the base link [torque; force], at its
 ///   origin and in its axes.
-/// - The other rows, `Y_c`: the joint torques [Nm] or forces [N], along the URDF axis, exerted by
-///   the URDF parent on the URDF child, for any base.
+/// - The other rows, `Y_c`: the joint torques \[Nm\] or forces \[N\], along the URDF axis, exerted
+///   by the URDF parent on the URDF child, for any base.
 /// - Columns: ten per link. A joint's row is zero for the links on the base's side of the joint.
 ///
 /// Both are valid only while the base link is the only link in contact with the environment. A

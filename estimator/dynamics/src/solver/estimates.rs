@@ -22,7 +22,7 @@ pub struct ContactSolution {
     /// frame.
     pub wrench: Wrench,
     /// Standard deviations from F/T noise, `[fx fy fz tx ty tz]` [N, Nm]; see
-    /// [`Solver::update_deviations`].
+    /// [`crate::Solver::update_deviations`].
     pub deviation: [f64; 6],
     /// Its basis.
     pub certainty: Determinacy,

@@ -8,7 +8,7 @@ use std::ops::Add;
 /// parameters.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RigidInertia {
-    /// Mass [kg].
+    /// Mass \[kg\].
     pub mass: f64,
     /// First moment `h = m c` [kg m].
     pub first_moment: Vec3,
@@ -20,7 +20,7 @@ pub struct RigidInertia {
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Inconsistency {
-    /// The mass is not positive [kg].
+    /// The mass is not positive \[kg\].
     #[error("its mass is {0} kg")]
     Mass(f64),
     /// The least eigenvalue of the tensor of inertia about the centre of mass is negative [kg m^2].
@@ -51,8 +51,9 @@ impl RigidInertia {
         }
     }
 
-    /// From mass [kg], centre of mass in link axes [m], and the tensor of inertia about the centre
-    /// of mass in link axes [kg m^2] (the parallel-axis theorem: `I_O = I_c + m (c.c 1 - c c^T)`).
+    /// From mass \[kg\], centre of mass in link axes \[m\], and the tensor of inertia about the
+    /// centre of mass in link axes [kg m^2] (the parallel-axis theorem: `I_O = I_c + m (c.c 1 - c
+    /// c^T)`).
     pub fn from_centroidal(mass: f64, centre: &Vec3, inertia: &Mat3) -> Self {
         let shift = Mat3::from_diagonal_element(centre.dot(centre)) - centre * centre.transpose();
         Self {
@@ -101,7 +102,7 @@ impl RigidInertia {
         ]
     }
 
-    /// Centre of mass in link axes [m]; `None` if the mass is not positive.
+    /// Centre of mass in link axes \[m\]; `None` if the mass is not positive.
     pub fn centre(&self) -> Option<Vec3> {
         (self.mass > 0.0).then(|| self.first_moment / self.mass)
     }

@@ -33,7 +33,8 @@ pub struct Observation {
     pub readings: Vec<Wrench>,
     /// The present contacts, as declared.
     pub active: ContactSet,
-    /// Per channel, in the order of [`Robot::channels`]: its fault. A missing torque is no fault.
+    /// Per channel, in the order of [`crate::Robot::channels`]: its fault. A missing torque is no
+    /// fault.
     pub faults: Vec<Reason>,
     /// Fault of the base motion, if no channel measures it.
     pub base_fault: Reason,

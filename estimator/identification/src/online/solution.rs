@@ -215,7 +215,7 @@ pub struct ComponentSolution {
     pub tau: f64,
     /// Number of parameters that the data determine, rather than the prior.
     pub effective: f64,
-    /// Duration of motion of its links in the absorbed data [s].
+    /// Duration of motion of its links in the absorbed data \[s\].
     pub motion: f64,
     /// Number of absorbed rows, in motion and at rest.
     pub rows: u64,

@@ -73,7 +73,8 @@ pub(crate) fn check_size(
     })
 }
 
-/// A buffer of whitened rows `[a | y]` for an [`Information`]. Absorbing empties it for reuse.
+/// A buffer of whitened rows `[a | y]` for an [`Information`](super::Information). Absorbing
+/// empties it for reuse.
 #[derive(Clone, Debug)]
 pub struct Panel {
     pub(crate) unknowns: usize,
