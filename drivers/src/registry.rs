@@ -20,11 +20,13 @@ use proprio_topics::Kind;
 use serde::Deserialize;
 
 /// Why a driver's keys cannot be read.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum OptionsError<E> {
     /// There is no driver of that name; [`DRIVERS`] lists them.
+    #[error("there is no driver of that name")]
     UnknownDriver,
     /// A key is unknown or has a wrong value.
+    #[error("its keys are wrong: {0}")]
     Keys(E),
 }
 

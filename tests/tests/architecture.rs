@@ -192,7 +192,7 @@ const OUTERMOST: [(&str, &str); 18] = [
         "gateway/topics/src/ipc/robot.rs",
         "the loop of the thread that opens ports",
     ),
-    ("gateway/topics/examples/consumer.rs", "a program"),
+    ("gateway/topics/examples/", "programs"),
     ("ffi/src/lib.rs", "hands the clock to C"),
     ("bridge/src/described.rs", "waits for what is sent again"),
     ("ffi/benches/", "measure"),

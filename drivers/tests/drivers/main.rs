@@ -14,6 +14,7 @@ mod cubemars;
 mod damiao;
 mod dbc;
 mod every_device;
+mod example;
 mod findings;
 mod golden;
 mod icub_mc4;
