@@ -12,6 +12,7 @@
 //! 95.4 % of torques. The share of torques is smaller if the measured torque contains noise and
 //! friction (and, at the motor, the rotor's inertia), which the standard deviations do not include.
 
+use crate::inertial::InertialState;
 use crate::pipeline::{Estimate, Pipeline};
 use crate::reading::{self, ReadingError};
 use crate::setup::Setup;
@@ -99,7 +100,7 @@ impl Assessor {
             ),
             next: 0,
             last: None,
-            course: vec![in_force(setup, Nanos::MIN)],
+            course: vec![in_force(&setup.initial, Nanos::MIN)],
             joints: vec![CoverageSum::default(); setup.robot.joint_names().count()],
             subtrees: vec![CoverageSum::default(); setup.robot.subtree_names().count()],
             robot,
@@ -164,7 +165,7 @@ impl Assessor {
         if pipeline.inertia().is_none() {
             return;
         }
-        let now = in_force(pipeline.setup(), t);
+        let now = in_force(pipeline.parameters(), t);
         // It may be that only offsets have changed.
         if self
             .course
@@ -194,11 +195,11 @@ impl Assessor {
     }
 }
 
-/// The parameters of a setup, in use from `since` on.
-fn in_force(setup: &Setup, since: Nanos) -> InForce {
+/// These parameters, in use from `since` on.
+fn in_force(parameters: &InertialState, since: Nanos) -> InForce {
     InForce {
         since,
-        bodies: setup.state.model.inertias().to_vec(),
-        calibrations: setup.state.calibrations.clone(),
+        bodies: parameters.model.inertias().to_vec(),
+        calibrations: parameters.calibrations.clone(),
     }
 }

@@ -155,7 +155,7 @@ impl Check {
         let mut setup = setup.clone();
         setup.identifies &= refused.is_none();
         let setup = &setup;
-        let model = &setup.state.model;
+        let model = &setup.initial.model;
         let mut position = positions(
             setup,
             |limits| 0.0_f64.clamp(limits.lower, limits.upper),
@@ -294,14 +294,14 @@ fn at_rest(
 
 /// Per F/T sensor, its load at rest, beside what it measures.
 fn sensors_at_rest(setup: &Setup, posture: &Posture, loads: &[Wrench]) -> Vec<AtRest> {
-    let model = &setup.state.model;
+    let model = &setup.initial.model;
     let mut beyond: Vec<f64> = model.inertias().iter().map(|body| body.mass).collect();
     for joint in model.joints().iter().rev() {
         beyond[joint.parent] += beyond[joint.child];
     }
     let measured = |number: usize| {
         let raw = posture.measured.as_ref()?.wrenches.get(number)?;
-        let calibration = setup.state.calibrations.get(number)?;
+        let calibration = setup.initial.calibrations.get(number)?;
         Some(calibration.apply(raw, f64::NAN))
     };
     let cuts = setup.robot.structure.sensors().iter().zip(loads);
@@ -328,7 +328,7 @@ fn overloaded(model: &Model) -> Vec<(String, f64, f64)> {
 
 /// The joints whose torque can never be determined, and the contacts that hide it.
 fn undetermined(setup: &Setup) -> Result<(Vec<String>, Vec<String>), DynamicsError> {
-    let (model, robot) = (&setup.state.model, &setup.robot);
+    let (model, robot) = (&setup.initial.model, &setup.robot);
     let structure = &robot.structure;
     // A general posture: where axes are aligned, the result would be a special case.
     let somewhere = |limits: Limits| limits.lower + 0.618 * (limits.upper - limits.lower);
@@ -365,7 +365,7 @@ fn undetermined(setup: &Setup) -> Result<(Vec<String>, Vec<String>), DynamicsErr
 /// without limits, `without`.
 fn positions(setup: &Setup, within: impl Fn(Limits) -> f64, without: f64) -> Vec<f64> {
     let mut positions = setup.robot.locked.clone();
-    let model = &setup.state.model;
+    let model = &setup.initial.model;
     for (dof, position) in positions.iter_mut().enumerate() {
         if position.is_nan() {
             let limits = model.dof_joint(dof).and_then(|joint| model.limits(joint));

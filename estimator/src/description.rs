@@ -28,7 +28,7 @@ impl Setup {
                 if parent == 0 {
                     break false;
                 }
-                are_identified &= self.state.is_identified(parent);
+                are_identified &= self.initial.is_identified(parent);
                 joint = parent - 1;
                 if cuts.iter().any(|cut| cut.joint() == joint) {
                     break true;
@@ -66,7 +66,7 @@ impl Setup {
         } else {
             "taken as exact".to_owned()
         };
-        let Some(parameters) = self.state.identified() else {
+        let Some(parameters) = self.initial.identified() else {
             return writeln!(
                 f,
                 "inertial parameters: the URDF's, {known} (identification.urdf_relative_std)"
@@ -93,7 +93,7 @@ impl Setup {
             provenance.program,
             parameters.identified().count()
         )?;
-        let others = (0..links).filter(|&link| !self.state.is_identified(link));
+        let others = (0..links).filter(|&link| !self.initial.is_identified(link));
         let others: Vec<_> = others
             .map(|link| self.robot.model.link_name(link))
             .collect();

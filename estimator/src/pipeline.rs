@@ -86,6 +86,7 @@ pub use identification::Job;
 use crate::differentiate::Window;
 use crate::drive::DriveRow;
 use crate::history::History;
+use crate::inertial::InertialState;
 use crate::setup::Setup;
 use crate::uncertainty::Uncertainty;
 use buffers::{ChannelBuffer, Sanity};
@@ -95,7 +96,9 @@ use drives::{Drives, Instant};
 use identification::OnlineIdentification;
 use prediction::Predictor;
 use proprio_dynamics::spatial::Wrench;
-use proprio_dynamics::{ContactSet, Dependence, FrameMotion, Kinematics, Noise, SensorCut, Solver};
+use proprio_dynamics::{
+    ContactSet, Dependence, FrameMotion, Kinematics, Noise, SensorCut, Solver, Structure,
+};
 use proprio_identification::online::state::StateError;
 use proprio_identification::online::{Online, OnlineError};
 use proprio_identification::robot::ChannelRole;
@@ -108,6 +111,10 @@ use validity::Dependences;
 /// The estimator's core: no input, no output, no clock.
 pub struct Pipeline {
     setup: Setup,
+    /// The parameters in use.
+    parameters: InertialState,
+    /// The robot's parts and contacts, with the contacts where they are now.
+    structure: Structure,
     buffers: Vec<ChannelBuffer>,
     /// The same channels: whether their readings can be true.
     sanity: Vec<Sanity>,
@@ -163,36 +170,10 @@ impl Pipeline {
         reason = "the setup was checked when it was built"
     )]
     pub fn new(setup: Setup) -> Self {
-        let buffers = setup.robot.channels.iter().map(|c| match c.role {
-            ChannelRole::Joint(_) => ChannelBuffer::Joint(
-                History::default(),
-                Box::new(Window::new(setup.joint_settings).expect("settings were checked")),
-            ),
-            ChannelRole::Sensor(number) => ChannelBuffer::Sensor(
-                History::default(),
-                History::default(),
-                sensor_predictor(&setup, number),
-            ),
-            ChannelRole::Base => ChannelBuffer::Imu(
-                History::default(),
-                Box::new(Window::new(setup.gyro_settings).expect("settings were checked")),
-                (!setup.waits)
-                    .then(|| Predictor::new([ACCELEROMETER_NOISE; 3], setup.gyro_settings))
-                    .flatten(),
-            ),
-        });
-        let sanity = setup.robot.channels.iter().map(|c| match c.role {
-            ChannelRole::Joint(_) => Sanity::of_encoder(setup.joint_settings.noise),
-            ChannelRole::Sensor(number) => Sanity::of_noisy(sensor_peaks(&setup, number)),
-            ChannelRole::Base => {
-                let (a, g) = (ACCELEROMETER_NOISE, setup.gyro_settings.noise);
-                Sanity::of_noisy([a, a, a, g, g, g])
-            }
-        });
-        let kinematics = Kinematics::new(&setup.state.model, setup.robot.base_link)
+        let kinematics = Kinematics::new(&setup.initial.model, setup.robot.base_link)
             .expect("the base is a link of the model");
         let (dofs, contacts) = (
-            setup.state.model.dof_count(),
+            setup.initial.model.dof_count(),
             setup.robot.structure.contacts().len(),
         );
         let mut estimate = Box::new(Estimate::absent(Nanos::ZERO));
@@ -200,9 +181,12 @@ impl Pipeline {
         estimate.contacts.count = u32::try_from(setup.robot.contacts.len()).unwrap_or(0);
         estimate.contacts.residual_count =
             u32::try_from(setup.robot.subtree_names().count()).unwrap_or(0);
-        let mut uncertainty =
-            Uncertainty::new(&setup.robot.structure, &setup.state, setup.robot.base_link)
-                .expect("the covariance is of the model, and the base its link");
+        let mut uncertainty = Uncertainty::new(
+            &setup.robot.structure,
+            &setup.initial,
+            setup.robot.base_link,
+        )
+        .expect("the covariance is of the model, and the base its link");
         let (identification, refusal) = match setup
             .identifies
             .then(|| OnlineIdentification::new(&setup))
@@ -216,8 +200,18 @@ impl Pipeline {
             identification.install_initial_covariance(&mut uncertainty.parameters);
         }
         Self {
-            buffers: buffers.collect(),
-            sanity: sanity.collect(),
+            buffers: setup
+                .robot
+                .channels
+                .iter()
+                .map(|own| buffer(&setup, own.role))
+                .collect(),
+            sanity: setup
+                .robot
+                .channels
+                .iter()
+                .map(|own| sanity(&setup, own.role))
+                .collect(),
             inputs: Inputs::new(&setup),
             base_fault: Reason::None,
             contacts: Contacts::new(&setup),
@@ -244,6 +238,8 @@ impl Pipeline {
             estimate,
             budget: Box::default(),
             drives: Drives::new(&setup),
+            parameters: setup.initial.clone(),
+            structure: setup.robot.structure.clone(),
             setup,
         }
     }
@@ -271,7 +267,12 @@ impl Pipeline {
         let Some(identification) = &mut self.identification else {
             return Ok(());
         };
-        identification.resume(state, &mut self.setup, &mut self.uncertainty.parameters)
+        identification.resume(
+            state,
+            &self.setup,
+            &mut self.parameters,
+            &mut self.uncertainty.parameters,
+        )
     }
 
     /// The next job of identification, if one is due: about once a second of stamps. Call it after
@@ -300,7 +301,7 @@ impl Pipeline {
     /// nothing if there is no such sensor. With identification on, its next solution replaces the
     /// offset again.
     pub fn set_offset(&mut self, sensor: usize, offset: Wrench) {
-        if let Some(place) = self.setup.state.offsets.get_mut(sensor) {
+        if let Some(place) = self.parameters.offsets.get_mut(sensor) {
             *place = offset;
             self.residuals.restart_means();
             if let Some(zero) = self.new_zeros.get_mut(sensor) {
@@ -309,10 +310,16 @@ impl Pipeline {
         }
     }
 
-    /// The setup, with the parameters in use.
+    /// The configuration.
     #[must_use]
     pub fn setup(&self) -> &Setup {
         &self.setup
+    }
+
+    /// The inertial parameters, offsets and calibrations in use.
+    #[must_use]
+    pub fn parameters(&self) -> &InertialState {
+        &self.parameters
     }
 
     /// How many samples were taken and dropped so far.
@@ -414,9 +421,10 @@ impl Pipeline {
             if !(self.contacts).is_elsewhere(&self.setup.robot, &active, instant) {
                 identification.observe(instant, &self.setup, &self.buffers, &active, base);
             }
-            let touched = self.residuals.touched(&self.setup.robot.structure);
-            let parameters = &mut self.uncertainty.parameters;
-            if identification.apply(&mut self.setup, parameters, &touched) {
+            let touched = self.residuals.touched(&self.structure);
+            let (parameters, propagation) =
+                (&mut self.parameters, &mut self.uncertainty.parameters);
+            if identification.apply(&self.setup, parameters, propagation, &touched) {
                 self.residuals.restart_means();
                 for (sensor, since) in self.new_zeros.iter_mut().enumerate() {
                     since.take_if(|_| identification.knows_zero(sensor));
@@ -438,7 +446,7 @@ impl Pipeline {
         self.base_fault = fault;
         if self
             .kinematics
-            .set_base(&self.setup.state.model, link)
+            .set_base(&self.parameters.model, link)
             .is_err()
         {
             self.base_fault = Reason::NotFinite;
@@ -462,6 +470,45 @@ impl Pipeline {
 const ACCELEROMETER_NOISE: f64 = 0.035;
 
 /// The predictor of F/T sensor `number`, if estimates do not wait.
+/// An empty buffer for the samples of a channel.
+#[allow(
+    clippy::expect_used,
+    reason = "the setup was checked when it was built"
+)]
+fn buffer(setup: &Setup, role: ChannelRole) -> ChannelBuffer {
+    let checked = "settings were checked";
+    match role {
+        ChannelRole::Joint(_) => ChannelBuffer::Joint(
+            History::default(),
+            Box::new(Window::new(setup.joint_settings).expect(checked)),
+        ),
+        ChannelRole::Sensor(number) => ChannelBuffer::Sensor(
+            History::default(),
+            History::default(),
+            sensor_predictor(setup, number),
+        ),
+        ChannelRole::Base => ChannelBuffer::Imu(
+            History::default(),
+            Box::new(Window::new(setup.gyro_settings).expect(checked)),
+            (!setup.waits)
+                .then(|| Predictor::new([ACCELEROMETER_NOISE; 3], setup.gyro_settings))
+                .flatten(),
+        ),
+    }
+}
+
+/// What tells impossible values of a channel.
+fn sanity(setup: &Setup, role: ChannelRole) -> Sanity {
+    match role {
+        ChannelRole::Joint(_) => Sanity::of_encoder(setup.joint_settings.noise),
+        ChannelRole::Sensor(number) => Sanity::of_noisy(sensor_peaks(setup, number)),
+        ChannelRole::Base => {
+            let (a, g) = (ACCELEROMETER_NOISE, setup.gyro_settings.noise);
+            Sanity::of_noisy([a, a, a, g, g, g])
+        }
+    }
+}
+
 fn sensor_predictor(setup: &Setup, number: usize) -> Option<Predictor<6>> {
     if setup.waits {
         return None;

@@ -34,13 +34,15 @@ use proprio_topics::{Kind, MAX_JOINTS, Nanos};
 /// 128; the difference is for samples that come while an instant waits for other channels.
 const WINDOW: usize = 96;
 
-/// The resolved configuration of the estimator.
+/// The resolved configuration of the estimator. What changes while it runs (the parameters in use,
+/// the places of contacts) is in [`crate::pipeline::Pipeline`].
 #[derive(Debug, Clone)]
 pub struct Setup {
-    /// The robot, which does not change.
+    /// The robot.
     pub robot: Robot,
-    /// Its inertial parameters, offsets and calibrations in use.
-    pub state: InertialState,
+    /// The inertial parameters, offsets and calibrations to begin with: those of the URDF and the
+    /// configuration, or those identified earlier.
+    pub initial: InertialState,
     /// How long an estimate waits for channels without a sample, by stamps.
     pub max_wait: Nanos,
     /// Whether an estimate waits for them at all. If not, they are extrapolated.
@@ -111,47 +113,29 @@ impl Setup {
         let (contacts, mut specs) = contacts(config, &model)?;
         let skins = skins(config, &model, &contacts, &specs, &mut warnings)?;
         let (base_link, base) = base(config, &model, &contacts, &specs)?;
-        let mut support = None;
-        match &base {
+        let support = match &base {
             BaseMotion::Standing(_) => {
                 let mut known = specs.iter().zip(&contacts);
-                support = known.position(|(spec, contact)| {
+                let support = known.position(|(spec, contact)| {
                     spec.frame.link == base_link && is_wrench(spec) && contact.always
                 });
                 if support.is_none() {
                     specs.push(ground_reaction(base_link));
                 }
+                support
             }
             BaseMotion::Imu(_) if is_untouched(&model, &sensors, &specs, base_link) => {
                 specs.push(ground_reaction(base_link));
-                warnings.push(format!(
-                    "base: no [[contact]] is on the part of the robot that has the IMU; that part \
-                     does not fly, so an unknown wrench is taken to act on link {:?}. Add a \
-                     [[contact]] where the robot is held or stands (presence = \"possible\" if it \
-                     may fly)",
-                    model.link_name(base_link)
-                ));
+                warnings.push(untouched(&model, base_link));
+                None
             }
-            BaseMotion::Imu(_) | BaseMotion::Stance(_) => {}
-        }
+            BaseMotion::Imu(_) | BaseMotion::Stance(_) => None,
+        };
         let mut always = ContactSet::first(specs.len());
-        for (number, _) in contacts.iter().enumerate().filter(|(_, c)| !c.always) {
-            always.remove(number);
-        }
+        let at_times = (0..).zip(&contacts).filter(|(_, c)| !c.always);
+        at_times.for_each(|(number, _)| always.remove(number));
         let structure = Structure::new(&model, &sensors, &specs, Structure::LENGTH_SCALE)
             .map_err(|error| structure_problem(config, &contacts, &error))?;
-        let max_deviation = config.output.max_torque_std_nm.map_or_else(
-            || default_max_deviation(&model),
-            |bound| vec![bound; model.dof_count()],
-        );
-        let noise = &config.differentiation;
-        let max_silence = Nanos::from_seconds(config.input.max_silence_ms * 1e-3);
-        let settings = |peak| Settings {
-            noise: peak,
-            capacity: WINDOW,
-            max_window: Nanos::from_seconds(noise.max_window_ms * 1e-3),
-            max_gap: max_silence,
-        };
         let sensors = config.force_torque.iter();
         let robot = Robot {
             name: config.robot.clone(),
@@ -164,8 +148,8 @@ impl Setup {
             support,
             trigger: trigger(config, &channels)?,
             channels,
-            max_silence,
-            position_noise: noise.position_noise_rad,
+            max_silence: Nanos::from_seconds(config.input.max_silence_ms * 1e-3),
+            position_noise: config.differentiation.position_noise_rad,
             offsets: sensors.clone().map(ForceTorque::offset).collect(),
             calibrations: sensors.map(ForceTorque::calibration).collect(),
             calibrated: calibration::Kind {
@@ -177,20 +161,21 @@ impl Setup {
             torque_side: identification.torque_side,
             model,
         };
+        let noise = &config.differentiation;
         let mut setup = Self {
-            state: InertialState::configured(&robot),
-            robot,
+            initial: InertialState::configured(&robot),
             max_wait: Nanos::from_seconds(config.output.wait_ms().unwrap_or(1.0) * 1e-3),
             waits: config.output.wait_ms().is_some(),
-            max_deviation,
+            max_deviation: max_deviation(config, &robot.model),
             skins,
-            joint_settings: settings(noise.position_noise_rad),
-            gyro_settings: settings(noise.angular_velocity_noise_radps),
+            joint_settings: differentiation(config, noise.position_noise_rad),
+            gyro_settings: differentiation(config, noise.angular_velocity_noise_radps),
             drives: Vec::new(),
             learns_drives: false,
             identifies: identification.enabled,
             identification_period: Nanos::from_seconds(1.0 / identification.rate_hz),
             warnings,
+            robot,
         };
         if let Some(file) = &config.parameters {
             Parameters::load(file)
@@ -206,7 +191,7 @@ impl Setup {
     /// They belong to another robot, or were identified with another model. Nothing is changed
     /// then.
     pub fn apply(&mut self, parameters: &Parameters) -> Result<(), ParametersError> {
-        self.state.apply(&self.robot, parameters)?;
+        self.initial.apply(&self.robot, parameters)?;
         self.drives = parameters.drives().to_vec();
         Ok(())
     }
@@ -216,8 +201,8 @@ impl Setup {
     #[must_use]
     pub fn robot_as_identified(&self) -> Robot {
         let mut robot = self.robot.clone();
-        robot.model = self.state.model.clone();
-        robot.calibrations.clone_from(&self.state.calibrations);
+        robot.model = self.initial.model.clone();
+        robot.calibrations.clone_from(&self.initial.calibrations);
         robot
     }
 
@@ -247,11 +232,11 @@ impl Setup {
     pub(crate) fn known_offset(&self, sensor: usize) -> Option<Wrench> {
         let (_, deviation) = self.robot.offsets.get(sensor)?;
         let name = self.robot.sensor_names().nth(sensor)?;
-        let is_identified = (self.state.identified())
+        let is_identified = (self.initial.identified())
             .is_some_and(|found| found.offsets().iter().any(|offset| offset.sensor == name));
         let is_known = is_identified || *deviation != UNKNOWN_OFFSET;
         (is_known && !self.identifies)
-            .then(|| self.state.offsets.get(sensor).copied())
+            .then(|| self.initial.offsets.get(sensor).copied())
             .flatten()
     }
 
@@ -261,7 +246,7 @@ impl Setup {
     pub(crate) fn depends_on_temperature(&self, channel: usize) -> bool {
         let role = self.robot.channels.get(channel).map(|channel| channel.role);
         let calibration = match role {
-            Some(ChannelRole::Sensor(number)) => self.state.calibrations.get(number),
+            Some(ChannelRole::Sensor(number)) => self.initial.calibrations.get(number),
             _ => None,
         };
         calibration.is_some_and(Calibration::depends_on_temperature)
@@ -463,6 +448,26 @@ fn structure_problem(config: &Config, contacts: &[NamedContact], error: &Structu
     }
 }
 
+/// How a signal with this peak noise is differentiated.
+fn differentiation(config: &Config, noise: f64) -> Settings {
+    Settings {
+        noise,
+        capacity: WINDOW,
+        max_window: Nanos::from_seconds(config.differentiation.max_window_ms * 1e-3),
+        max_gap: Nanos::from_seconds(config.input.max_silence_ms * 1e-3),
+    }
+}
+
+/// The warning that an unknown wrench is taken to act on the base link.
+fn untouched(model: &Model, base_link: usize) -> String {
+    format!(
+        "base: no [[contact]] is on the part of the robot that has the IMU; that part does not \
+         fly, so an unknown wrench is taken to act on link {:?}. Add a [[contact]] where the robot \
+         is held or stands (presence = \"possible\" if it may fly)",
+        model.link_name(base_link)
+    )
+}
+
 /// Whether no contact is on the links that are between the F/T sensors around `link`.
 fn is_untouched(model: &Model, sensors: &[SensorCut], specs: &[ContactSpec], link: usize) -> bool {
     // Of each link, the link at the top of its part. Parents are before their children.
@@ -482,12 +487,15 @@ pub fn hold(config: &Config, model: &mut Model) {
     }
 }
 
-/// Per degree of freedom, the default of [`Setup::max_deviation`] \[Nm or N\].
-fn default_max_deviation(model: &Model) -> Vec<f64> {
+/// [`Setup::max_deviation`].
+fn max_deviation(config: &Config, model: &Model) -> Vec<f64> {
     /// The effort of a drive is typically ten times the gravity load of the links. A limit above
     /// a hundred times is a placeholder.
     const USUAL: f64 = 10.0;
     const CREDIBLE: f64 = 100.0;
+    if let Some(bound) = config.output.max_torque_std_nm {
+        return vec![bound; model.dof_count()];
+    }
     let mut bounds = gravity_loads(model);
     for (dof, bound) in bounds.iter_mut().enumerate() {
         if let Some(number) = model.dof_joint(dof) {

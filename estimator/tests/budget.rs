@@ -190,12 +190,12 @@ fn each_part_is_what_an_error_of_its_input_does() {
         let root = cad_root(&robot.model.inertias()[number], robot.urdf_relative_std);
         let changed = (0..10).map(|row| {
             with_setup(&|setup| {
-                let mut parameters = setup.state.model.inertias()[number].parameters();
+                let mut parameters = setup.initial.model.inertias()[number].parameters();
                 for (column, parameter) in parameters.iter_mut().enumerate() {
                     *parameter += root[(row, column)];
                 }
                 let inertia = proprio_dynamics::spatial::RigidInertia::from_parameters(&parameters);
-                setup.state.model.set_inertia(number, inertia).unwrap();
+                setup.initial.model.set_inertia(number, inertia).unwrap();
             })
         });
         assert_shares(&budgets, Source::Link, link, &squares(changed, &stated));

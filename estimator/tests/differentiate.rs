@@ -6,7 +6,8 @@
 
 use nalgebra::{DMatrix, DVector};
 use proprio_estimator::differentiate::{
-    Estimate, Grid, MAX_SAMPLES, Pushed, Refused, Settings, SettingsError, Unavailable, Window,
+    Grid, MAX_SAMPLES, Pushed, Refused, Settings, SettingsError, SignalEstimate, Unavailable,
+    Window,
 };
 use proprio_topics::Nanos;
 use proptest::prelude::*;
@@ -69,7 +70,7 @@ fn settings(sampling: Sampling) -> Settings {
     }
 }
 
-fn channels(e: &Estimate<1>) -> [[f64; 2]; 3] {
+fn channels(e: &SignalEstimate<1>) -> [[f64; 2]; 3] {
     [
         [e.value[0], e.value_std[0]],
         [e.first[0], e.first_std[0]],

@@ -2499,7 +2499,7 @@ fn what_a_gain_leaves_under_load_is_no_contact() {
             .map(|p| 12.0 * p),
     );
     setup.robot.model.set_inertia(hand, heavy).expect("a body");
-    setup.state = InertialState::configured(&setup.robot);
+    setup.initial = InertialState::configured(&setup.robot);
     let truth = real_beyond(&setup, 8);
     let lean = |phase: &[f64], t: f64| {
         let (mut q, mut dq, mut ddq) = state(phase, t);

@@ -1619,10 +1619,10 @@ fn with(mut setup: Setup, outcome: &Outcome) -> Setup {
             .check(1e-9)
             .unwrap_or_else(|e| panic!("{}: no body: {e:?}", link.name));
     }
-    let offsets = setup.state.offsets.clone();
+    let offsets = setup.initial.offsets.clone();
     let identified = parameters(outcome, &setup.robot, "a test").unwrap();
     setup.apply(&identified).unwrap();
-    setup.state.offsets = offsets;
+    setup.initial.offsets = offsets;
     setup
 }
 

@@ -71,7 +71,7 @@ fn reports(file: &Path) -> anyhow::Result<bool> {
 fn set_offsets(setup: &mut Setup, log: &LogOutcome) {
     for offset in &log.offsets {
         let sensor = setup.robot.sensor(&offset.sensor);
-        if let Some(place) = sensor.and_then(|sensor| setup.state.offsets.get_mut(sensor)) {
+        if let Some(place) = sensor.and_then(|sensor| setup.initial.offsets.get_mut(sensor)) {
             let middle = |i: usize| f64::midpoint(offset.start[i], offset.end[i]);
             let [fx, fy, fz, tx, ty, tz] = std::array::from_fn(middle);
             *place = Wrench::from_parts([fx, fy, fz], [tx, ty, tz]);

@@ -179,11 +179,11 @@ pub fn significant(number: f64, digits: u8) -> String {
 /// The setup with its parameters computed again.
 fn rebuilt(mut setup: Setup) -> Setup {
     let mut state = InertialState::configured(&setup.robot);
-    if let Some(parameters) = setup.state.identified() {
+    if let Some(parameters) = setup.initial.identified() {
         // They were applied to this robot before.
         let _ = state.apply(&setup.robot, parameters);
     }
-    setup.state = state;
+    setup.initial = state;
     setup
 }
 
@@ -220,7 +220,7 @@ fn trial(setup: &Setup, still: &Still) -> TrialEnd {
         torques: Vec::new(),
         contacts: Vec::new(),
     };
-    let calibrations = setup.state.calibrations.iter().enumerate();
+    let calibrations = setup.initial.calibrations.iter().enumerate();
     let temperatures: Vec<(usize, Reading)> = calibrations
         .filter_map(|(number, calibration)| {
             let own = ChannelRole::Sensor(number);
@@ -258,8 +258,8 @@ fn trial(setup: &Setup, still: &Still) -> TrialEnd {
 /// What sensor number `sensor` sends: its load and offset before calibration.
 fn raw(setup: &Setup, still: &Still, sensor: usize) -> proprio_topics::Wrench {
     let of = |wrenches: &[Wrench]| wrenches.get(sensor).copied().unwrap_or(Wrench::zero());
-    let corrected = of(&still.loads) + of(&setup.state.offsets);
-    let gain = setup.state.calibrations.get(sensor).map(|c| *c.gain());
+    let corrected = of(&still.loads) + of(&setup.initial.offsets);
+    let gain = setup.initial.calibrations.get(sensor).map(|c| *c.gain());
     let inverse = gain.and_then(Matrix6::try_inverse);
     let corrected = Vector6::from(corrected.torque_first());
     let [tx, ty, tz, fx, fy, fz] = inverse

@@ -23,6 +23,7 @@ impl Pipeline {
         let dof = self.setup.robot.published().nth(joint)?;
         let Self {
             setup,
+            structure,
             solver,
             kinematics,
             uncertainty,
@@ -58,29 +59,17 @@ impl Pipeline {
         };
         let rests_on = dependences.torques.get(dof).copied().unwrap_or_default();
         add_inputs(budget, setup, inputs, &rests_on, |sensor| {
-            solver.torque_noise(&robot.structure, dof, sensor)
+            solver.torque_noise(structure, dof, sensor)
         });
         let solution = (&*solver, &*kinematics);
         let place_std = contacts.places().iter().map(|place| place.std);
-        let structure = &robot.structure;
         uncertainty.torque_shares(
             structure,
             solution,
             place_std,
             dof,
             |source, number, share| {
-                let (name, matters) = match source {
-                    Source::Link => (robot.model.link_name(number), share != 0.0),
-                    Source::Place => (contact_name(setup, number), share != 0.0),
-                    // A difference of two solutions has rounding errors.
-                    Source::Position | Source::Acceleration => {
-                        let name = robot.model.dof_name(number);
-                        (name, rests_on.dofs.contains(number))
-                    }
-                    Source::Base | Source::Rotation => ("", rests_on.base),
-                    _ => (sensor_name(setup, number), share != 0.0),
-                };
-                if matters {
+                if let Some(name) = cause_of(setup, &rests_on, source, (number, share)) {
                     budget.add(part(source, name, share));
                 }
             },
@@ -103,6 +92,27 @@ impl Pipeline {
         }
         Some(budget)
     }
+}
+
+/// The name of what causes a share of a torque's variance; none if it has no part in it.
+fn cause_of<'a>(
+    setup: &'a Setup,
+    rests_on: &Dependence,
+    source: Source,
+    (number, share): (usize, f64),
+) -> Option<&'a str> {
+    let model = &setup.robot.model;
+    let (name, matters) = match source {
+        Source::Link => (model.link_name(number), share != 0.0),
+        Source::Place => (contact_name(setup, number), share != 0.0),
+        // A difference of two solutions has rounding errors.
+        Source::Position | Source::Acceleration => {
+            (model.dof_name(number), rests_on.dofs.contains(number))
+        }
+        Source::Base | Source::Rotation => ("", rests_on.base),
+        _ => (sensor_name(setup, number), share != 0.0),
+    };
+    matters.then_some(name)
 }
 
 /// Adds what a torque rests on: measured joints, sensors with the variance that their noise causes,

@@ -5,6 +5,7 @@ use super::buffers::{ChannelBuffer, OrReason, stale, temperature_at};
 use super::prediction::{Extrapolated, Predictor};
 use crate::differentiate::{Grid, Unavailable, Window};
 use crate::history::{ChannelValue, History};
+use crate::inertial::InertialState;
 use crate::setup::Setup;
 use crate::uncertainty::Uncertainty;
 use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
@@ -38,6 +39,8 @@ pub(super) struct At<'a> {
     /// The last stamp whose samples may be used.
     pub(super) until: Nanos,
     pub(super) setup: &'a Setup,
+    /// The parameters in use.
+    pub(super) parameters: &'a InertialState,
     /// Per F/T sensor, since when its zero is another one than that of the offset in use.
     pub(super) new_zeros: &'a [Option<Nanos>],
     pub(super) uncertainty: &'a mut Uncertainty,
@@ -45,7 +48,7 @@ pub(super) struct At<'a> {
 
 impl Inputs {
     pub(super) fn new(setup: &Setup) -> Self {
-        let (robot, dofs) = (&setup.robot, setup.state.model.dof_count());
+        let (robot, dofs) = (&setup.robot, setup.initial.model.dof_count());
         let sensors = robot.structure.sensors().len();
         Self {
             position: robot.position_without_samples(),
@@ -152,7 +155,7 @@ impl Inputs {
         });
         let wrench =
             |[fx, fy, fz, tx, ty, tz]: [f64; 6]| Wrench::from_parts([fx, fy, fz], [tx, ty, tz]);
-        let state = &at.setup.state;
+        let state = &at.parameters;
         if let (Some(reading), Some(missing), Some(calibration), Some(offset)) = (
             self.readings.get_mut(sensor),
             self.missing_temperature.get_mut(sensor),

@@ -157,7 +157,7 @@ impl Contacts {
     }
 
     /// Moves the structure's contacts to their places at `t`.
-    pub(super) fn place(&mut self, robot: &mut Robot, t: Nanos) {
+    pub(super) fn place(&mut self, structure: &mut Structure, always: &ContactSet, t: Nanos) {
         for contact in 0..self.configured.len() {
             let (Some(configured), touch) = (
                 self.configured.get(contact).copied(),
@@ -185,13 +185,8 @@ impl Contacts {
             };
             if let Some(lost) = self.lost.get_mut(contact) {
                 // A contact that is present anyway, and a full wrench, do not depend on the touch.
-                let kind = robot
-                    .structure
-                    .contacts()
-                    .get(contact)
-                    .map(|spec| spec.kind);
-                let is_certain =
-                    robot.always.contains(contact) && kind == Some(ContactKind::Wrench);
+                let kind = structure.contacts().get(contact).map(|spec| spec.kind);
+                let is_certain = always.contains(contact) && kind == Some(ContactKind::Wrench);
                 let patch = touch
                     .lost
                     .filter(|_| !touch.is_there() && declared.is_none() && !is_certain);
@@ -201,7 +196,7 @@ impl Contacts {
             }
             if let Some(now) = self.places.get_mut(contact)
                 && *now != place
-                && move_to(&mut robot.structure, contact, &place)
+                && move_to(structure, contact, &place)
             {
                 *now = place;
             }

@@ -17,7 +17,7 @@ use proprio_topics::{InertiaEstimate, LinkInertia, Name, Nanos, Quality, Reason,
 use super::buffers::{ChannelBuffer, OrReason, temperature_at};
 use crate::differentiate::Window;
 use crate::history::History;
-use crate::inertial::{PosteriorBlock, excess};
+use crate::inertial::{InertialState, PosteriorBlock, excess};
 use crate::setup::Setup;
 use crate::uncertainty::propagation::{Covariance, Propagation};
 use proprio_dynamics::spatial::{RigidInertia, Vec3, Wrench};
@@ -111,7 +111,7 @@ impl Job {
 
 /// Structure and calibrations of the sensors: a saved state is valid for these alone.
 fn measurement_setup(setup: &Setup) -> SensorFingerprint {
-    SensorFingerprint::new(&setup.robot.structure, &setup.state.calibrations)
+    SensorFingerprint::new(&setup.robot.structure, &setup.initial.calibrations)
 }
 
 /// The covariance of all parameters and offsets: the solution's posterior, and the prior of
@@ -126,7 +126,7 @@ fn covariance(setup: &Setup, solution: &Solution) -> Covariance {
         drift: &component.drift,
         known: component.data,
     });
-    setup.state.covariance_with(&setup.robot, blocks)
+    setup.initial.covariance_with(&setup.robot, blocks)
 }
 
 /// Writes a solution as the message that is published.
@@ -191,8 +191,8 @@ fn to_u32(number: usize) -> u32 {
 impl OnlineIdentification {
     pub(super) fn new(setup: &Setup) -> Result<Self, OnlineError> {
         let period = setup.identification_period;
-        let mut online = Online::new(&setup.robot, &setup.state.offsets, period)?;
-        if let Some(parameters) = setup.state.identified() {
+        let mut online = Online::new(&setup.robot, &setup.initial.offsets, period)?;
+        if let Some(parameters) = setup.initial.identified() {
             let links: Vec<(usize, RigidInertia)> = parameters
                 .identified()
                 .filter_map(|link| Some((link, parameters.inertia(link)?)))
@@ -407,7 +407,7 @@ impl OnlineIdentification {
             return;
         };
         let (mean, reason) = mean_reading(history, t, self.period, setup.robot.max_silence);
-        let calibration = setup.state.calibrations.get(number);
+        let calibration = setup.initial.calibrations.get(number);
         *reading = calibration.map_or(mean, |calibration| calibration.apply(&mean, celsius));
         *fault = reason;
         // A mean of readings before and after is of neither zero.
@@ -478,7 +478,8 @@ impl OnlineIdentification {
     /// turns worse (late, vibrating) looks like a contact that comes and goes.
     pub(super) fn apply(
         &mut self,
-        setup: &mut Setup,
+        setup: &Setup,
+        parameters: &mut InertialState,
         propagation: &mut Propagation,
         touched: &SensorSet,
     ) -> bool {
@@ -486,7 +487,7 @@ impl OnlineIdentification {
         if !self.online.apply() {
             return false;
         }
-        self.put_in_use(setup, propagation, touched);
+        self.put_in_use(setup, parameters, propagation, touched);
         true
     }
 
@@ -494,7 +495,8 @@ impl OnlineIdentification {
     pub(super) fn resume(
         &mut self,
         text: &str,
-        setup: &mut Setup,
+        setup: &Setup,
+        parameters: &mut InertialState,
         propagation: &mut Propagation,
     ) -> Result<(), StateError> {
         self.online
@@ -508,24 +510,25 @@ impl OnlineIdentification {
             workspace.propagation = new;
             write_inertia(setup, self.online.solution(), &mut workspace.inertia);
         }
-        self.put_in_use(setup, propagation, &SensorSet::EMPTY);
+        self.put_in_use(setup, parameters, propagation, &SensorSet::EMPTY);
         Ok(())
     }
 
-    /// Copies the last solution to the setup and the propagation of the pipeline.
+    /// Copies the last solution to the parameters and the propagation of the pipeline.
     fn put_in_use(
         &mut self,
-        setup: &mut Setup,
+        setup: &Setup,
+        parameters: &mut InertialState,
         propagation: &mut Propagation,
         touched: &SensorSet,
     ) {
         for component in &self.online.solution().components {
             for (&link, body) in component.links.iter().zip(&component.bodies) {
                 // No error: a link of the model, and finite.
-                let _ = setup.state.model.set_inertia(link, *body);
+                let _ = parameters.model.set_inertia(link, *body);
             }
             for (&sensor, offset) in component.sensors.iter().zip(&component.offsets) {
-                if let Some(place) = setup.state.offsets.get_mut(sensor) {
+                if let Some(place) = parameters.offsets.get_mut(sensor) {
                     *place = *offset;
                 }
             }
@@ -533,7 +536,7 @@ impl OnlineIdentification {
             for (&sensor, (found, worst)) in component.sensors.iter().zip(found) {
                 let structure = &setup.robot.structure;
                 let [found, worst] = [found, worst].map(|v| excess(structure, sensor, v));
-                if let Some(place) = setup.state.excess_variance.get_mut(sensor) {
+                if let Some(place) = parameters.excess_variance.get_mut(sensor) {
                     let most = match touched.contains(sensor) {
                         true => *place,
                         false => [f64::INFINITY; 6],

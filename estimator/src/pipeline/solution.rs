@@ -9,7 +9,7 @@ use super::steps::StepCover;
 use super::validity::{Dependences, ValidityCheck, first_fault};
 use crate::setup::Setup;
 use crate::uncertainty::{Solution, Uncertainty};
-use proprio_dynamics::{ContactSet, Dependence, Determinacy, DofSet, SensorSet, Solver};
+use proprio_dynamics::{ContactSet, Dependence, Determinacy, DofSet, SensorSet, Solver, Structure};
 use proprio_identification::online::Doubt;
 use proprio_identification::robot::ChannelRole;
 use proprio_topics::{ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Nanos, Reason, Residual};
@@ -19,12 +19,14 @@ impl Pipeline {
     /// again if other contacts are detected, and writes the results.
     pub(super) fn compute_estimate(&mut self, t: Nanos) {
         let active = self.active_contacts(t);
-        self.contacts.place(&mut self.setup.robot, t);
+        self.contacts
+            .place(&mut self.structure, &self.setup.robot.always, t);
         let base = self.place_base(&active);
         let at = At {
             t,
             until: self.until(t),
             setup: &self.setup,
+            parameters: &self.parameters,
             new_zeros: &self.new_zeros,
             uncertainty: &mut self.uncertainty,
         };
@@ -38,8 +40,8 @@ impl Pipeline {
         }
         if solved {
             self.steps.update(
-                &self.setup.state.model,
-                &self.setup.robot.structure,
+                &self.parameters.model,
+                &self.structure,
                 &self.kinematics,
                 &self.solver,
                 &self.inputs.readings,
@@ -57,7 +59,7 @@ impl Pipeline {
     /// Solves with the contacts in `active` present, and computes all standard deviations. False if
     /// the solver failed.
     fn solve(&mut self, t: Nanos, active: &ContactSet) -> bool {
-        let (model, structure) = (&self.setup.state.model, &self.setup.robot.structure);
+        let (model, structure) = (&self.parameters.model, &self.structure);
         let (inputs, kinematics, solver) = (&self.inputs, &mut self.kinematics, &mut self.solver);
         self.dependences.update(structure, kinematics, active);
         let solved = kinematics
@@ -103,7 +105,7 @@ impl Pipeline {
             detected: ContactSet::EMPTY,
             unwatched: &[],
         };
-        let structure = &self.setup.robot.structure;
+        let structure = &self.structure;
         for (own, dependence) in (structure.subtrees().iter()).zip(&self.dependences.subtrees) {
             let (reason, cause) = validity.reason_and_cause(dependence);
             if reason != Reason::None && !own.sensors.is_empty() {
@@ -136,6 +138,7 @@ impl Pipeline {
         let robot = &self.setup.robot;
         let judge = Judge {
             setup: &self.setup,
+            structure: &self.structure,
             solver: &self.solver,
             uncertainty: &self.uncertainty,
             residuals: &self.residuals,
@@ -152,7 +155,7 @@ impl Pipeline {
                 detected: self.residuals.detected(),
                 unwatched: &self.unwatched,
             },
-            unconfirmed: self.residuals.unconfirmed(&robot.structure),
+            unconfirmed: self.residuals.unconfirmed(&self.structure),
             stuck,
             is_solved,
         };
@@ -196,6 +199,7 @@ impl Pipeline {
 /// Says of each result whether it is valid, and if not, why.
 struct Judge<'a> {
     setup: &'a Setup,
+    structure: &'a Structure,
     solver: &'a Solver,
     uncertainty: &'a Uncertainty,
     residuals: &'a ResidualMonitor,
@@ -216,7 +220,7 @@ struct Judge<'a> {
 impl Judge<'_> {
     /// Why the residual of a link's sub-tree speaks against what acts on the link.
     fn doubt(&self, link: usize) -> Option<Reason> {
-        let structure = &self.setup.robot.structure;
+        let structure = self.structure;
         let number = structure.subtree_of(link)?;
         let sensors = structure.subtrees().get(number)?.sensors;
         let residual = self.residuals.subtrees().nth(number)?;
@@ -255,7 +259,7 @@ impl Judge<'_> {
             let channel = leading.role().map_or(NO_CAUSE, |role| self.channel(role));
             return (Reason::Contradicted, channel);
         }
-        let mut moved = self.setup.robot.structure.moved_by(dof).iter();
+        let mut moved = self.structure.moved_by(dof).iter();
         if let Some(reason) = moved.find_map(|link| self.doubt(*link)) {
             return (reason, cause);
         }
@@ -309,7 +313,7 @@ impl Judge<'_> {
             return ContactWrench::ABSENT;
         };
         let (mut reason, mut cause) = self.validity.reason_and_cause(dependence);
-        let specs = self.setup.robot.structure.contacts();
+        let specs = self.structure.contacts();
         if reason == Reason::None {
             let link = specs.get(contact).map(|spec| spec.frame.link);
             reason = link.and_then(|link| self.doubt(link)).unwrap_or_default();

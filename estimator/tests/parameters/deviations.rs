@@ -433,19 +433,19 @@ fn parameters_drawn_from_the_covariance_spread_the_torques_as_stated() {
     let mut setup = arm();
     let active = setup.robot.always;
     spread(
-        &setup.state.model,
+        &setup.initial.model,
         &setup.robot.structure,
         &active,
-        &setup.state.covariance,
+        &setup.initial.covariance,
         &mut random,
         4000,
     );
     setup.apply(&identified(&setup, &mut random)).unwrap();
     spread(
-        &setup.state.model,
+        &setup.initial.model,
         &setup.robot.structure,
         &active,
-        &setup.state.covariance,
+        &setup.initial.covariance,
         &mut random,
         4000,
     );

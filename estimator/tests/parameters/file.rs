@@ -153,7 +153,7 @@ fn an_icubs_file_is_less_than_a_megabyte() {
     assert!(bytes < 1_000_000, "{bytes}");
     config.parameters = Some(written);
     assert_eq!(
-        Setup::new(&config).unwrap().state.identified(),
+        Setup::new(&config).unwrap().initial.identified(),
         Some(&parameters)
     );
 }
@@ -260,8 +260,8 @@ fn parameters_of_another_robot_are_refused_with_the_first_difference() {
         let mut setup = setup.clone();
         let error = setup.apply(&other).unwrap_err().to_string();
         assert_eq!(
-            (setup.state.identified(), &setup.state.offsets),
-            (None, &arm().state.offsets),
+            (setup.initial.identified(), &setup.initial.offsets),
+            (None, &arm().initial.offsets),
             "nothing is changed"
         );
         error

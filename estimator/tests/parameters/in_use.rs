@@ -25,7 +25,7 @@ fn identified_parameters_replace_those_of_the_urdf() {
         .model
         .inertias()
         .iter()
-        .zip(setup.state.model.inertias())
+        .zip(setup.initial.model.inertias())
         .enumerate()
     {
         let factor = if link < top { 1.0 } else { 1.1 };
@@ -33,7 +33,7 @@ fn identified_parameters_replace_those_of_the_urdf() {
         assert_eq!(parameters.inertia(link).is_some(), link >= top);
     }
     assert_eq!(
-        setup.state.offsets,
+        setup.initial.offsets,
         [Wrench::from_parts([1.0, 2.0, 3.0], [0.1, 0.2, 0.3])],
         "the file wins"
     );
@@ -260,16 +260,16 @@ fn a_calibration_reads_back_and_is_used() {
         }
         // It replaces the one of the configuration.
         let calibration = parameters.offsets()[0].calibrated.unwrap().calibration;
-        assert_ne!(setup.state.calibrations[0], calibration);
+        assert_ne!(setup.initial.calibrations[0], calibration);
         setup.apply(&parameters).unwrap();
-        assert_eq!(setup.state.calibrations[0], calibration);
+        assert_eq!(setup.initial.calibrations[0], calibration);
         assert_eq!(setup.robot.calibrations[0].gain_force_first()[0], 2.0);
         // Its uncertainty is part of the torques' standard deviations.
         let certain = {
             let plain = identified(&setup, &mut Random::new(3));
             let mut certain = arm();
             certain.apply(&plain).unwrap();
-            certain.state.calibrations[0] = calibration;
+            certain.initial.calibrations[0] = calibration;
             estimates(certain)
         };
         let unsure = estimates(setup);
@@ -346,7 +346,7 @@ fn an_uncertain_calibration_stays_uncertain_during_on_line_identification() {
     let mut solver = Solver::new(&setup.robot.structure);
     solver
         .solve(
-            &setup.state.model,
+            &setup.initial.model,
             &setup.robot.structure,
             &kinematics,
             &[load],
@@ -398,7 +398,7 @@ fn an_uncertain_calibration_stays_uncertain_during_on_line_identification() {
         };
         torques(
             &setup
-                .state
+                .initial
                 .covariance_with(&setup.robot, [others, group].into_iter()),
         )
     };
@@ -472,7 +472,7 @@ fn the_gain_of_a_sensor_is_as_uncertain_as_usual() {
         drift: &[[0.0; 6]],
         known: Nanos::ZERO,
     };
-    let covariance = (setup.state).covariance_with(&setup.robot, std::iter::once(group));
+    let covariance = (setup.initial).covariance_with(&setup.robot, std::iter::once(group));
     let mut propagation = Propagation::new(structure, &covariance).unwrap();
     propagation.set_calibration_point(0, &(load + offset[0]), 0.0);
     propagation

@@ -246,7 +246,7 @@ fn the_urdf_of_identified_parameters_can_be_loaded() {
     let new = parameters.urdf(&text, &setup.robot).unwrap();
     let mut applied = arm();
     applied.apply(&parameters).unwrap();
-    check_same(&new, &["l_arm_ft_sensor"], applied.state.model.inertias());
+    check_same(&new, &["l_arm_ft_sensor"], applied.initial.model.inertias());
     assert_eq!(without_inertials(&new), without_inertials(&text));
     let base = FrameMotion::standing(&Vec3::new(0.0, 0.0, -9.81));
     let model = Model::from_urdf(&new, &["l_arm_ft_sensor"]).unwrap();
@@ -265,5 +265,5 @@ fn the_urdf_of_identified_parameters_can_be_loaded() {
             .map(|w| w.force.norm())
             .sum::<f64>()
     };
-    assert!((weigh(&model) - weigh(&applied.state.model)).abs() < 1e-12 * weigh(&model));
+    assert!((weigh(&model) - weigh(&applied.initial.model)).abs() < 1e-12 * weigh(&model));
 }

@@ -95,16 +95,16 @@ impl SubtreeRoot {
         }
         for block in each() {
             let (rows, factors) = (&sum[LANES * block.rows.start..], coefficients(block));
+            let with_rows = |column: &[f32]| {
+                let products = column.iter().zip(rows);
+                products
+                    .map(|(u, y)| f64::from(*u) * f64::from(*y))
+                    .sum::<f64>()
+            };
             let product = |columns| {
                 let columns = block.columns_of(columns).zip(factors);
                 columns
-                    .map(|(column, factor)| {
-                        let column = column.as_flattened().iter().zip(rows);
-                        factor
-                            * column
-                                .map(|(u, y)| f64::from(*u) * f64::from(*y))
-                                .sum::<f64>()
-                    })
+                    .map(|(column, factor)| factor * with_rows(column.as_flattened()))
                     .sum::<f64>()
             };
             let own = product(&block.columns);
@@ -128,18 +128,11 @@ impl SubtreeRoot {
             share(Source::Link, *link, root.iter().map(row).sum());
         }
         for end in &self.ends {
-            let mut covariance = Covariance6::default();
-            add_reading(
-                &mut covariance,
-                solver.sensor_pose(end.sensor),
-                &readings[end.sensor],
-            );
+            let (mut covariance, pose) = (Covariance6::default(), solver.sensor_pose(end.sensor));
+            add_reading(&mut covariance, pose, &readings[end.sensor]);
             let motion = numbers(&motion(end.place));
-            share(
-                Source::Drift,
-                end.sensor,
-                dot(&motion, &times(&covariance, &motion)),
-            );
+            let variance = dot(&motion, &times(&covariance, &motion));
+            share(Source::Drift, end.sensor, variance);
         }
     }
 }
