@@ -1,7 +1,8 @@
 //! Frames to torques, under fault, from a seed: the gateway's half of [`crate::truth`].
 //!
 //! ```text
-//! seed -> Rig: a robot at random, its boards of families at random (gateway.toml, estimator.toml)
+//! seed -> ChainRig: a robot at random, its boards of families at random (gateway.toml,
+//!              estimator.toml)
 //! boards <-> Wire (faults) <-> Bus (devices) -> shared memory -> Pipeline -> judged
 //! ```
 //!
@@ -37,7 +38,7 @@ use proprio_topics::ipc::{Domain, DomainConfig, Reader, Renewal, Writer};
 use proprio_topics::{
     Counter, DeviceHealth, DeviceState, Kind, NO_CAUSE, Nanos, Quality, Reading, Sample,
 };
-use rig::{REST, Rig};
+use rig::{ChainRig, REST};
 use std::path::Path;
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::{Arc, Mutex};
@@ -119,7 +120,7 @@ impl Shown {
 #[must_use]
 pub fn run(seed: u64, family: Family, fault: Fault) -> Option<Shown> {
     let (from, until) = PRESENT;
-    let troubles = vec![Trouble { fault, from, until }];
+    let troubles = vec![PlannedFault { fault, from, until }];
     let folder = tempfile::tempdir().expect("a folder");
     Some(Chain::open(seed, family, troubles, DURATION, folder.path())?.run(&mut |_| {}))
 }
@@ -146,7 +147,7 @@ pub fn soak(
             left.extend(Fault::ALL.iter().map(|(_, fault)| *fault));
         }
         let from = EVERY * (number as f64 + 0.5);
-        Trouble {
+        PlannedFault {
             fault: left.swap_remove(random.below(left.len())),
             from,
             until: from + 0.5 * EVERY,
@@ -158,7 +159,7 @@ pub fn soak(
 
 /// A fault, and when it is present \[s\].
 #[derive(Debug, Clone, Copy)]
-struct Trouble {
+struct PlannedFault {
     fault: Fault,
     from: f64,
     until: f64,
@@ -174,7 +175,7 @@ fn device_of(plan: &Plan, kind: Kind, random: &mut Random) -> Option<(usize, usi
 }
 
 /// The fault that the board itself has.
-fn board_fault(trouble: &Trouble, device: String) -> Option<InjectedFault> {
+fn board_fault(trouble: &PlannedFault, device: String) -> Option<InjectedFault> {
     let (from, until) = (trouble.from, trouble.until);
     match trouble.fault {
         Fault::Stuck => Some(InjectedFault::Freeze {
@@ -204,7 +205,7 @@ struct Chain {
     plan: Plan,
     simulation: Simulation,
     /// In the order of time.
-    troubles: Vec<Trouble>,
+    troubles: Vec<PlannedFault>,
     duration: f64,
     family: Family,
     /// Bus and number of the device that has the faults.
@@ -239,7 +240,7 @@ impl Chain {
     fn open(
         seed: u64,
         family: Family,
-        troubles: Vec<Trouble>,
+        troubles: Vec<PlannedFault>,
         duration: f64,
         folder: &Path,
     ) -> Option<Self> {
@@ -260,21 +261,21 @@ impl Chain {
                 faults: faults.collect(),
             }
         };
-        let rig = Rig::new(seed, family, settings, START, folder)?;
+        let rig = ChainRig::new(seed, family, settings, START, folder)?;
         Some(Self::new(rig, seed, troubles, duration, family, folder))
     }
 
     fn new(
-        rig: Rig,
+        rig: ChainRig,
         seed: u64,
-        troubles: Vec<Trouble>,
+        troubles: Vec<PlannedFault>,
         duration: f64,
         family: Family,
         folder: &Path,
     ) -> Self {
         let kind = family.kind;
         let target = device_of(&rig.plan, kind, &mut Random::new(seed, "fault")).expect("one");
-        let Rig {
+        let ChainRig {
             name,
             setup,
             plan,
@@ -397,7 +398,7 @@ impl Chain {
     }
 
     /// The fault that is present, or was until `tail` ago \[s\].
-    fn trouble(&self, t: f64, tail: f64) -> Option<Trouble> {
+    fn trouble(&self, t: f64, tail: f64) -> Option<PlannedFault> {
         let begun = self.troubles.partition_point(|trouble| trouble.from <= t);
         let last = begun
             .checked_sub(1)

@@ -9,7 +9,7 @@ use proprio_topics::{JointTorque, NO_CAUSE};
 use std::collections::BTreeMap;
 
 /// The true torques of all joints at an instant \[s\].
-pub(crate) type Truth<'a> = &'a mut dyn FnMut(f64) -> Vec<f64>;
+pub(crate) type TrueTorques<'a> = &'a mut dyn FnMut(f64) -> Vec<f64>;
 
 /// Deviations within which a valid torque is.
 const DEVIATIONS: f64 = 4.0;
@@ -98,7 +98,7 @@ impl Judge {
     pub(crate) fn new(
         joints: Vec<String>,
         channels: Vec<String>,
-        truth: Truth<'_>,
+        truth: TrueTorques<'_>,
         duration: f64,
         begin: f64,
     ) -> Self {
@@ -134,7 +134,7 @@ impl Judge {
     }
 
     /// The torques of an estimate of `t`.
-    pub(crate) fn on_estimate(&mut self, t: f64, torques: &[JointTorque], truth: Truth<'_>) {
+    pub(crate) fn on_estimate(&mut self, t: f64, torques: &[JointTorque], truth: TrueTorques<'_>) {
         let truth = truth(t);
         for (joint, (torque, truth)) in torques.iter().zip(truth).enumerate() {
             let is_late = t > self.begin;

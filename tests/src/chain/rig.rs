@@ -210,7 +210,7 @@ BO_ 257 T: 8 S
 "#;
 
 /// The robot of a run.
-pub(super) struct Rig {
+pub(super) struct ChainRig {
     /// In words.
     pub(super) name: String,
     /// The estimator's configuration: its masses are wrong, its offsets unknown.
@@ -226,7 +226,7 @@ pub(super) struct Rig {
 /// Duration without motion at the start \[s\].
 pub(super) const REST: f64 = 2.0;
 
-impl Rig {
+impl ChainRig {
     /// The robot of `seed`, whose devices of one kind are of `family`; `None` if it has no device
     /// of that kind. `settings` for the boards, which are powered at `t0`.
     pub(super) fn new(

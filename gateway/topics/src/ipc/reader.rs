@@ -52,7 +52,7 @@ impl Freshness {
     }
 }
 
-type Ports<T, S> = (Subscriber<S, T, ()>, PortFactory<S, T, ()>);
+type Subscription<T, S> = (Subscriber<S, T, ()>, PortFactory<S, T, ()>);
 
 /// The receiving end of a topic. Belongs to one thread: open it where it is used.
 ///
@@ -60,7 +60,7 @@ type Ports<T, S> = (Subscriber<S, T, ()>, PortFactory<S, T, ()>);
 #[derive(Debug)]
 pub struct Reader<T: Topic, S: Service = ipc::Service> {
     // `Some` until drop; dropped under the domain's lock.
-    ports: Option<Ports<T, S>>,
+    ports: Option<Subscription<T, S>>,
     domain: Domain<S>,
     bell: Bell,
     failures: Failures,
@@ -331,7 +331,8 @@ impl<T: Topic, S: Service> Reader<T, S> {
     #[must_use]
     pub fn writers(&self) -> usize {
         let ports = self.ports.as_ref();
-        let count = |(_, service): &Ports<T, S>| service.dynamic_config().number_of_publishers();
+        let count =
+            |(_, service): &Subscription<T, S>| service.dynamic_config().number_of_publishers();
         let counted = self.domain.guard().survive(|| ports.map_or(0, count));
         counted.unwrap_or(0)
     }

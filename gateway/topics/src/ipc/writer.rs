@@ -35,7 +35,7 @@ pub struct Sent {
     pub connected: usize,
 }
 
-type Ports<T> = (
+type Publication<T> = (
     Publisher<ipc::Service, T, ()>,
     PortFactory<ipc::Service, T, ()>,
 );
@@ -44,7 +44,7 @@ type Ports<T> = (
 #[derive(Debug)]
 pub struct Writer<T: Topic> {
     // `Some` until drop; dropped under the domain's lock.
-    ports: Option<Ports<T>>,
+    ports: Option<Publication<T>>,
     domain: Domain,
     bell: Bell,
     failures: Failures,
@@ -193,7 +193,8 @@ impl<T: Topic> Writer<T> {
     #[must_use]
     pub fn readers(&self) -> usize {
         let ports = self.ports.as_ref();
-        let count = |(_, service): &Ports<T>| service.dynamic_config().number_of_subscribers();
+        let count =
+            |(_, service): &Publication<T>| service.dynamic_config().number_of_subscribers();
         let counted = self.domain.guard().survive(|| ports.map_or(0, count));
         counted.unwrap_or(0)
     }
