@@ -152,28 +152,19 @@ impl Family for Aft {
         };
         let mut unpaired = 0;
         let paired = self.pairing.push(second, frame, half, &mut unpaired);
-        if unpaired > 0 {
-            link.bringup.lost();
-            out.fault(Counter::Unpaired, unpaired, frame.id);
-        }
+        link.lost(Counter::Unpaired, unpaired, frame, out);
         let Paired::With(acquired, stamp, [first, second]) = paired else {
             return;
         };
         let mut quality = Quality::GOOD;
         let force = axes(first, NEWTON, 0, &mut quality);
         let torque = axes(second, NEWTON_METRE, 3, &mut quality);
-        if quality.contains(Quality::SATURATED) {
-            out.fault(Counter::Saturated, 1, frame.id);
-        }
-        if link.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
-        }
         let output = Output {
             acquired,
             stamp,
             ..Output::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        out.push(output, frame.id);
+        link.give(output, frame, out);
     }
 
     fn reset(&mut self) {

@@ -104,10 +104,9 @@ impl Timing {
         send_within: Nanos::from_millis(100),
     };
 
-    /// Of motors that send by themselves, or that another program commands. Only the watching
+    /// Of devices that send by themselves, or that another program commands. Only the watching
     /// counts: one that was not heard of for a second and a half is silent.
     pub(crate) const LISTENED: Self = Self {
-        answer_timeout: Nanos::from_millis(20),
         attempts: 3,
         answer_counts: Nanos::from_millis(100),
         ..Self::USUAL
@@ -341,6 +340,10 @@ impl Bringup {
             frame,
             again: now + self.timing.answer_timeout,
         });
+        self.in_time(frame, now)
+    }
+
+    fn in_time(&self, frame: Frame, now: Nanos) -> Transmit {
         Transmit {
             frame,
             deadline: now + self.timing.send_within,
@@ -450,10 +453,7 @@ impl Bringup {
                 },
                 Phase::Starting { next } => {
                     if let Some(&frame) = self.start.get(next) {
-                        return Some(Transmit {
-                            frame,
-                            deadline: now + self.timing.send_within,
-                        });
+                        return Some(self.in_time(frame, now));
                     }
                     self.phase = Phase::Watching {
                         until: now + self.max_silence + self.start_wait,
@@ -476,10 +476,7 @@ impl Bringup {
                 }
                 Phase::Stopping { next } => {
                     if let Some(&frame) = self.stop.get(next) {
-                        return Some(Transmit {
-                            frame,
-                            deadline: now + self.timing.send_within,
-                        });
+                        return Some(self.in_time(frame, now));
                     }
                     self.phase = Phase::Stopped;
                 }

@@ -15,6 +15,20 @@ pub(crate) fn payload<'f>(frame: &'f Frame, out: &mut Decoded) -> Option<&'f [u8
     None
 }
 
+/// As [`payload`], of a frame with `length` bytes: others are counted, too.
+pub(crate) fn payload_of<'f>(
+    length: usize,
+    frame: &'f Frame,
+    out: &mut Decoded,
+) -> Option<&'f [u8]> {
+    let data = payload(frame, out)?;
+    if data.len() != length {
+        out.fault(Counter::Length, 1, frame.id);
+        return None;
+    }
+    Some(data)
+}
+
 /// The payload of a data frame, classic or CAN FD. Other frames are counted, except error frames.
 pub(crate) fn fd_payload<'f>(frame: &'f Frame, out: &mut Decoded) -> Option<&'f [u8]> {
     match frame.format {

@@ -399,16 +399,11 @@ impl Encoder {
             _ => Some((frame.t, frame.stamp)),
         };
         let Some((acquired, stamp)) = measured else {
-            link.bringup.lost();
-            return out.fault(Counter::Unpaired, 1, frame.id);
+            return link.lost(Counter::Unpaired, 1, frame, out);
         };
         let mut quality = Quality::GOOD;
         if self.state.error != 0 {
             quality |= Quality::DEVICE_FAULT;
-            out.fault(Counter::DeviceFault, 1, frame.id);
-        }
-        if link.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
         }
         let reading = Reading::Joint(JointState {
             position: counts as f64 / counts_per_turn * TAU,
@@ -419,7 +414,7 @@ impl Encoder {
             stamp,
             ..Output::new(0, frame, quality, reading)
         };
-        out.push(output, frame.id);
+        link.give(output, frame, out);
     }
 }
 

@@ -132,6 +132,32 @@ impl Rounds {
     }
 }
 
+/// The quality of readings with these faults, of which those in `position` make the position
+/// doubtful.
+pub(crate) fn quality_of(faults: u32, position: u32) -> Quality {
+    let mut quality = Quality::GOOD;
+    if faults & position != 0 {
+        quality |= Quality::DEVICE_FAULT;
+    }
+    if faults & !position != 0 {
+        quality |= Quality::DRIVE_FAULT;
+    }
+    quality
+}
+
+/// Counts the faults in `quality`.
+pub(crate) fn count_faults(quality: Quality, frame: &Frame, out: &mut Decoded) {
+    for (flag, counter) in [
+        (Quality::SATURATED, Counter::Saturated),
+        (Quality::DEVICE_FAULT, Counter::DeviceFault),
+        (Quality::DRIVE_FAULT, Counter::DriveFault),
+    ] {
+        if quality.contains(flag) {
+            out.fault(counter, 1, frame.id);
+        }
+    }
+}
+
 /// The reading of a thermometer, if there is one.
 pub(crate) fn temperature(output: u8, celsius: f64, frame: &Frame, out: &mut Decoded) {
     if celsius.is_finite() {
@@ -157,24 +183,30 @@ impl<Q: Inquiry> Supervision<Q> {
         &mut self,
         output: u8,
         frame: &Frame,
-        mut quality: Quality,
+        quality: Quality,
         state: JointState,
         out: &mut Decoded,
     ) {
-        for (flag, counter) in [
-            (Quality::SATURATED, Counter::Saturated),
-            (Quality::DEVICE_FAULT, Counter::DeviceFault),
-            (Quality::DRIVE_FAULT, Counter::DriveFault),
-        ] {
-            if quality.contains(flag) {
-                out.fault(counter, 1, frame.id);
-            }
-        }
-        if self.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
-        }
         let reading = Reading::Joint(state);
-        out.push(Output::new(output, frame, quality, reading), frame.id);
+        self.give(Output::new(output, frame, quality, reading), frame, out);
+    }
+
+    /// Adds a main reading that `frame` completes, counts the faults in its quality, and marks the
+    /// first one after a gap.
+    pub(crate) fn give(&mut self, mut output: Output, frame: &Frame, out: &mut Decoded) {
+        count_faults(output.quality, frame, out);
+        if self.bringup.reading(frame.t) {
+            output.quality |= Quality::GAP_BEFORE;
+        }
+        out.push(output, frame.id);
+    }
+
+    /// Readings were lost: they are counted, and the next one is marked.
+    pub(crate) fn lost(&mut self, counter: Counter, count: u32, frame: &Frame, out: &mut Decoded) {
+        if count > 0 {
+            self.bringup.lost();
+            out.fault(counter, count, frame.id);
+        }
     }
 
     /// Whether a command can be sent to the board now.

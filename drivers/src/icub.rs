@@ -211,23 +211,9 @@ pub fn address(spec: &Spec) -> Result<u8, SpecError> {
     }
 }
 
-/// How long the host waits for these boards, apart from the silence after power-on.
-pub(crate) const TIMING: Timing = Timing {
-    power_on_silence: Nanos::ZERO,
-    // A board answers within a few ms; icub-main repeats after 20 ms.
-    answer_timeout: Nanos::from_millis(20),
-    // As in icub-main.
-    attempts: 15,
-    // A board that is powered later starts within this time, at the cost of two frames a second.
-    slow_attempt: Nanos::from_millis(500),
-    answer_counts: Nanos::from_millis(1000),
-    // An IMU changes its fusion mode before its first reading.
-    start: Nanos::from_millis(250),
-    start_most: Nanos::from_millis(500),
-    send_within: Nanos::from_millis(100),
-};
-
-/// [`TIMING`] with the silence after power-on of the key `power_on_silence_ms`.
+/// [`Timing::USUAL`] with the silence after power-on of the key `power_on_silence_ms`. (A board
+/// answers within a few ms; icub-main repeats 15 times after 20 ms. An IMU changes its fusion mode
+/// before its first reading.)
 ///
 /// # Errors
 /// [`SpecError::Key`] above a minute.
@@ -241,7 +227,7 @@ pub(crate) fn timing(ms: u32) -> Result<Timing, SpecError> {
     }
     Ok(Timing {
         power_on_silence: Nanos::from_millis(i64::from(ms)),
-        ..TIMING
+        ..Timing::USUAL
     })
 }
 

@@ -15,7 +15,7 @@ use crate::{
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
-use proprio_topics::{Counter, JointState, Kind, Quality, Reading};
+use proprio_topics::{JointState, Kind, Quality, Reading};
 use serde::Deserialize;
 
 /// Types of the streams.
@@ -100,12 +100,9 @@ impl Family for Mais {
             Some(HES7TO14) => (SECOND, SENSORS - SECOND),
             _ => return,
         };
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = bytes::payload_of(usize::from(length), frame, out) else {
             return;
         };
-        if data.len() != usize::from(length) {
-            return out.fault(Counter::Length, 1, frame.id);
-        }
         if link.bringup.reading(frame.t) {
             self.gap = self.seen;
         }

@@ -6,8 +6,8 @@ mod board;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-use crate::bringup::{Bringup, NoInquiry};
-use crate::family::{Family, Supervised, Supervision};
+use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::family::{Family, Supervised, Supervision, count_faults, quality_of};
 use crate::held::HeldValue;
 use crate::icub::{self, class};
 use crate::icub_motor::mode;
@@ -19,7 +19,7 @@ use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
-use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
+use proprio_topics::{Actuator, JointState, Kind, Nanos, Quality, Reading};
 use serde::Deserialize;
 
 /// Types of the streams.
@@ -136,7 +136,7 @@ impl Driver for IcubMc4Options {
         let kinds = [kind::POSITION, kind::STATUS, kind::VELOCITY];
         let claims: ArrayVec<Claim, 3> = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
         let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::POSITION);
-        let bringup = Bringup::new(spec, Mode::Listen, icub::TIMING, watched);
+        let bringup = Bringup::new(spec, Mode::Listen, Timing::USUAL, watched);
         let this = Mc4 {
             address,
             outputs: spec.outputs.clone(),
@@ -148,12 +148,9 @@ impl Driver for IcubMc4Options {
 }
 
 /// The quality of a joint's readings under these faults, in this mode.
-fn quality_of(faults: u32, mode: u32) -> Quality {
-    let mut quality = Quality::GOOD;
-    if faults & fault::POSITION != 0 {
-        quality |= Quality::DEVICE_FAULT;
-    }
-    if faults & !fault::POSITION != 0 || mode == mode::HARDWARE_FAULT {
+fn status_quality(faults: u32, mode: u32) -> Quality {
+    let mut quality = quality_of(faults, fault::POSITION);
+    if mode == mode::HARDWARE_FAULT {
         quality |= Quality::DRIVE_FAULT;
     }
     if matches!(mode, CALIBRATION | mode::NOT_CONFIGURED) {
@@ -194,12 +191,7 @@ impl Mc4 {
                 continue;
             }
             let mut quality = joint.status;
-            if quality.contains(Quality::DEVICE_FAULT) {
-                out.fault(Counter::DeviceFault, 1, frame.id);
-            }
-            if quality.contains(Quality::DRIVE_FAULT) {
-                out.fault(Counter::DriveFault, 1, frame.id);
-            }
+            count_faults(quality, frame, out);
             if gap {
                 quality |= Quality::GAP_BEFORE;
             }
@@ -222,7 +214,7 @@ impl Mc4 {
         for (((joint, (faults, mode)), mask), output) in joints.zip(0_u8..) {
             let faults = u32::from(faults) | u32::from(shared) << 8 & mask;
             let mode = u32::from(mode);
-            joint.status = quality_of(faults, mode);
+            joint.status = status_quality(faults, mode);
             let reading = Reading::Actuator(Actuator {
                 duty: f64::NAN,
                 mode,
@@ -244,12 +236,9 @@ impl Family for Mc4 {
         let Some(kind @ (kind::POSITION | kind::STATUS | kind::VELOCITY)) = stream else {
             return;
         };
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = bytes::payload_of(FRAME, frame, out) else {
             return;
         };
-        if data.len() != FRAME {
-            return out.fault(Counter::Length, 1, frame.id);
-        }
         match kind {
             kind::POSITION => self.positions(data, frame, link, out),
             kind::STATUS => self.status(data, frame, out),

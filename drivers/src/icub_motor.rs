@@ -6,7 +6,7 @@ mod board;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-use crate::bringup::{Bringup, NoInquiry};
+use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class};
 use crate::{
@@ -121,7 +121,7 @@ impl Driver for IcubMotorOptions {
         ];
         let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::TWO_FOC);
         let claims: ArrayVec<Claim, 4> = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
-        let bringup = Bringup::new(spec, Mode::Listen, icub::TIMING, watched);
+        let bringup = Bringup::new(spec, Mode::Listen, Timing::USUAL, watched);
         let this = TwoFoc {
             address,
             velocity: self.velocity,
@@ -163,24 +163,14 @@ impl TwoFoc {
         link: &mut Supervision<NoInquiry>,
         out: &mut Decoded,
     ) {
-        let mut quality = self.status;
-        if quality.contains(Quality::DEVICE_FAULT) {
-            out.fault(Counter::DeviceFault, 1, frame.id);
-        }
-        if quality.contains(Quality::DRIVE_FAULT) {
-            out.fault(Counter::DriveFault, 1, frame.id);
-        }
-        if link.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
-        }
         let velocity = f64::from(bytes::i16_le(data, 2)) * RAD_PER_S_PER_LSB;
-        let reading = Reading::Joint(JointState {
+        let joint = JointState {
             position: f64::from(bytes::u32_le(data, 4).cast_signed()) * RAD_PER_LSB,
             velocity: if self.velocity { velocity } else { f64::NAN },
             current: f64::from(bytes::i16_le(data, 0)) * AMPERE_PER_LSB,
             ..JointState::ABSENT
-        });
-        out.push(Output::new(0, frame, quality, reading), frame.id);
+        };
+        link.joint(0, frame, self.status, joint, out);
     }
 
     fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {

@@ -6,7 +6,7 @@ mod board;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-use crate::bringup::Bringup;
+use crate::bringup::{Bringup, Timing};
 use crate::configure::{Configure, Setting};
 use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
@@ -195,7 +195,7 @@ impl Driver for IcubPosOptions {
         if setting.is_some() {
             claims.push(Claim::shared(icub::to_host(class::POLLING_ANALOG, address)));
         }
-        let configure = Configure::new(spec, setting, icub::TIMING);
+        let configure = Configure::new(spec, setting, Timing::USUAL);
         let this = Pos {
             address,
             quantity: self.quantity,

@@ -10,5 +10,5 @@ mod options;
 #[cfg(feature = "recognise")]
 mod recognise;
 
-pub use firmware::{Firmware, error_words};
+pub use firmware::Firmware;
 pub use options::OdriveOptions;

@@ -34,10 +34,10 @@ use std::sync::atomic::Ordering::Relaxed;
 
 /// Maximum wait in one turn of the loop. The watchdog needs a sign of life every 100 ms, with or
 /// without frames.
-pub const MAX_TURN: Nanos = Nanos::from_millis(50);
+pub(crate) const MAX_TURN: Nanos = Nanos::from_millis(50);
 
 /// Time for the devices to stop before the link is closed in any case.
-pub const STOP_TIME: Nanos = Nanos::from_millis(200);
+pub(crate) const STOP_TIME: Nanos = Nanos::from_millis(200);
 
 /// Maximum number of frames that wait to be sent: a start-up command for each of 16 boards, several
 /// times over.
@@ -295,7 +295,7 @@ impl<S: Sink> Bus<S> {
 
     /// The link's closing note for the log, if any.
     #[must_use]
-    pub fn link_note(&self) -> Option<String> {
+    pub(crate) fn link_note(&self) -> Option<String> {
         self.link.note()
     }
 

@@ -164,7 +164,7 @@ impl HardwareToMonotonic {
     const PARTS: usize = 8;
     const PART: i64 = 125_000_000;
     /// The longest plausible delay from adapter to kernel \[ns\].
-    pub const LONGEST_WAY: Nanos = Nanos(100_000_000);
+    pub(crate) const LONGEST_WAY: Nanos = Nanos(100_000_000);
 
     /// The instant at which the adapter's clock showed `hardware`, given the kernel's stamp of the
     /// same frame (both \[ns\], the latter CLOCK_MONOTONIC); never later than that. `None` if the

@@ -19,7 +19,7 @@ use crate::operator::Operator;
 use crate::plan::Plan;
 use crate::thread::{BusThread, join, statuses};
 use crate::watch;
-use anyhow::{Context, anyhow, bail};
+use anyhow::{Context, bail};
 use proprio_topics::ipc::{Domain, DomainConfig, Writer, open_files_remedy};
 use proprio_topics::{Description, GatewayHealth, Nanos};
 use sd_notify::NotifyState;
@@ -79,157 +79,230 @@ fn adapters(plan: &Plan, sys: &Path) -> String {
     lines.collect()
 }
 
-async fn serve(config: &Path, plan: Plan, domain_config: &DomainConfig) -> anyhow::Result<()> {
+async fn serve(config: &Path, plan: Plan, domain: &DomainConfig) -> anyhow::Result<()> {
     let mut terminate = signal(SignalKind::terminate()).context("cannot catch SIGTERM")?;
     let mut interrupt = signal(SignalKind::interrupt()).context("cannot catch SIGINT")?;
-    let clock = Monotonic;
-    let started = clock.now();
-    let mut ports = ControlPorts::open(Domain::open(domain_config)?, &plan, clock.now())?;
-
-    for bus in plan.buses.iter().filter(|bus| bus.load.is_high()) {
-        tracing::warn!(
-            bus = bus.name,
-            "its devices need up to {:.0} % of the bus: frames of low priority come late; make \
-             periods longer, or move devices to another bus",
-            bus.load.share * 100.0
-        );
-    }
-    let stop = Arc::new(AtomicBool::new(false));
-    // A common start keeps the buses of one log in step; by then all of them are open.
-    let replay_start = clock.now() + REPLAY_DELAY;
-    let mut threads = Vec::new();
-    let mut failure = None;
-    for (bus, number) in plan.buses.iter().zip(0_u32..) {
-        match BusThread::start(&plan, bus, number, &ports.domain, &stop, replay_start) {
-            Ok(thread) => threads.push(thread),
-            Err(error) => {
-                failure = Some(error.context(format!("bus {:?}", bus.name)));
-                break;
-            }
-        }
-    }
-    if let Some(error) = failure {
-        // The threads that have started must stop their boards and release their ports.
-        join(&mut threads, &stop);
-        return Err(error);
-    }
-    let interfaces = plan.buses.iter().map(|bus| match &bus.source {
-        FrameSource::SocketCan(adapter) => Some(adapter.clone()),
-        FrameSource::Virtual { .. } | FrameSource::Replay { .. } => None,
-    });
-    let observer = Observer::start(
-        interfaces.collect(),
-        Netlink::default(),
-        HEALTH_PERIOD,
-        Arc::clone(&stop),
-    );
-    let observer = match observer {
-        Ok(observer) => observer,
-        Err(error) => {
-            join(&mut threads, &stop);
-            return Err(anyhow!(error).context("cannot start a thread"));
-        }
-    };
     let (ask, mut asked) = tokio::sync::mpsc::channel(control::MAX_CLIENTS);
-    let mut socket = control_socket(domain_config, &plan.robot, &ask);
-    let watched = Arc::new(Mutex::new(plan.clone()));
-    if let Err(error) = watch::start(
-        Arc::clone(&watched),
-        domain_config.name.clone(),
-        Arc::clone(&stop),
-    ) {
-        tracing::warn!("devices that the configuration does not know are not told: {error}");
-    }
-    let mut loads = Loads::new(&plan);
-    let mut operator = Operator::new(config, plan);
-    tracing::info!(
-        robot = operator.plan().robot,
-        buses = operator.plan().buses.len(),
-        channels = operator.plan().channels.len(),
-        "running"
-    );
-    let _ = sd_notify::notify(&[NotifyState::Ready, NotifyState::Status("running")]);
-    let watchdog = sd_notify::watchdog_enabled();
-
-    let mut health = Box::new(GatewayHealth::new(started));
-    let mut health_log = HealthLog::default();
-    let (mut is_damaged, mut has_failed) = (false, false);
+    let mut gateway = Gateway::start(config, plan, domain, ask)?;
     let mut ticks = tokio::time::interval(HEALTH_PERIOD);
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     let why = loop {
         tokio::select! {
             _ = terminate.recv() => break "SIGTERM",
             _ = interrupt.recv() => break "SIGINT",
-            Some(asked) = asked.recv() => {
-                fill_health(&mut health, &statuses(&threads), &observer.newest());
-                operator.begin(asked, &mut threads, &health, clock.now());
-                if operator.has_reloaded() {
-                    let description = operator.plan().description();
-                    let _ = ports.description.send(&description, clock.now());
-                    *watched.lock().unwrap_or_else(PoisonError::into_inner) =
-                        operator.plan().clone();
+            Some(asked) = asked.recv() => gateway.begin(asked),
+            () = tokio::time::sleep(LOOK), if gateway.operator.waits() => {
+                gateway.operator.look(&mut gateway.threads, Monotonic.now());
+            }
+            _ = ticks.tick() => {
+                if let Some(why) = gateway.tick() {
+                    break why;
                 }
-                continue;
             }
-            () = tokio::time::sleep(LOOK), if operator.waits() => {
-                operator.look(&mut threads, clock.now());
-                continue;
-            }
-            _ = ticks.tick() => {}
-        }
-        let now = clock.now();
-        let statuses = statuses(&threads);
-        fill_health(&mut health, &statuses, &observer.newest());
-        loads.measure(&mut health, &statuses, now);
-        health_log.log_changes(&health, &statuses);
-        // A reader that cannot be reached now is no reason to stop; the next health follows in 0.1
-        // s.
-        let _ = ports.health.send(&health, now);
-        let _ = ports.description.update_connections();
-        let renewed = ports.domain.renewed().map(|domain| {
-            if !std::mem::replace(&mut is_damaged, true) {
-                tracing::error!("{}", ports.domain.damage());
-            }
-            ControlPorts::open(domain?, operator.plan(), now)
-        });
-        match renewed {
-            Some(Ok(new)) => {
-                ports = new;
-                for thread in &threads {
-                    thread.renewal.pass(ports.domain.clone());
-                }
-                drop(socket.take());
-                socket = control_socket(domain_config, &operator.plan().robot, &ask);
-            }
-            Some(Err(error)) if !has_failed => {
-                has_failed = true;
-                tracing::error!("{error:#}; trying again");
-            }
-            Some(Err(_)) => {}
-            None => (is_damaged, has_failed) = (false, false),
-        }
-        operator.look(&mut threads, now);
-        if threads.iter().any(BusThread::is_lost) {
-            break "a bus thread has ended unexpectedly";
-        }
-        if threads.iter().all(BusThread::has_ended) {
-            break "all logs have ended";
-        }
-        if watchdog.is_some() && !threads.iter().any(|t| t.is_stuck(now)) {
-            let _ = sd_notify::notify(&[NotifyState::Watchdog]);
         }
     };
     tracing::info!(why, "stopping");
-    // As long as the health's writer is there, no other gateway of this robot can have made one.
-    drop(socket);
-    let _ = sd_notify::notify(&[NotifyState::Stopping]);
-    let panicked = join(&mut threads, &stop);
-    fill_health(&mut health, &statuses(&threads), &observer.newest());
-    let _ = ports.health.send(&health, clock.now());
-    match panicked {
-        None => Ok(()),
-        Some(bus) => bail!("the thread of bus {bus:?} panicked: this is a bug in the program"),
+    gateway.stop()
+}
+
+/// The gateway while it runs.
+struct Gateway<'a> {
+    domain: &'a DomainConfig,
+    stop: Arc<AtomicBool>,
+    observer: Observer,
+    threads: Vec<BusThread>,
+    ports: ControlPorts,
+    ask: tokio::sync::mpsc::Sender<control::Asked>,
+    socket: Option<control::Socket>,
+    /// The plan that unknown devices are told by.
+    watched: Arc<Mutex<Plan>>,
+    operator: Operator,
+    loads: Loads,
+    health: Box<GatewayHealth>,
+    health_log: HealthLog,
+    /// Whether systemd waits for signs of life.
+    is_watched: bool,
+    /// Whether the domain's files are damaged.
+    is_damaged: bool,
+    /// Whether renewing them has failed.
+    has_failed: bool,
+}
+
+impl<'a> Gateway<'a> {
+    /// Opens the ports and starts the threads of `plan`, which `config` holds.
+    fn start(
+        config: &Path,
+        plan: Plan,
+        domain: &'a DomainConfig,
+        ask: tokio::sync::mpsc::Sender<control::Asked>,
+    ) -> anyhow::Result<Self> {
+        let started = Monotonic.now();
+        let ports = ControlPorts::open(Domain::open(domain)?, &plan, Monotonic.now())?;
+        for bus in plan.buses.iter().filter(|bus| bus.load.is_high()) {
+            tracing::warn!(
+                bus = bus.name,
+                "its devices need up to {:.0} % of the bus: frames of low priority come late; \
+                 make periods longer, or move devices to another bus",
+                bus.load.share * 100.0
+            );
+        }
+        let stop = Arc::new(AtomicBool::new(false));
+        let mut threads = Vec::new();
+        let started_all = start_threads(&plan, &ports.domain, &stop, &mut threads);
+        let observer = match started_all.and_then(|()| observe(&plan, &stop)) {
+            Ok(observer) => observer,
+            Err(error) => {
+                // The threads that have started must stop their boards and release their ports.
+                join(&mut threads, &stop);
+                return Err(error);
+            }
+        };
+        let socket = control_socket(domain, &plan.robot, &ask);
+        let watched = Arc::new(Mutex::new(plan.clone()));
+        if let Err(error) =
+            watch::start(Arc::clone(&watched), domain.name.clone(), Arc::clone(&stop))
+        {
+            tracing::warn!("devices that the configuration does not know are not told: {error}");
+        }
+        tracing::info!(
+            robot = plan.robot,
+            buses = plan.buses.len(),
+            channels = plan.channels.len(),
+            "running"
+        );
+        let _ = sd_notify::notify(&[NotifyState::Ready, NotifyState::Status("running")]);
+        Ok(Self {
+            domain,
+            stop,
+            observer,
+            threads,
+            ports,
+            ask,
+            socket,
+            watched,
+            loads: Loads::new(&plan),
+            operator: Operator::new(config, plan),
+            health: Box::new(GatewayHealth::new(started)),
+            health_log: HealthLog::default(),
+            is_watched: sd_notify::watchdog_enabled().is_some(),
+            is_damaged: false,
+            has_failed: false,
+        })
     }
+
+    /// Begins to carry out what is asked.
+    fn begin(&mut self, asked: control::Asked) {
+        let now = Monotonic.now();
+        fill_health(
+            &mut self.health,
+            &statuses(&self.threads),
+            &self.observer.newest(),
+        );
+        self.operator
+            .begin(asked, &mut self.threads, &self.health, now);
+        if self.operator.has_reloaded() {
+            let plan = self.operator.plan();
+            let _ = self.ports.description.send(&plan.description(), now);
+            *self.watched.lock().unwrap_or_else(PoisonError::into_inner) = plan.clone();
+        }
+    }
+
+    /// What is done each [`HEALTH_PERIOD`]; returns why the gateway ends, if it does.
+    fn tick(&mut self) -> Option<&'static str> {
+        let now = Monotonic.now();
+        let statuses = statuses(&self.threads);
+        fill_health(&mut self.health, &statuses, &self.observer.newest());
+        self.loads.measure(&mut self.health, &statuses, now);
+        self.health_log.log_changes(&self.health, &statuses);
+        // A reader that cannot be reached now is no reason to stop; the next health follows in 0.1
+        // s.
+        let _ = self.ports.health.send(&self.health, now);
+        let _ = self.ports.description.update_connections();
+        self.renew(now);
+        self.operator.look(&mut self.threads, now);
+        if self.threads.iter().any(BusThread::is_lost) {
+            return Some("a bus thread has ended unexpectedly");
+        }
+        if self.threads.iter().all(BusThread::has_ended) {
+            return Some("all logs have ended");
+        }
+        if self.is_watched && !self.threads.iter().any(|t| t.is_stuck(now)) {
+            let _ = sd_notify::notify(&[NotifyState::Watchdog]);
+        }
+        None
+    }
+
+    /// Opens the ports anew if the domain's files are damaged.
+    fn renew(&mut self, now: Nanos) {
+        let Some(renewed) = self.ports.domain.renewed() else {
+            (self.is_damaged, self.has_failed) = (false, false);
+            return;
+        };
+        if !std::mem::replace(&mut self.is_damaged, true) {
+            tracing::error!("{}", self.ports.domain.damage());
+        }
+        let plan = self.operator.plan();
+        let opened = renewed.map_err(Into::into);
+        match opened.and_then(|domain| ControlPorts::open(domain, plan, now)) {
+            Ok(ports) => {
+                self.ports = ports;
+                for thread in &self.threads {
+                    thread.renewal.pass(self.ports.domain.clone());
+                }
+                drop(self.socket.take());
+                self.socket = control_socket(self.domain, &plan.robot, &self.ask);
+            }
+            Err(error) if !std::mem::replace(&mut self.has_failed, true) => {
+                tracing::error!("{error:#}; trying again");
+            }
+            Err(_) => {}
+        }
+    }
+
+    fn stop(mut self) -> anyhow::Result<()> {
+        // As long as the health's writer is there, no other gateway of this robot can have made
+        // one.
+        drop(self.socket.take());
+        let _ = sd_notify::notify(&[NotifyState::Stopping]);
+        let panicked = join(&mut self.threads, &self.stop);
+        fill_health(
+            &mut self.health,
+            &statuses(&self.threads),
+            &self.observer.newest(),
+        );
+        let _ = self.ports.health.send(&self.health, Monotonic.now());
+        match panicked {
+            None => Ok(()),
+            Some(bus) => bail!("the thread of bus {bus:?} panicked: this is a bug in the program"),
+        }
+    }
+}
+
+/// Starts the thread of each bus into `threads`, up to the first that cannot.
+fn start_threads(
+    plan: &Plan,
+    domain: &Domain,
+    stop: &Arc<AtomicBool>,
+    threads: &mut Vec<BusThread>,
+) -> anyhow::Result<()> {
+    // A common start keeps the buses of one log in step; by then all of them are open.
+    let replay_start = Monotonic.now() + REPLAY_DELAY;
+    for (bus, number) in plan.buses.iter().zip(0_u32..) {
+        let thread = BusThread::start(plan, bus, number, domain, stop, replay_start);
+        threads.push(thread.with_context(|| format!("bus {:?}", bus.name))?);
+    }
+    Ok(())
+}
+
+/// Asks the kernel for the state of the interfaces of `plan` until `stop`.
+fn observe(plan: &Plan, stop: &Arc<AtomicBool>) -> anyhow::Result<Observer> {
+    let interfaces = plan.buses.iter().map(|bus| match &bus.source {
+        FrameSource::SocketCan(adapter) => Some(adapter.clone()),
+        FrameSource::Virtual { .. } | FrameSource::Replay { .. } => None,
+    });
+    let (kernel, stop) = (Netlink::default(), Arc::clone(stop));
+    Observer::start(interfaces.collect(), kernel, HEALTH_PERIOD, stop)
+        .context("cannot start a thread")
 }
 
 /// The control plane's ports.

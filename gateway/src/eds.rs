@@ -55,7 +55,8 @@ impl SectionName {
     }
 }
 
-fn parse(text: &str) -> Result<Objects, String> {
+/// The sections of `text`, in order, because explicit entries count before those of a short form.
+fn sections(text: &str) -> Result<BTreeMap<String, Section>, String> {
     let mut form = IniDefault::default();
     form.delimiters = vec!['='];
     form.comment_symbols = vec![';'];
@@ -69,8 +70,11 @@ fn parse(text: &str) -> Result<Objects, String> {
     let sections = Ini::new_from_defaults(form)
         .read(lines.collect::<Vec<_>>().join("\n"))
         .map_err(|e| format!("is no EDS or DCF file: {e}"))?;
-    // In order, because explicit entries count before those of a short form.
-    let sections: BTreeMap<String, Section> = sections.into_iter().collect();
+    Ok(sections.into_iter().collect())
+}
+
+fn parse(text: &str) -> Result<Objects, String> {
+    let sections = sections(text)?;
     let places: Vec<(SectionName, &String, &Section)> = sections
         .iter()
         .filter_map(|(name, section)| Some((SectionName::of(name)?, name, section)))

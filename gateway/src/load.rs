@@ -41,13 +41,13 @@ impl BusLoad {
 
     /// Whether the bus is nearly full.
     #[must_use]
-    pub fn is_high(self) -> bool {
+    pub(crate) fn is_high(self) -> bool {
         self.share > Self::HIGH
     }
 
     /// Whether a bus whose share was high before still is.
     #[must_use]
-    pub fn stays_high(share: f64, was_high: bool) -> bool {
+    pub(crate) fn stays_high(share: f64, was_high: bool) -> bool {
         share
             > if was_high {
                 Self::NO_LONGER
@@ -116,7 +116,7 @@ pub fn bits_on_wire(frame: &Frame) -> WireBits {
 
 /// The longest time that `frame` needs on a bus \[s\], with the interframe space.
 #[must_use]
-pub fn seconds_on_wire(frame: &Frame, rates: BitRates) -> f64 {
+pub(crate) fn seconds_on_wire(frame: &Frame, rates: BitRates) -> f64 {
     let WireBits { nominal, data } = bits_on_wire(frame);
     f64::from(nominal) / f64::from(rates.nominal) + f64::from(data) / f64::from(rates.data)
 }
@@ -143,7 +143,7 @@ pub struct Totals {
 /// classic frames with 11-bit identifiers, from their number and bytes. The greater of this and of
 /// the gateway's own frames is the load.
 #[derive(Debug, Clone)]
-pub struct Meter {
+pub(crate) struct Meter {
     /// The newest first.
     past: VecDeque<(Nanos, Totals)>,
     /// The last load that was far enough apart to be measured.
@@ -152,13 +152,13 @@ pub struct Meter {
 
 impl Meter {
     /// The time over which the load is measured.
-    pub const WINDOW: Nanos = Nanos::from_millis(1000);
+    pub(crate) const WINDOW: Nanos = Nanos::from_millis(1000);
     /// A shorter time tells no rate yet.
     const LEAST: Nanos = Nanos::from_millis(200);
 
     /// A bus of which nothing was measured.
     #[must_use]
-    pub const fn new() -> Self {
+    pub(crate) const fn new() -> Self {
         Self {
             past: VecDeque::new(),
             load: BusLoad {
@@ -170,7 +170,12 @@ impl Meter {
 
     /// The load of the time before `now`, with the totals until then. Without `rates` the share is
     /// NaN.
-    pub fn measure(&mut self, now: Nanos, totals: Totals, rates: Option<BitRates>) -> BusLoad {
+    pub(crate) fn measure(
+        &mut self,
+        now: Nanos,
+        totals: Totals,
+        rates: Option<BitRates>,
+    ) -> BusLoad {
         // An interface that was set up again counts from zero; one that was not asked yet, or did
         // not answer, tells zero.
         if let Some((_, last)) = self.past.front()

@@ -1,10 +1,8 @@
 //! Converts a recorded log to a table of samples and back: `proprio decode` and `proprio encode`.
 //! No daemon, no clock.
 
-use crate::config::FrameSource;
 use crate::decoder::Decoder;
 use crate::joints::Inverse;
-use crate::link::adapter::Adapter;
 use crate::link::replay::{self, Matching};
 use crate::log::{self, LogFormat, Stamps, candump};
 use crate::plan::{BusPlan, ChannelPlan, DevicePlan, Plan};
@@ -596,7 +594,7 @@ impl<'p, W: Write> TableEncoder<'p, W> {
             joint_outputs: joint_outputs(plan),
             frames: Frames::new(),
             log: EncodedLog {
-                interfaces: plan.buses.iter().map(interface).collect(),
+                interfaces: plan.buses.iter().map(BusPlan::interface).collect(),
                 waiting: VecDeque::new(),
                 frames: 0,
                 out: log,
@@ -673,13 +671,5 @@ impl<'p, W: Write> TableEncoder<'p, W> {
         self.report.refused += refused.len() as u64;
         self.report.samples += (joints.len() - refused.len()) as u64;
         Ok(())
-    }
-}
-
-/// The interface name of `bus` in a log.
-fn interface(bus: &BusPlan) -> &str {
-    match &bus.source {
-        FrameSource::SocketCan(Adapter::Interface(name)) | FrameSource::Virtual { name } => name,
-        FrameSource::SocketCan(_) | FrameSource::Replay { .. } => &bus.name,
     }
 }

@@ -73,6 +73,17 @@ impl BusPlan {
         let is_log = matches!(self.source, FrameSource::Replay { .. });
         self.load.share > 1.0 && !self.listen_only && !is_log
     }
+
+    /// The name of its interface in a log.
+    #[must_use]
+    pub fn interface(&self) -> &str {
+        match &self.source {
+            FrameSource::SocketCan(Adapter::Interface(name)) | FrameSource::Virtual { name } => {
+                name
+            }
+            FrameSource::SocketCan(_) | FrameSource::Replay { .. } => &self.name,
+        }
+    }
 }
 
 /// One device.

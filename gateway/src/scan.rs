@@ -11,7 +11,8 @@ mod found;
 mod tables;
 
 pub use found::{FoundDevice, devices};
-pub use tables::{FILL_IN, ScannedBus, file, placeholders, tables};
+pub(crate) use tables::FILL_IN;
+pub use tables::{ScannedBus, file, placeholders, tables};
 
 use crate::clock::Clock;
 use crate::link::{Link, Received, TransmitError, send_by};

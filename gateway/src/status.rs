@@ -150,7 +150,7 @@ impl BusStatus {
     }
 
     /// Sets the state of a device, and what is told of it.
-    pub fn set_state(&self, device: u16, now: &dyn Device) {
+    pub(crate) fn set_state(&self, device: u16, now: &dyn Device) {
         if let Some(status) = self.devices.get(usize::from(device)) {
             let state = now.state();
             let lacks = now.lacks().filter(|_| state == State::Streaming);
@@ -165,7 +165,7 @@ impl BusStatus {
     }
 
     /// Sets which axes of an F/T sensor are frozen, and which are beyond its full scale.
-    pub fn set_axes(&self, device: u16, frozen: u16, beyond: u16) {
+    pub(crate) fn set_axes(&self, device: u16, frozen: u16, beyond: u16) {
         if let Some(status) = self.devices.get(usize::from(device)) {
             let axes = u32::from(frozen) | u32::from(beyond) << 16;
             status.axes.store(axes, Relaxed);
@@ -173,7 +173,7 @@ impl BusStatus {
     }
 
     /// Counts what `frame`, received or sent, can have taken of the bus. For one writer.
-    pub fn on_wire(&self, frame: &Frame) {
+    pub(crate) fn on_wire(&self, frame: &Frame) {
         let WireBits { nominal, data } = bits_on_wire(frame);
         for (cell, bits) in self
             .bits
@@ -199,7 +199,7 @@ impl BusStatus {
     }
 
     /// Copies the link's state and counters.
-    pub fn set_link(&self, state: LinkState, counters: &LinkCounters) {
+    pub(crate) fn set_link(&self, state: LinkState, counters: &LinkCounters) {
         let LinkCounters {
             dropped,
             error_frames,
@@ -214,7 +214,7 @@ impl BusStatus {
     }
 
     /// Counts an error frame under each of its causes.
-    pub fn record_error(&self, frame: ErrorFrame) {
+    pub(crate) fn record_error(&self, frame: ErrorFrame) {
         for cause in frame.causes() {
             if let Some(status) = self.errors.get(cause as usize) {
                 status.record(frame);

@@ -4,7 +4,7 @@ use crate::bus::{Bus, Turn};
 use crate::clock::Monotonic;
 use crate::config::FrameSource;
 use crate::decoder::Decoder;
-use crate::inbox::{Requests, inbox};
+use crate::inbox::{Inbox, Requests, inbox};
 use crate::link::adapter::{self, Adapter};
 use crate::link::interface::{Interfaces, Netlink};
 use crate::link::replay::Replay;
@@ -111,30 +111,25 @@ impl BusThread {
         let listens = bus.listen_only || matches!(bus.source, FrameSource::Replay { .. });
         let mode = listens.then_some(Mode::Listen);
         let decoder = Decoder::new(number, bus, mode, Arc::clone(&status))?;
-        let mut link: Box<dyn Link> = if let FrameSource::Replay { log, pace, stamps } = &bus.source
-        {
-            let matching = plan.matching(number as usize);
-            let mut replay = Replay::open_with(log, *pace, *stamps, matching, &decoder.claims())?;
-            replay.start_at(replay_start);
-            Box::new(replay)
-        } else {
-            open_link(bus, &domain.config().name, &decoder.claims())?
-        };
-        if bus.listen_only {
-            link = Box::new(ListenOnly(link));
-        }
+        let (name, claims) = (&domain.config().name, decoder.claims());
+        let link = open_own(plan, bus, number, name, &claims, replay_start)?;
         let claim = match &bus.source {
             FrameSource::SocketCan(adapter) if !listens => claim_interface(adapter),
             _ => None,
         };
-        let ended = Arc::new(AtomicBool::new(false));
         let (requests, inbox) = inbox(bus.devices.len());
-        let (ready, is_ready) = mpsc::channel();
+        let (ended, renewal) = (Arc::default(), Arc::default());
+        let work = BusLoop {
+            link,
+            decoder,
+            inbox,
+            status: Arc::clone(&status),
+            renewal: Arc::clone(&renewal),
+            stop: Arc::clone(stop),
+            ended: Arc::clone(&ended),
+        };
         let (domain, robot, realtime) = (domain.clone(), plan.robot.clone(), bus.realtime);
-        let renewal = Arc::new(Renewal::default());
-        let renewal_there = Arc::clone(&renewal);
-        let (stop, ended_there, status_there) =
-            (Arc::clone(stop), Arc::clone(&ended), Arc::clone(&status));
+        let (ready, is_ready) = mpsc::channel();
         let body = move || {
             // A port belongs to the thread that creates it.
             let writer = match Writer::<Sample>::create(&domain, &robot, domain.epoch()) {
@@ -143,28 +138,9 @@ impl BusThread {
             };
             // The memory of a domain that is given up is freed when nobody has it any more.
             drop(domain);
-            let refused = realtime
-                .map(|r| realtime::apply(r.cpu, r.priority))
-                .unwrap_or_default();
-            let _ = ready.send(Ok(refused));
-            let clock = Monotonic;
-            let sink = SharedMemory::new(writer, &robot, renewal_there);
-            let mut bus = Bus::new(link, decoder, sink, status_there).with_inbox(inbox);
-            while !stop.load(Acquire) {
-                if bus.turn(&clock) == Turn::Ended {
-                    if let Some(note) = bus.link_note() {
-                        tracing::warn!("{note}");
-                    }
-                    ended_there.store(true, Release);
-                    // Readers may still read the last samples: keep the port until the gateway
-                    // stops.
-                    while !stop.load(Acquire) {
-                        std::thread::sleep(Duration::from_millis(20));
-                    }
-                }
-            }
-            ended_there.store(true, Release);
-            bus.stop(&clock);
+            let refused = realtime.map(|r| realtime::apply(r.cpu, r.priority));
+            let _ = ready.send(Ok(refused.unwrap_or_default()));
+            work.run(writer, &robot);
         };
         let name: String = format!("bus {}", bus.name).chars().take(15).collect();
         let thread = std::thread::Builder::new()
@@ -194,6 +170,39 @@ impl BusThread {
     }
 }
 
+/// What a bus thread works with.
+struct BusLoop {
+    link: Box<dyn Link>,
+    decoder: Decoder,
+    inbox: Inbox,
+    status: Arc<BusStatus>,
+    renewal: Arc<Renewal>,
+    stop: Arc<AtomicBool>,
+    ended: Arc<AtomicBool>,
+}
+
+impl BusLoop {
+    /// Makes turns until it is told to stop, then stops the boards.
+    fn run(self, writer: Writer<Sample>, robot: &str) {
+        let sink = SharedMemory::new(writer, robot, self.renewal);
+        let mut bus = Bus::new(self.link, self.decoder, sink, self.status).with_inbox(self.inbox);
+        while !self.stop.load(Acquire) {
+            if bus.turn(&Monotonic) == Turn::Ended {
+                if let Some(note) = bus.link_note() {
+                    tracing::warn!("{note}");
+                }
+                self.ended.store(true, Release);
+                // Readers may still read the last samples: keep the port until the gateway stops.
+                while !self.stop.load(Acquire) {
+                    std::thread::sleep(Duration::from_millis(20));
+                }
+            }
+        }
+        self.ended.store(true, Release);
+        bus.stop(&Monotonic);
+    }
+}
+
 /// Claims the interface of `adapter` for a gateway that commands boards, and warns if another one
 /// has: when either ends, it stops the boards of both. The claim is the name of an abstract socket.
 /// It belongs to the network namespace as the interface does, and ends with its process.
@@ -213,6 +222,31 @@ fn claim_interface(adapter: &Adapter) -> Option<UnixDatagram> {
         }
         Err(_) => None,
     }
+}
+
+/// Opens the link of bus `number`; from a log, which begins at `replay_start`, it takes the frames
+/// of this bus.
+fn open_own(
+    plan: &Plan,
+    bus: &BusPlan,
+    number: u32,
+    domain: &str,
+    claims: &[Claim],
+    replay_start: Nanos,
+) -> Result<Box<dyn Link>, OpenError> {
+    let link: Box<dyn Link> = match &bus.source {
+        FrameSource::Replay { log, pace, stamps } => {
+            let matching = plan.matching(number as usize);
+            let mut replay = Replay::open_with(log, *pace, *stamps, matching, claims)?;
+            replay.start_at(replay_start);
+            Box::new(replay)
+        }
+        _ => open_link(bus, domain, claims)?,
+    };
+    Ok(match bus.listen_only {
+        true => Box::new(ListenOnly(link)),
+        false => link,
+    })
 }
 
 /// Opens the link of `bus`; from a log it takes every frame.
@@ -255,7 +289,7 @@ fn check_fd(bus: &BusPlan, interface: &str, kernel: &mut impl Interfaces) -> Res
 #[cfg(test)]
 impl BusThread {
     /// A bus that makes no turn, and its end of the inbox.
-    pub(crate) fn still(bus: &BusPlan) -> (Self, crate::inbox::Inbox) {
+    pub(crate) fn still(bus: &BusPlan) -> (Self, Inbox) {
         let (requests, inbox) = inbox(bus.devices.len());
         let this = Self {
             name: bus.name.clone(),

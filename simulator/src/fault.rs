@@ -121,7 +121,7 @@ pub struct TimeWindow {
 
 impl TimeWindow {
     /// The whole simulation.
-    pub const ALWAYS: Self = Self {
+    pub(crate) const ALWAYS: Self = Self {
         from: 0.0,
         until: f64::INFINITY,
     };

@@ -6,9 +6,7 @@ use crate::settings::SimulationSettings;
 use crate::simulator::{BusCounts, BusSimulator, Simulator, SimulatorError};
 use crate::truth::Simulation;
 use proprio_drivers::{Frame, State};
-use proprio_gateway::config::FrameSource;
 use proprio_gateway::decoder::Decoder;
-use proprio_gateway::link::adapter::Adapter;
 use proprio_gateway::log::candump::write_log_line;
 use proprio_gateway::plan::BusPlan;
 use proprio_gateway::status::BusStatus;
@@ -170,7 +168,7 @@ impl<'a> Host<'a> {
                 bus: plan.name.clone(),
                 cause,
             })?,
-            interface: interface(plan),
+            interface: plan.interface(),
             free: Nanos::MIN,
             sent: 0,
             commands: 0,
@@ -184,14 +182,6 @@ impl<'a> Host<'a> {
         let t = Nanos(t.0 + (1000 - t.0.rem_euclid(1000)) % 1000);
         self.free = t + FRAME_TIME;
         frame.at(t, StampKind::Log)
-    }
-}
-
-/// The interface name of `bus` in a log.
-fn interface(bus: &BusPlan) -> &str {
-    match &bus.source {
-        FrameSource::SocketCan(Adapter::Interface(name)) | FrameSource::Virtual { name } => name,
-        FrameSource::SocketCan(_) | FrameSource::Replay { .. } => &bus.name,
     }
 }
 

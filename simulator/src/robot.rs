@@ -1,7 +1,7 @@
 //! A robot, loaded from its configuration folder: gateway.toml, estimator.toml and the URDF that
 //! the latter names.
 
-use proprio_dynamics::model::{Model, ModelError};
+use proprio_dynamics::model::{Frame, Model, ModelError};
 use proprio_estimator::config::Config;
 use proprio_gateway::plan::Plan;
 use std::path::{Path, PathBuf};
@@ -159,6 +159,18 @@ impl SimulatedRobot {
             folder: self.folder.clone(),
             problem,
         }
+    }
+
+    /// The error that something in estimator.toml is wrong.
+    pub(crate) fn wrong_config(&self, problem: String) -> SimulatedRobotError {
+        self.mismatch(format!("estimator.toml, {problem}"))
+    }
+
+    /// The frame of a link that estimator.toml names at `place`.
+    pub(crate) fn frame(&self, place: &str, link: &str) -> Result<Frame, SimulatedRobotError> {
+        let missing = || format!("{place}: link = {link:?} is not a link of the URDF");
+        let frame = self.model.frame(link);
+        frame.ok_or_else(|| self.wrong_config(missing()))
     }
 }
 

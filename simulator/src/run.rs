@@ -23,7 +23,7 @@ use std::thread;
 use std::time::Duration;
 
 /// Period of the rows of the truth: one millisecond.
-pub const TRUTH_PERIOD: Nanos = Nanos::from_millis(1);
+pub(crate) const TRUTH_PERIOD: Nanos = Nanos::from_millis(1);
 
 /// Maximum wait of a bus thread before it checks whether to stop.
 const MOST_WAIT: Nanos = Nanos::from_millis(20);

@@ -34,7 +34,7 @@ pub const ACCELERATION_NOISE: f64 = 0.03;
 /// Standard deviation of a simulated IMU's angular velocity \[rad/s\].
 pub const ANGULAR_VELOCITY_NOISE: f64 = 0.002;
 /// Standard deviation of a simulated taxel \[counts\].
-pub const TAXEL_NOISE: f64 = 0.8;
+pub(crate) const TAXEL_NOISE: f64 = 0.8;
 
 /// Error of a spike on every axis: \[N\] and \[Nm\].
 const SPIKE: (f64, f64) = (200.0, 5.0);

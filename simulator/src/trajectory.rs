@@ -45,9 +45,9 @@ impl Trajectory {
     /// Maximum speed of a joint \[rad/s or m/s\].
     pub const MOST_SPEED: f64 = 1.2;
     /// Maximum distance of a joint from its rest position \[rad or m\].
-    pub const MOST_EXCURSION: f64 = 0.4;
+    pub(crate) const MOST_EXCURSION: f64 = 0.4;
     /// Duration of the transition from rest to full motion \[s\].
-    pub const BLEND: f64 = 2.0;
+    pub(crate) const BLEND: f64 = 2.0;
     /// Ranges of the three sines' frequencies \[Hz\].
     const BANDS: [(f64, f64); 3] = [(0.1, 0.25), (0.25, 0.5), (0.5, 0.9)];
 

@@ -8,61 +8,26 @@
 //! carry it) and the pushes of faults ([`InjectedFault::Push`]), which the skins of estimator.toml
 //! feel.
 
-use crate::fault::{InjectedFault, TimeWindow};
-use crate::noise::Random;
+mod touch;
+
+pub use touch::{PlannedPush, TouchEvent};
+
+use crate::fault::InjectedFault;
 use crate::robot::{SimulatedRobot, SimulatedRobotError};
 use crate::settings::SimulationSettings;
-use crate::trajectory::{Point, Trajectory, window};
+use crate::trajectory::{Point, Trajectory};
 use proprio_dynamics::model::{Frame, MeasurementDirection, MeasurementFrame, Model};
 use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
 use proprio_dynamics::{
     DynamicsError, ExternalWrench, FrameMotion, InverseDynamics, JointState, Kinematics, Noise,
     SensorCut,
 };
-use proprio_estimator::config::{Base, ContactModel, ContactSite, ForceTorque};
-use proprio_estimator::skin::{TRIANGLE, TRIANGLES, Taxel, TaxelMap};
+use proprio_estimator::config::{Base, ForceTorque};
 use proprio_topics::{Kind, Skin};
+use touch::{Poke, Push, SkinTruth};
 
 /// Standard gravity \[m/s^2\].
 const GRAVITY: f64 = 9.80665;
-/// The push on the hand: force \[N\] and torque \[Nm\].
-const PUSH: (f64, f64) = (10.0, 0.3);
-/// Its start and end in a cycle, and the fraction of the push that each flank takes.
-const PUSH_TIME: (f64, f64, f64) = (0.4, 0.6, 0.25);
-
-/// Pressure of a taxel under the middle of a push \[counts per N\].
-const COUNTS_PER_NEWTON: f64 = 5.0;
-/// Width of a push on a skin, a standard deviation \[m\]: that of a finger tip.
-const WIDTH: f64 = 0.006;
-
-/// The beginning or end of a touch.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TouchEvent {
-    /// Time: seconds since the start of the simulation.
-    pub t: f64,
-    /// The contact's number in estimator.toml.
-    pub contact: usize,
-    /// Whether the touch begins.
-    pub begins: bool,
-}
-
-/// The push on the hand, once in every cycle.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PlannedPush {
-    /// The contact's number in estimator.toml.
-    pub contact: usize,
-    /// Its largest force \[N\] and torque about the contact's frame \[Nm\].
-    pub force: f64,
-    /// See `force`.
-    pub torque: f64,
-    /// Its begin and end in each cycle \[s\].
-    pub from: f64,
-    /// See `from`.
-    pub until: f64,
-    /// Duration of a cycle \[s\].
-    pub cycle: f64,
-}
-
 /// The truth at one instant.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Truth {
@@ -131,85 +96,11 @@ pub struct Simulation {
     truth: Truth,
 }
 
-/// An undeclared push.
-#[derive(Debug, Clone, Copy)]
-struct Poke {
-    external: ExternalWrench,
-    /// Where it acts, in its link's axes.
-    point: Vec3,
-    window: TimeWindow,
-}
-
-/// A skin: its taxels, in its link's axes.
-#[derive(Debug, Clone)]
-struct SkinTruth {
-    name: String,
-    link: usize,
-    taxels: Vec<Option<Vec3>>,
-}
-
 #[derive(Debug, Clone)]
 struct ForceTorqueSensor {
     name: String,
     cut: SensorCut,
     offset: [f64; 6],
-}
-
-#[derive(Debug, Clone, Copy)]
-struct Push {
-    contact: usize,
-    frame: Frame,
-    /// The peak wrench, at the frame's origin.
-    wrench: Wrench,
-    cycle: f64,
-}
-
-impl Push {
-    /// The push on contact number `contact`.
-    fn new(
-        robot: &SimulatedRobot,
-        contacts: &[(String, Frame)],
-        contact: usize,
-        settings: &SimulationSettings,
-    ) -> Option<Self> {
-        let (_, frame) = contacts.get(contact)?;
-        Some(Self {
-            contact,
-            frame: *frame,
-            wrench: push_wrench(robot.config.contact.get(contact)?, settings.seed),
-            cycle: settings.cycle,
-        })
-    }
-
-    /// Its wrench at `t`; zero at the beginning and end of each cycle.
-    fn at(&self, t: f64) -> Wrench {
-        let (from, until, flank) = PUSH_TIME;
-        let x = ((t / self.cycle).rem_euclid(1.0) - from) / (until - from);
-        self.wrench * (window(x / flank).0 * window((1.0 - x) / flank).0)
-    }
-
-    /// The first beginning or end later than `t`.
-    fn next_touch(&self, t: f64) -> TouchEvent {
-        let (from, until, _) = PUSH_TIME;
-        let cycle = (t / self.cycle).floor();
-        // The margin keeps rounding from finding the same one twice.
-        let later = |x: &f64| *x > t + 1e-9 * self.cycle;
-        let changes = [
-            (cycle + from, true),
-            (cycle + until, false),
-            (cycle + 1.0 + from, true),
-        ];
-        let times = changes.map(|(x, begins)| (x * self.cycle, begins));
-        let (t, begins) = times
-            .into_iter()
-            .find(|(x, _)| later(x))
-            .unwrap_or((f64::INFINITY, false));
-        TouchEvent {
-            t,
-            contact: self.contact,
-            begins,
-        }
-    }
 }
 
 impl Simulation {
@@ -241,8 +132,8 @@ impl Simulation {
         let push = on_hand
             .filter(|c| settings.push && Some(*c) != carries)
             .and_then(|contact| Push::new(robot, &contacts, contact, settings));
-        let pokes = pokes(robot, &settings.faults)?;
-        let skins = skins(robot)?;
+        let pokes = Poke::of_faults(robot, &settings.faults)?;
+        let skins = SkinTruth::of_robot(robot)?;
         let dofs = model.dof_count();
         let joint_names: Vec<String> = (0..dofs)
             .map(|dof| model.dof_name(dof).to_owned())
@@ -250,7 +141,7 @@ impl Simulation {
         let trajectory = trajectory(robot, settings, &joint_names)?;
         let standing = standing(robot, &joint_names, &trajectory);
         let kinematics = Kinematics::new(&model, carrier.frame.link)
-            .map_err(|e| wrong(robot, format!("base: {e}")))?;
+            .map_err(|e| robot.wrong_config(format!("base: {e}")))?;
         let at_rest = FrameMotion::standing(&carrier.gravity);
         let mut this = Self {
             base: FrameMotion::of_link_from_imu(&at_rest, &carrier.frame.pose),
@@ -278,7 +169,7 @@ impl Simulation {
         };
         // Inconsistencies are reported here, not as absent readings later.
         this.evaluate(0.0)
-            .map_err(|e| wrong(robot, e.to_string()))?;
+            .map_err(|e| robot.wrong_config(e.to_string()))?;
         Ok(this)
     }
 
@@ -310,29 +201,8 @@ impl Simulation {
     /// where there is no taxel. Triangles without any taxel are omitted.
     #[must_use]
     pub fn taxels(&self, skin: usize, t: f64) -> Vec<Skin> {
-        let Some(skin) = self.skins.get(skin) else {
-            return Vec::new();
-        };
-        let present = || self.pokes.iter().filter(|poke| poke.window.contains(t));
-        let value = |place: &Vec3| -> f64 {
-            let pushes = present().filter(|poke| poke.external.frame.link == skin.link);
-            let pressures = pushes.map(|poke| {
-                let away = (place - poke.point).norm() / WIDTH;
-                COUNTS_PER_NEWTON * poke.external.wrench.force.norm() * (-0.5 * away * away).exp()
-            });
-            pressures.sum()
-        };
-        let triangles = skin.taxels.chunks(TRIANGLE).zip(0..);
-        let triangles = triangles.filter(|(places, _)| places.iter().any(Option::is_some));
-        triangles
-            .map(|(places, triangle)| {
-                let mut taxels = [f64::NAN; TRIANGLE];
-                for (taxel, place) in taxels.iter_mut().zip(places) {
-                    *taxel = place.as_ref().map_or(f64::NAN, value);
-                }
-                Skin { triangle, taxels }
-            })
-            .collect()
+        let skin = self.skins.get(skin);
+        skin.map_or(Vec::new(), |skin| skin.taxels(&self.pokes, t))
     }
 
     /// The joints' names, by degree of freedom.
@@ -341,12 +211,12 @@ impl Simulation {
     }
 
     /// The F/T sensors' names.
-    pub fn wrench_names(&self) -> impl Iterator<Item = &str> {
+    pub(crate) fn wrench_names(&self) -> impl Iterator<Item = &str> {
         self.sensors.iter().map(|s| s.name.as_str())
     }
 
     /// The IMUs' names.
-    pub fn imu_names(&self) -> impl Iterator<Item = &str> {
+    pub(crate) fn imu_names(&self) -> impl Iterator<Item = &str> {
         self.imus.iter().map(|(name, _)| name.as_str())
     }
 
@@ -358,20 +228,12 @@ impl Simulation {
     /// The push on the hand; `None` if there is none.
     #[must_use]
     pub fn push(&self) -> Option<PlannedPush> {
-        let (from, until, _) = PUSH_TIME;
-        self.push.map(|push| PlannedPush {
-            contact: push.contact,
-            force: push.wrench.force.norm(),
-            torque: push.wrench.torque.norm(),
-            from: from * push.cycle,
-            until: until * push.cycle,
-            cycle: push.cycle,
-        })
+        self.push.as_ref().map(Push::planned)
     }
 
     /// The next beginning or end of a touch after `t` seconds; `None` if there is none.
     #[must_use]
-    pub fn next_touch(&self, t: f64) -> Option<TouchEvent> {
+    pub(crate) fn next_touch(&self, t: f64) -> Option<TouchEvent> {
         self.push.map(|push| push.next_touch(t))
     }
 
@@ -554,7 +416,7 @@ impl Carrier {
     ) -> Result<Self, SimulatedRobotError> {
         Ok(match &robot.config.base {
             Base::Fixed { link, gravity_mps2 } => {
-                let frame = frame_of(robot, "base", link)?;
+                let frame = robot.frame("base", link)?;
                 Self {
                     frame,
                     contact: contacts.iter().position(|(_, f)| f.link == frame.link),
@@ -565,9 +427,9 @@ impl Carrier {
             // The simulated robot does not walk: it stands on its first foot.
             Base::Stance { foot } => {
                 let foot = foot.first();
-                let foot = foot.ok_or_else(|| wrong(robot, "base.foot is empty".into()))?;
+                let foot = foot.ok_or_else(|| robot.wrong_config("base.foot is empty".into()))?;
                 Self {
-                    frame: frame_of(robot, "base.foot", &foot.link)?,
+                    frame: robot.frame("base.foot", &foot.link)?,
                     contact: contacts.iter().position(|(name, _)| *name == foot.contact),
                     gravity: Vec3::from(foot.gravity_mps2),
                     imu: None,
@@ -579,7 +441,7 @@ impl Carrier {
                 xyz_m,
                 rpy_rad,
             } => {
-                let mut imu = frame_of(robot, "base", link)?;
+                let mut imu = robot.frame("base", link)?;
                 let beside = contacts.iter().position(|(_, f)| f.link == imu.link);
                 let contact = beside.or_else(|| (0..contacts.len()).find(|c| Some(*c) != hand));
                 let frame = contact.and_then(|c| contacts.get(c));
@@ -596,23 +458,11 @@ impl Carrier {
     }
 }
 
-/// The error that something in estimator.toml is wrong.
-fn wrong(robot: &SimulatedRobot, problem: String) -> SimulatedRobotError {
-    robot.mismatch(format!("estimator.toml, {problem}"))
-}
-
-/// The frame of a link that estimator.toml names at `place`.
-fn frame_of(robot: &SimulatedRobot, place: &str, link: &str) -> Result<Frame, SimulatedRobotError> {
-    let missing = || format!("{place}: link = {link:?} is not a link of the URDF");
-    let frame = robot.model.frame(link);
-    frame.ok_or_else(|| wrong(robot, missing()))
-}
-
 /// The contacts: names and frames.
 fn contacts(robot: &SimulatedRobot) -> Result<Vec<(String, Frame)>, SimulatedRobotError> {
     let contacts = robot.config.contact.iter().map(|contact| {
         let name = contact.name().to_owned();
-        let frame = frame_of(robot, &format!("contact {name:?}"), &contact.link)?;
+        let frame = robot.frame(&format!("contact {name:?}"), &contact.link)?;
         Ok((name, frame))
     });
     contacts.collect()
@@ -621,7 +471,7 @@ fn contacts(robot: &SimulatedRobot) -> Result<Vec<(String, Frame)>, SimulatedRob
 fn sensors(robot: &SimulatedRobot) -> Result<Vec<ForceTorqueSensor>, SimulatedRobotError> {
     let sensors = robot.config.force_torque.iter().map(|ft| {
         let cut = sensor_cut(&robot.model, ft)
-            .map_err(|e| wrong(robot, format!("force_torque {:?}: {e}", ft.sensor)))?;
+            .map_err(|e| robot.wrong_config(format!("force_torque {:?}: {e}", ft.sensor)))?;
         Ok(ForceTorqueSensor {
             name: ft.sensor.clone(),
             cut,
@@ -629,62 +479,6 @@ fn sensors(robot: &SimulatedRobot) -> Result<Vec<ForceTorqueSensor>, SimulatedRo
         })
     });
     sensors.collect()
-}
-
-/// The pushes of faults.
-fn pokes(
-    robot: &SimulatedRobot,
-    faults: &[InjectedFault],
-) -> Result<Vec<Poke>, SimulatedRobotError> {
-    let mut pokes = Vec::new();
-    for fault in faults {
-        let InjectedFault::Push {
-            link,
-            force,
-            at,
-            along,
-            window,
-        } = fault
-        else {
-            continue;
-        };
-        let frame = robot.model.frame(link);
-        let frame = frame.ok_or_else(|| {
-            robot.mismatch(format!("fault {fault}: {link:?} is not a link of the URDF"))
-        })?;
-        let point = Vec3::from(at.unwrap_or_default());
-        let along = Vec3::from(along.unwrap_or([1.0, 0.0, 0.0]));
-        let force = along.try_normalize(1e-9).unwrap_or_else(Vec3::x) * *force;
-        let torque = point.cross(&force);
-        pokes.push(Poke {
-            external: ExternalWrench {
-                frame,
-                wrench: Wrench { torque, force },
-            },
-            point: frame.pose.point(&point),
-            window: *window,
-        });
-    }
-    Ok(pokes)
-}
-
-fn skins(robot: &SimulatedRobot) -> Result<Vec<SkinTruth>, SimulatedRobotError> {
-    let skins = robot.config.skin.iter().map(|skin| {
-        let place = format!("skin {:?}", skin.channel);
-        let frame = frame_of(robot, &place, &skin.link)?;
-        let map =
-            TaxelMap::load(&skin.taxels).map_err(|e| wrong(robot, format!("{place}: {e}")))?;
-        let taxels = map.0.iter().skip(skin.first_taxel);
-        let point = |taxel: &Taxel| frame.pose.point(&taxel.position);
-        Ok(SkinTruth {
-            name: skin.channel.clone(),
-            link: frame.link,
-            taxels: (taxels.take(TRIANGLE * TRIANGLES))
-                .map(|taxel| taxel.as_ref().map(point))
-                .collect(),
-        })
-    });
-    skins.collect()
 }
 
 /// The motion of the joints, of which faults may hold some.
@@ -764,32 +558,9 @@ fn sensor_cut(
     )
 }
 
-/// A push that is possible for a contact of this kind, in a direction drawn from the seed.
-fn push_wrench(contact: &ContactSite, seed: u64) -> Wrench {
-    let mut random = Random::new(seed, "push", 0);
-    let mut unit = || {
-        let direction = Vec3::new(random.normal(), random.normal(), random.normal());
-        direction.try_normalize(1e-9).unwrap_or_else(Vec3::x)
-    };
-    let (force, torque) = (unit() * PUSH.0, unit() * PUSH.1);
-    let through = |force: Vec3| Wrench {
-        force,
-        torque: Vec3::from(contact.position_m).cross(&force),
-    };
-    match (contact.kind, contact.direction) {
-        (ContactModel::Wrench, _) => Wrench { force, torque },
-        (ContactModel::ForceAlong, Some(direction)) => through(
-            Vec3::from(direction)
-                .try_normalize(1e-9)
-                .unwrap_or_else(Vec3::x)
-                * PUSH.0,
-        ),
-        (ContactModel::Force | ContactModel::ForceAlong, _) => through(force),
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use super::touch::PUSH;
     use super::*;
     use std::collections::HashMap;
     use std::path::Path;

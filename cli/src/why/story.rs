@@ -160,7 +160,8 @@ impl TorqueCase {
         story
     }
 
-    /// Why a torque is withheld: a table of what is said of each reason, long as it is.
+    /// Why a torque is withheld.
+    // Long: a table of what is said of each reason.
     fn withheld(&self, budget: &TorqueBudget, reason: Reason) -> Story {
         let channel = self.cause.as_deref().unwrap_or("a channel");
         let (likelier, residual) = (budget.likelier.as_str(), budget.unexplained.as_str());

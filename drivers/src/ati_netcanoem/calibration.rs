@@ -10,14 +10,8 @@ use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Nanos, Refusal};
 
 pub(super) const TIMING: Timing = Timing {
-    power_on_silence: Nanos::ZERO,
-    answer_timeout: Nanos::from_millis(20),
-    attempts: 5,
-    slow_attempt: Nanos::from_millis(500),
-    answer_counts: Nanos::from_millis(100),
-    start: Nanos::from_millis(100),
-    start_most: Nanos::from_millis(2000),
     send_within: Nanos::from_millis(50),
+    ..Timing::POLLED
 };
 
 /// The requests, in their order: select a calibration, counts, units, six rows.

@@ -127,8 +127,7 @@ impl Netcanoem {
             .is_some_and(|first| within((first.t, first.stamp), (frame.t, frame.stamp), LIMIT));
         if !in_time {
             if !core::mem::take(&mut self.joined) {
-                link.bringup.lost();
-                out.fault(Counter::Unpaired, 1, frame.id);
+                link.lost(Counter::Unpaired, 1, frame, out);
             }
             return self.drop_all(link, frame, out);
         }
@@ -171,22 +170,17 @@ fn give(
     let mut quality = Quality::GOOD;
     if gauges.iter().any(|gauge| gauge.abs() >= 32767.0) {
         quality |= Quality::SATURATED;
-        out.fault(Counter::Saturated, 1, frame.id);
     }
     let unnamed = first.status & (STATUS_ANY | STATUS_BUS) == STATUS_ANY;
     if first.status & STATUS_FAULTS != 0 || unnamed || !is_trusted {
         quality |= Quality::DEVICE_FAULT;
-        out.fault(Counter::DeviceFault, 1, frame.id);
-    }
-    if link.bringup.reading(frame.t) {
-        quality |= Quality::GAP_BEFORE;
     }
     let output = Output {
         acquired: first.t,
         stamp: first.stamp,
         ..Output::new(0, frame, quality, reading)
     };
-    out.push(output, frame.id);
+    link.give(output, frame, out);
 }
 
 impl Driver for AtiNetcanoemOptions {

@@ -106,13 +106,47 @@ pub(super) struct CanopenDrive {
     synced: Option<Nanos>,
     /// Which of the TPDOs makes readings alone.
     rates: Rates,
-    /// The last values in SI units, and when they came.
-    values: [Option<(Nanos, f64)>; DriveQuantity::JOINT],
+    last: LastValues,
+    state: NodeState,
+}
+
+/// What was sent last.
+#[derive(Debug, Default)]
+struct LastValues {
+    /// The values in SI units, and when they came.
+    joint: [Option<(Nanos, f64)>; DriveQuantity::JOINT],
     status: u32,
     mode: u32,
     /// The error code, if it is mapped.
     error: Option<u32>,
-    state: NodeState,
+}
+
+impl LastValues {
+    /// Takes what a TPDO says at `t`; returns whether this is more than values of the joint.
+    fn take(&mut self, pdo: &Used, scales: &Scales, data: &[u8], t: Nanos) -> bool {
+        let mut tells_status = false;
+        for field in &pdo.fields {
+            let Some(raw) = field.bits.of(data) else {
+                continue;
+            };
+            let number = field.raw.number(raw, field.bits.length());
+            let at = field.quantity as usize;
+            #[allow(clippy::cast_possible_truncation)] // at most 16 bits
+            let word = raw as u32;
+            if let (Some(value), Some(per_step)) = (self.joint.get_mut(at), scales.per_step.get(at))
+            {
+                *value = Some((t, number * per_step));
+            } else {
+                tells_status = true;
+                match field.quantity {
+                    DriveQuantity::Status => self.status = word,
+                    DriveQuantity::Mode => self.mode = word,
+                    _ => self.error = Some(word),
+                }
+            }
+        }
+        tells_status
+    }
 }
 
 impl CanopenDrive {
@@ -167,39 +201,17 @@ impl CanopenDrive {
                 return out.fault(Counter::Unexpected, 1, frame.id);
             }
         }
-        let mut tells_status = false;
-        for field in &used.fields {
-            let Some(raw) = field.bits.of(data) else {
-                continue;
-            };
-            let number = field.raw.number(raw, field.bits.length());
-            let at = field.quantity as usize;
-            #[allow(clippy::cast_possible_truncation)] // at most 16 bits
-            let word = raw as u32;
-            if let (Some(value), Some(per_step)) =
-                (self.values.get_mut(at), table.scales.per_step.get(at))
-            {
-                *value = Some((frame.t, number * per_step));
-            } else {
-                tells_status = true;
-                match field.quantity {
-                    DriveQuantity::Status => self.status = word,
-                    DriveQuantity::Mode => self.mode = word,
-                    _ => self.error = Some(word),
-                }
-            }
-        }
-        let (bit, rank, group, alone) = (used.bit, used.rank, table.group, table.alone);
-        if tells_status {
+        let (bit, rank, group) = (used.bit, used.rank, table.group);
+        if self.last.take(used, &table.scales, data, frame.t) {
             let reading = Reading::Actuator(Actuator {
                 duty: f64::NAN,
-                mode: self.mode,
-                encoder: self.status,
-                faults: self.error.unwrap_or(u32::from(self.state.error)),
+                mode: self.last.mode,
+                encoder: self.last.status,
+                faults: self.last.error.unwrap_or(u32::from(self.state.error)),
             });
             out.push(Output::new(0, frame, self.quality(), reading), frame.id);
         }
-        if alone & bit != 0 {
+        if table.alone & bit != 0 {
             let at = |bit: u8| bit.trailing_zeros() as usize;
             let rank_of = |other| table.used.iter().find(|used| at(used.bit) == other);
             let is_better = |other| rank_of(other).is_none_or(|other| rank > other.rank);
@@ -207,11 +219,20 @@ impl CanopenDrive {
             if is_first && !self.synced.is_some_and(|t| self.is_fresh(t, frame.t)) {
                 self.give(None, frame, link, out);
             }
-            return;
+        } else if group & bit != 0 {
+            self.add_to_group(bit, group, frame, link, out);
         }
-        if group & bit == 0 {
-            return;
-        }
+    }
+
+    /// A TPDO of `group` has come: the last one completes the reading of a SYNC.
+    fn add_to_group(
+        &mut self,
+        bit: u8,
+        group: u8,
+        frame: &Frame,
+        link: &mut Supervision<Script<DriveStart>>,
+        out: &mut Decoded,
+    ) {
         let too_long = self.have != 0 && !self.is_fresh(self.began, frame.t);
         if self.have & bit != 0 || too_long {
             self.abandon(frame.id, link, out);
@@ -227,8 +248,7 @@ impl CanopenDrive {
         }
         self.have = 0;
         if core::mem::take(&mut self.suspect) {
-            out.fault(Counter::Unpaired, 1, frame.id);
-            return link.bringup.lost();
+            return link.lost(Counter::Unpaired, 1, frame, out);
         }
         self.synced = Some(frame.t);
         let measured = self.measured.take();
@@ -237,7 +257,7 @@ impl CanopenDrive {
 
     fn quality(&self) -> Quality {
         let mut quality = Quality::GOOD;
-        if self.status & FAULT != 0 || self.state.error != 0 {
+        if self.last.status & FAULT != 0 || self.state.error != 0 {
             quality |= Quality::DRIVE_FAULT;
         }
         // Errors of sensors.
@@ -260,23 +280,13 @@ impl CanopenDrive {
         link: &mut Supervision<Script<DriveStart>>,
         out: &mut Decoded,
     ) {
-        let values = self.values.map(|value| match value {
+        let values = self.last.joint.map(|value| match value {
             Some((t, value)) if self.is_fresh(t, frame.t) => value,
             _ => f64::NAN,
         });
         if !values[0].is_finite() {
             // Only where stamps run backward.
             return out.fault(Counter::Value, 1, frame.id);
-        }
-        let mut quality = self.quality();
-        if quality.contains(Quality::DRIVE_FAULT) {
-            out.fault(Counter::DriveFault, 1, frame.id);
-        }
-        if quality.contains(Quality::DEVICE_FAULT) {
-            out.fault(Counter::DeviceFault, 1, frame.id);
-        }
-        if link.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
         }
         let [position, velocity, torque, current] = values;
         let reading = Reading::Joint(JointState {
@@ -286,9 +296,9 @@ impl CanopenDrive {
             current,
             ..JointState::ABSENT
         });
-        let mut output = Output::new(0, frame, quality, reading);
+        let mut output = Output::new(0, frame, self.quality(), reading);
         (output.acquired, output.stamp) = measured.unwrap_or((frame.t, frame.stamp));
-        out.push(output, frame.id);
+        link.give(output, frame, out);
     }
 }
 
@@ -333,10 +343,7 @@ impl Driver for CanopenDriveOptions {
             suspect: false,
             synced: None,
             rates: Rates::default(),
-            values: [None; DriveQuantity::JOINT],
-            status: 0,
-            mode: 0,
-            error: None,
+            last: LastValues::default(),
             state: NodeState::default(),
         };
         Ok(Supervised::boxed(claims, bringup, script, this))
@@ -386,7 +393,7 @@ impl Family for CanopenDrive {
         self.suspect = false;
         self.synced = None;
         self.rates = Rates::default();
-        self.values = [None; DriveQuantity::JOINT];
+        self.last.joint = Default::default();
         self.table = None;
     }
 }

@@ -149,6 +149,51 @@ pub(super) struct Scales {
     pub(super) per_step: [f64; DriveQuantity::JOINT],
 }
 
+/// Refuses a file without what is needed of it: it has `stated`, unless keys state that
+/// (`configured`).
+fn check_file(
+    node: u8,
+    options: &CanopenDriveOptions,
+    objects: &Objects,
+    stated: &PdoMapping,
+    configured: bool,
+) -> Result<(), SpecError> {
+    let name = options.eds.as_deref().unwrap_or_default();
+    let file = (name, objects);
+    if !configured {
+        let has = |pdo: &Pdo| !fields(pdo).0.is_empty();
+        canopen::check_pdos(file, node, has, "state pdos")?;
+        if let Some((number, id)) = stated.wrong_id() {
+            return Err(SpecError::Description(format!(
+                "eds = {name:?}, [{:04X}sub1]: TPDO {} has the identifier {id}, which \
+                 another one, or CiA 301 itself, uses: correct it there, or state pdos",
+                0x1800 + number,
+                number + 1
+            )));
+        }
+    }
+    // Torque and current of the file are left out if their scale is not known.
+    let asked = |quantity| configured && stated.has(quantity);
+    let per_mille = options.current_unit == CurrentUnit::PerMille;
+    for (object, key, wanted) in [
+        (COUNTS, "counts_per_turn", options.counts_per_turn.is_none()),
+        (
+            RATED_TORQUE,
+            "rated_torque",
+            options.rated_torque.is_none() && asked(DriveQuantity::Torque),
+        ),
+        (
+            RATED_CURRENT,
+            "rated_current",
+            options.rated_current.is_none() && per_mille && asked(DriveQuantity::Current),
+        ),
+    ] {
+        let is_wanted = |index| wanted && index == object.index;
+        canopen::check_objects(file, is_wanted, &format!("set {key}"))?;
+    }
+    Ok(())
+}
+
 impl DriveStart {
     pub(super) fn new(
         node: u8,
@@ -159,45 +204,13 @@ impl DriveStart {
         let of_keys = PdoMapping::of_keys(node, &options.pdos())?;
         let configured = of_keys.position().is_some();
         let listens = mode == Mode::Listen;
-        let name = options.eds.as_deref().unwrap_or_default();
         let stated = match file {
             Some(file) if !configured => PdoMapping::of_file(node, file),
             _ => of_keys,
         };
         // One that is asked need not have them in its file.
         if let (Some(file), true) = (file, listens) {
-            let file = (name, file);
-            if !configured {
-                let has = |pdo: &Pdo| !fields(pdo).0.is_empty();
-                canopen::check_pdos(file, node, has, "state pdos")?;
-                if let Some((number, id)) = stated.wrong_id() {
-                    return Err(SpecError::Description(format!(
-                        "eds = {name:?}, [{:04X}sub1]: TPDO {} has the identifier {id}, which \
-                         another one, or CiA 301 itself, uses: correct it there, or state pdos",
-                        0x1800 + number,
-                        number + 1
-                    )));
-                }
-            }
-            // Torque and current of the file are left out if their scale is not known.
-            let asked = |quantity| configured && stated.has(quantity);
-            let per_mille = options.current_unit == CurrentUnit::PerMille;
-            for (object, key, wanted) in [
-                (COUNTS, "counts_per_turn", options.counts_per_turn.is_none()),
-                (
-                    RATED_TORQUE,
-                    "rated_torque",
-                    options.rated_torque.is_none() && asked(DriveQuantity::Torque),
-                ),
-                (
-                    RATED_CURRENT,
-                    "rated_current",
-                    options.rated_current.is_none() && per_mille && asked(DriveQuantity::Current),
-                ),
-            ] {
-                let is_wanted = |index| wanted && index == object.index;
-                canopen::check_objects(file, is_wanted, &format!("set {key}"))?;
-            }
+            check_file(node, options, file, &stated, configured)?;
         }
         let mut ids = ArrayVec::<Id, 4>::new();
         for (number, pdo) in (0..4).zip(&stated.pdos) {

@@ -18,19 +18,6 @@ use proprio_topics::{
     Actuator, Counter, Imu, JointState, Kind, Nanos, Quality, Reading, Skin, StampKind,
 };
 
-/// Only the watching counts: nothing is sent. A device that was heard of never in the first second
-/// and a half is silent.
-const TIMING: Timing = Timing {
-    power_on_silence: Nanos::ZERO,
-    answer_timeout: Nanos::from_millis(100),
-    attempts: 3,
-    slow_attempt: Nanos::from_millis(500),
-    answer_counts: Nanos::from_millis(100),
-    start: Nanos::from_millis(250),
-    start_most: Nanos::from_millis(500),
-    send_within: Nanos::from_millis(100),
-};
-
 /// The host's side of a device that a .dbc file describes.
 #[derive(Debug)]
 pub(super) struct DbcDevice {
@@ -65,6 +52,16 @@ struct Assembly {
     last_count: Option<u64>,
     /// The largest count.
     most: u64,
+}
+
+/// The values of a frame that belong to one reading.
+#[derive(Default)]
+struct FrameValues {
+    values: [f64; VALUES],
+    /// Those that have come, one bit each.
+    come: u16,
+    /// Those that ride along.
+    along: u16,
 }
 
 impl Assembly {
@@ -120,48 +117,14 @@ impl Assembly {
             out.fault(Counter::Unexpected, 1, frame.id);
             return false;
         }
-        let mut values = [0.0; VALUES];
-        // The values that have come, and those that ride along, one bit each.
-        let (mut come, mut along): (u16, u16) = (0, 0);
-        for field in &part.fields {
-            let UsedSignal { bits, raw, .. } = *field;
-            let Some(found) = bits.of(frame.data()) else {
-                continue;
-            };
-            let is_none = field.is_none(found);
-            match field.role {
-                SignalRole::Counter => self.count = Some(found),
-                SignalRole::Fault => self.fault = found != 0 && !is_none,
-                SignalRole::Value {
-                    index,
-                    gain,
-                    offset,
-                    hold,
-                    rides,
-                } => {
-                    let number = gain * raw.number(found, bits.length()) + offset;
-                    let absent = self.absent.get(index).copied();
-                    let value = absent.filter(|_| is_none).unwrap_or(number);
-                    if !value.is_finite() && !is_none {
-                        out.fault(Counter::Value, 1, frame.id);
-                        if hold.is_none() {
-                            return false;
-                        }
-                    } else if let Some(hold) = hold {
-                        if let Some(held) = self.held.get_mut(index) {
-                            *held = Some((frame.t + hold, value));
-                        }
-                    } else if let Some(place) = values.get_mut(index) {
-                        *place = value;
-                        let values = if rides { &mut along } else { &mut come };
-                        *values |= 1 << index;
-                    }
-                }
-            }
-        }
-        if come == 0 {
+        let Some(FrameValues {
+            values,
+            come,
+            along,
+        }) = self.values_of(part, frame, out)
+        else {
             return false;
-        }
+        };
         let again = self.have & come != 0;
         if self.have != 0 && (again || !in_time) {
             self.drop_one(frame, out);
@@ -194,6 +157,55 @@ impl Assembly {
         }
         self.have = 0;
         true
+    }
+
+    /// Takes counter, fault and held values of a frame, and returns its other values; `None`: it
+    /// has none, or one that is no number.
+    fn values_of(
+        &mut self,
+        part: &SignalGroup,
+        frame: &Frame,
+        out: &mut Decoded,
+    ) -> Option<FrameValues> {
+        let mut found = FrameValues::default();
+        for field in &part.fields {
+            let UsedSignal { bits, raw, .. } = *field;
+            let Some(code) = bits.of(frame.data()) else {
+                continue;
+            };
+            let is_none = field.is_none(code);
+            match field.role {
+                SignalRole::Counter => self.count = Some(code),
+                SignalRole::Fault => self.fault = code != 0 && !is_none,
+                SignalRole::Value {
+                    index,
+                    gain,
+                    offset,
+                    hold,
+                    rides,
+                } => {
+                    let number = gain * raw.number(code, bits.length()) + offset;
+                    let absent = self.absent.get(index).copied();
+                    let value = absent.filter(|_| is_none).unwrap_or(number);
+                    if !value.is_finite() && !is_none {
+                        out.fault(Counter::Value, 1, frame.id);
+                        hold?;
+                    } else if let Some(hold) = hold {
+                        if let Some(held) = self.held.get_mut(index) {
+                            *held = Some((frame.t + hold, value));
+                        }
+                    } else if let Some(place) = found.values.get_mut(index) {
+                        *place = value;
+                        *(if rides {
+                            &mut found.along
+                        } else {
+                            &mut found.come
+                        }) |= 1 << index;
+                    }
+                }
+            }
+        }
+        (found.come != 0).then_some(found)
     }
 
     fn drop_one(&mut self, frame: &Frame, out: &mut Decoded) {
@@ -305,7 +317,7 @@ impl Driver for DbcOptions {
                 .max();
             Assembly::new(reading, most.unwrap_or(0))
         });
-        let bringup = Bringup::new(spec, Mode::Listen, TIMING, watched);
+        let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, watched);
         let this = DbcDevice {
             readings: readings.collect(),
             layout,

@@ -250,6 +250,64 @@ pub(super) struct ReadingLayout {
     pub(super) limit: Nanos,
 }
 
+/// A reading that is to be laid out.
+#[derive(Clone, Copy)]
+struct WantedReading<'a> {
+    options: &'a DbcOptions,
+    spec: &'a Spec,
+    number: usize,
+    keys: &'a ReadingKeys,
+}
+
+impl WantedReading<'_> {
+    /// Refuses keys of values that its kind, or the reading, has not.
+    fn check_names(&self) -> Result<(), String> {
+        let (keys, known) = (self.keys, self.keys.kind.fields());
+        let fields = keys.fields.keys().map(|name| ("fields", name));
+        let units = keys.units.keys().map(|name| ("units", name));
+        let holds = keys.hold_ms.keys().map(|name| ("hold_ms", name));
+        for (map, name) in fields.chain(units).chain(holds) {
+            if !known.contains(&name.as_str()) {
+                return Err(format!(
+                    "{map}.{name}: there is no such value; there is {}",
+                    known.join(", ")
+                ));
+            }
+            if !keys.fields.contains_key(name) {
+                return Err(format!("{map}.{name}: fields.{name} is missing"));
+            }
+        }
+        Ok(())
+    }
+
+    /// How long the last value called `name` is used.
+    fn hold(&self, name: &str) -> Result<Option<Nanos>, String> {
+        match self.keys.hold_ms.get(name) {
+            None => Ok(None),
+            Some(ms) if *ms > 0.0 && *ms <= 3.6e6 => Ok(Some(Nanos::from_seconds(ms * 1e-3))),
+            Some(ms) => Err(format!(
+                "hold_ms.{name} = {ms} must be above 0, at most an hour"
+            )),
+        }
+    }
+
+    /// The longest time from its first to its last frame, if its values come in several frames, of
+    /// `messages`.
+    fn pair_timeout(&self, messages: &[&Message]) -> Result<Nanos, String> {
+        match self.keys.pair_timeout_ms {
+            Some(ms) if ms > 0.0 && ms <= 1000.0 => Ok(Nanos::from_seconds(ms * 1e-3)),
+            Some(ms) => Err(format!(
+                "pair_timeout_ms = {ms} must be above 0, at most 1000"
+            )),
+            None => Err(format!(
+                "pair_timeout_ms is missing: its values come in several frames ({}), and the last \
+                 must come within this time after the first: less than half the period",
+                names(messages)
+            )),
+        }
+    }
+}
+
 /// Everything that is read.
 #[derive(Debug, Clone)]
 pub(super) struct DbcLayout {
@@ -269,9 +327,14 @@ impl DbcLayout {
             readings: Vec::new(),
         };
         for (number, keys) in options.reading.iter().enumerate() {
-            let place = format!("reading {number} ({})", keys.kind);
-            if let Err(problem) = this.add(options, spec, number, keys) {
-                return fail(format!("{place}: {problem}"));
+            let wanted = WantedReading {
+                options,
+                spec,
+                number,
+                keys,
+            };
+            if let Err(problem) = this.add(wanted) {
+                return fail(format!("reading {number} ({}): {problem}", keys.kind));
             }
         }
         let asks = [
@@ -311,84 +374,15 @@ impl DbcLayout {
         order.into_iter().map(|(_, number)| number).collect()
     }
 
-    fn add(
-        &mut self,
-        options: &DbcOptions,
-        spec: &Spec,
-        number: usize,
-        keys: &ReadingKeys,
-    ) -> Result<(), String> {
-        let (kind, known) = (keys.kind, keys.kind.fields());
-        let maps = [
-            keys.fields.keys().collect::<Vec<_>>(),
-            keys.units.keys().collect(),
-            keys.hold_ms.keys().collect(),
-        ];
-        for (map, names) in ["fields", "units", "hold_ms"].iter().zip(maps) {
-            for name in names {
-                if !known.contains(&name.as_str()) {
-                    return Err(format!(
-                        "{map}.{name}: there is no such value; there is {}",
-                        known.join(", ")
-                    ));
-                }
-                if *map != "fields" && !keys.fields.contains_key(name) {
-                    return Err(format!("{map}.{name}: fields.{name} is missing"));
-                }
-            }
-        }
-        let all = |kind| matches!(kind, Kind::Wrench | Kind::Gauges);
-        let first = keys.first.as_deref();
-        let mut opener = match first.map(|first| find_message(options, first)) {
-            Some(found) => Some(found.map_err(|e| format!("first = {first:?}: {e}"))?),
-            None => None,
-        };
-        let mut messages: Vec<&Message> = Vec::new();
-        for (index, name) in known.iter().enumerate() {
-            let Some(path) = keys.fields.get(*name) else {
-                if all(kind) {
-                    return Err(format!("fields.{name} is missing: a {kind} needs it"));
-                }
-                continue;
-            };
-            let at = |problem: String| format!("fields.{name} = {path:?}: {problem}");
-            let (message, signal) = find(options, path).map_err(at)?;
-            let unit = convert(signal, keys.units.get(*name), kind, index).map_err(at)?;
-            let hold = match keys.hold_ms.get(*name) {
-                None => None,
-                Some(ms) if *ms > 0.0 && *ms <= 3.6e6 => Some(Nanos::from_seconds(ms * 1e-3)),
-                Some(ms) => {
-                    return Err(format!(
-                        "hold_ms.{name} = {ms} must be above 0, at most an hour"
-                    ));
-                }
-            };
-            if hold.is_none() {
-                opener.get_or_insert(message);
-                if !messages.iter().any(|known| ptr::eq(*known, message)) {
-                    messages.push(message);
-                }
-            }
-            let role = SignalRole::Value {
-                index,
-                gain: signal.factor * unit.factor,
-                offset: signal.offset * unit.factor + unit.offset,
-                hold,
-                rides: false,
-            };
-            self.field(options, spec, number, (message, signal), role)
-                .map_err(at)?;
-        }
-        let Some(opener) = opener else {
-            return Err("it needs a value without hold_ms".into());
-        };
-        let names = || messages.iter().map(|message| name(message));
-        let names = || names().collect::<Vec<_>>().join(", ");
+    fn add(&mut self, wanted: WantedReading<'_>) -> Result<(), String> {
+        let WantedReading { number, keys, .. } = wanted;
+        wanted.check_names()?;
+        let (opener, messages) = self.add_values(wanted)?;
         if !messages.is_empty() && !messages.iter().any(|message| ptr::eq(*message, opener)) {
             return Err(format!(
                 "first = {:?} must be a message of its fields: {}",
                 name(opener),
-                names()
+                names(&messages)
             ));
         }
         for (key, path, role) in [
@@ -397,19 +391,18 @@ impl DbcLayout {
         ] {
             let Some(path) = path else { continue };
             let at = |problem: String| format!("{key} = {path:?}: {problem}");
-            let (message, signal) = find(options, path).map_err(at)?;
+            let (message, signal) = find(wanted.options, path).map_err(at)?;
             if role == SignalRole::Counter && !ptr::eq(message, opener) {
                 return Err(at(format!("it must be a signal of {}", name(opener))));
             }
             if matches!(signal.raw, Raw::Float32 | Raw::Float64) {
                 return Err(at("it must be an integer".into()));
             }
-            self.field(options, spec, number, (message, signal), role)
-                .map_err(at)?;
+            self.field(wanted, (message, signal), role).map_err(at)?;
         }
-        let (opener, _) = frames(options, spec, opener)?;
+        let (opener, _) = frames(wanted.options, wanted.spec, opener)?;
         let mut reading = ReadingLayout {
-            kind,
+            kind: keys.kind,
             needed: 0,
             opening: 0,
             limit: Nanos::MAX,
@@ -430,25 +423,57 @@ impl DbcLayout {
             return Err("it needs a value without hold_ms".into());
         }
         if frames > 1 {
-            reading.limit = match keys.pair_timeout_ms {
-                Some(ms) if ms > 0.0 && ms <= 1000.0 => Nanos::from_seconds(ms * 1e-3),
-                Some(ms) => {
-                    return Err(format!(
-                        "pair_timeout_ms = {ms} must be above 0, at most 1000"
-                    ));
-                }
-                None => {
-                    return Err(format!(
-                        "pair_timeout_ms is missing: its values come in several frames ({}), and \
-                         the last must come within this time after the first: less than half the \
-                         period",
-                        names()
-                    ));
-                }
-            };
+            reading.limit = wanted.pair_timeout(&messages)?;
         }
         self.readings.push(reading);
         Ok(())
+    }
+
+    /// Adds the values of a reading; returns the message that opens it, and all those that have a
+    /// value that each reading needs.
+    fn add_values<'a>(
+        &mut self,
+        wanted: WantedReading<'a>,
+    ) -> Result<(&'a Message, Vec<&'a Message>), String> {
+        let WantedReading { options, keys, .. } = wanted;
+        let kind = keys.kind;
+        let mut opener = match &keys.first {
+            Some(first) => {
+                Some(find_message(options, first).map_err(|e| format!("first = {first:?}: {e}"))?)
+            }
+            None => None,
+        };
+        let mut messages: Vec<&Message> = Vec::new();
+        for (index, name) in kind.fields().iter().enumerate() {
+            let Some(path) = keys.fields.get(*name) else {
+                if matches!(kind, Kind::Wrench | Kind::Gauges) {
+                    return Err(format!("fields.{name} is missing: a {kind} needs it"));
+                }
+                continue;
+            };
+            let at = |problem: String| format!("fields.{name} = {path:?}: {problem}");
+            let (message, signal) = find(options, path).map_err(at)?;
+            let unit = convert(signal, keys.units.get(*name), kind, index).map_err(at)?;
+            let hold = wanted.hold(name)?;
+            if hold.is_none() {
+                opener.get_or_insert(message);
+                if !messages.iter().any(|known| ptr::eq(*known, message)) {
+                    messages.push(message);
+                }
+            }
+            let role = SignalRole::Value {
+                index,
+                gain: signal.factor * unit.factor,
+                offset: signal.offset * unit.factor + unit.offset,
+                hold,
+                rides: false,
+            };
+            self.field(wanted, (message, signal), role).map_err(at)?;
+        }
+        match opener {
+            Some(opener) => Ok((opener, messages)),
+            None => Err("it needs a value without hold_ms".into()),
+        }
     }
 
     /// Refuses a frame that may complete more readings than one result holds.
@@ -480,13 +505,12 @@ impl DbcLayout {
     /// Adds a signal to the part that has the same frames.
     fn field(
         &mut self,
-        options: &DbcOptions,
-        spec: &Spec,
-        reading: usize,
+        wanted: WantedReading<'_>,
         (message, signal): (&Message, &Signal),
         role: SignalRole,
     ) -> Result<(), String> {
-        let (frames, j1939) = frames(options, spec, message)?;
+        let reading = wanted.number;
+        let (frames, j1939) = frames(wanted.options, wanted.spec, message)?;
         let bits = signal.bits.clone()?;
         let conditions = conditions(message, signal)?;
         let used = core::iter::once(bits).chain(conditions.iter().map(|c| c.bits));
@@ -620,6 +644,12 @@ fn frames(options: &DbcOptions, spec: &Spec, message: &Message) -> Result<(Claim
 /// The name of a message as its file's readers see it.
 fn name(message: &Message) -> &str {
     message.long_name.as_deref().unwrap_or(&message.name)
+}
+
+/// The names of messages, for a person.
+fn names(messages: &[&Message]) -> String {
+    let names: Vec<&str> = messages.iter().map(|message| name(message)).collect();
+    names.join(", ")
 }
 
 /// The identifier of a message, for a person.

@@ -2,7 +2,7 @@
 
 use super::{ADDRESSES, BROADCAST, board, class, command, to_board, to_host};
 use crate::recognise::{Evidence, Finding, IdUse, Key, Stream, Traffic, log2};
-use crate::{Format, Frame};
+use crate::{Format, Frame, Id};
 use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
@@ -24,90 +24,102 @@ fn told(
     address: u8,
     types: &[u8],
 ) -> Result<Option<BoardIdentity>, ()> {
-    let mut told = None;
+    let mut told = discovered(evidence, address, types);
+    for (class, command) in [
+        (class::POLLING_ANALOG, command::GET_FIRMWARE_VERSION),
+        (class::POLLING_MOTOR, command::MOTOR_GET_FIRMWARE_VERSION),
+    ] {
+        evidence.belongs(to_board(class, address));
+        let version = version(evidence, to_host(class, address), command, types);
+        told = told.or(version);
+    }
+    match told {
+        Some(told) if !types.contains(&told.board) => Err(()),
+        told => Ok(told),
+    }
+}
+
+/// What board `address` has answered to who asked all boards who they are, and for its text.
+fn discovered(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Option<BoardIdentity> {
     let id = to_host(class::MANAGEMENT, address);
     // Commands of the bootloader are below 10.
     let rule = |frame: &Frame| {
         let first = frame.data().first().copied();
         first.is_some_and(|c| c == command::DISCOVER || c < 0x10)
     };
-    if let Some(stream) = evidence.sends_as(IdUse::Tells, id, rule) {
-        let mut texts: [Option<[u8; 4]>; 8] = [None; 8];
-        let (mut frames, mut answers) = (0, 0_usize);
-        for frame in stream.kept() {
-            frames += 1;
-            match *frame.data() {
-                [command::DISCOVER, board, major, minor, ref build @ ..] if build.len() < 2 => {
-                    answers += 1;
-                    told = Some(BoardIdentity {
-                        board,
-                        version: [major, minor],
-                        build: build.first().copied(),
-                        info: String::new(),
-                    });
+    let stream = evidence.sends_as(IdUse::Tells, id, rule)?;
+    let mut told = None;
+    let mut texts: [Option<[u8; 4]>; 8] = [None; 8];
+    let (mut frames, mut answers) = (0, 0_usize);
+    for frame in stream.kept() {
+        frames += 1;
+        match *frame.data() {
+            [command::DISCOVER, board, major, minor, ref build @ ..] if build.len() < 2 => {
+                answers += 1;
+                told = Some(BoardIdentity {
+                    board,
+                    version: [major, minor],
+                    build: build.first().copied(),
+                    info: String::new(),
+                });
+            }
+            [command::GET_ADDITIONAL_INFO, number, a, b, c, d] => {
+                if let Some(text) = texts.get_mut(usize::from(number)) {
+                    *text = Some([a, b, c, d]);
                 }
-                [command::GET_ADDITIONAL_INFO, number, a, b, c, d] => {
-                    if let Some(text) = texts.get_mut(usize::from(number)) {
-                        *text = Some([a, b, c, d]);
-                    }
-                }
-                _ => {}
             }
-        }
-        if let Some(told) = &mut told {
-            // A type of 256; among many frames one is like it by chance.
-            evidence.add(8.0 - log2(types.len()) - log2(frames / answers.max(1)));
-            if texts.iter().all(Option::is_some) {
-                // A command, and eight numbers in their order.
-                evidence.add(16.0);
-                let bytes = texts.iter().flatten().flatten();
-                let text = bytes
-                    .take_while(|byte| **byte != 0)
-                    .map(|byte| char::from(*byte));
-                told.info = text.filter(|letter| !letter.is_control()).collect();
-            }
+            _ => {}
         }
     }
-    // Somebody else has asked for its version.
-    for (class, version) in [
-        (class::POLLING_ANALOG, command::GET_FIRMWARE_VERSION),
-        (class::POLLING_MOTOR, command::MOTOR_GET_FIRMWARE_VERSION),
-    ] {
-        evidence.belongs(to_board(class, address));
-        let id = to_host(class, address);
-        let stream = evidence.traffic.stream(id).into_iter();
-        let answers = stream.flat_map(Stream::kept);
-        let answers: Vec<&Frame> = answers.filter(|f| f.format == Format::Classic).collect();
-        let versions = answers.iter().filter_map(|frame| match *frame.data() {
-            [command, board, major, minor, build, _, _, fits @ (0 | 1)]
-                if command == version && board::NAMES.iter().any(|(known, _)| *known == board) =>
-            {
-                Some((board, [major, minor], build, fits))
-            }
-            _ => None,
-        });
-        let count = versions.clone().count();
-        let Some((board, version, build, fits)) = versions.clone().next() else {
-            continue;
-        };
-        // Among many frames one is like it by chance.
-        if count * 32 >= answers.len() {
-            // A command and a type of 256 each, and a byte that is 1; 0 is in many frames.
-            let fits = if fits == 1 { 7.0 } else { 1.0 };
-            let bits = 8.0 + (8.0 - log2(types.len())) + fits;
-            evidence.tells(id, bits - log2(answers.len() / count));
-            told.get_or_insert(BoardIdentity {
-                board,
-                version,
-                build: Some(build),
-                info: String::new(),
-            });
+    let mut told = told?;
+    // A type of 256; among many frames one is like it by chance.
+    evidence.add(8.0 - log2(types.len()) - log2(frames / answers.max(1)));
+    if texts.iter().all(Option::is_some) {
+        // A command, and eight numbers in their order.
+        evidence.add(16.0);
+        let bytes = texts.iter().flatten().flatten();
+        let text = bytes
+            .take_while(|byte| **byte != 0)
+            .map(|byte| char::from(*byte));
+        told.info = text.filter(|letter| !letter.is_control()).collect();
+    }
+    Some(told)
+}
+
+/// What a board has answered with identifier `id` to who asked for its version with `command`.
+fn version(
+    evidence: &mut Evidence<'_>,
+    id: Id,
+    command: u8,
+    types: &[u8],
+) -> Option<BoardIdentity> {
+    let stream = evidence.traffic.stream(id)?;
+    let is_classic = |frame: &&Frame| frame.format == Format::Classic;
+    let frames = stream.kept().filter(is_classic).count();
+    let mut versions = (stream.kept().filter(is_classic)).filter_map(|frame| match *frame.data() {
+        [c, board, major, minor, build, _, _, fits @ (0 | 1)]
+            if c == command && board::NAMES.iter().any(|(known, _)| *known == board) =>
+        {
+            Some((board, [major, minor, build], fits))
         }
+        _ => None,
+    });
+    let (board, [major, minor, build], fits) = versions.next()?;
+    let count = 1 + versions.count();
+    // Among many frames one is like it by chance.
+    if count * 32 < frames {
+        return None;
     }
-    match told {
-        Some(told) if !types.contains(&told.board) => Err(()),
-        told => Ok(told),
-    }
+    // A command and a type of 256 each, and a byte that is 1; 0 is in many frames.
+    let fits = if fits == 1 { 7.0 } else { 1.0 };
+    let bits = 8.0 + (8.0 - log2(types.len())) + fits;
+    evidence.tells(id, bits - log2(frames / count));
+    Some(BoardIdentity {
+        board,
+        version: [major, minor],
+        build: Some(build),
+        info: String::new(),
+    })
 }
 
 /// The boards of driver `driver`. `types` are those that it reads, of which some (`maybe`) may lack

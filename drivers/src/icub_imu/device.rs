@@ -5,7 +5,7 @@ use super::frames::{
     ACCELERATION_LSB, FIELD_LSB, ImuQuantity, Legacy, QUATERNION_LSB, RATE_LSB, kind, sensor,
 };
 use super::options::{IcubImuOptions, ImuKeys};
-use crate::bringup::Bringup;
+use crate::bringup::{Bringup, Timing};
 use crate::configure::{Configure, Setting};
 use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
@@ -134,33 +134,28 @@ impl ImuDevice {
         if self.not_calibrated {
             quality |= Quality::NOT_CALIBRATED;
         }
-        let counter = u32::from(self.sequence.unwrap_or(0));
-        self.give(imu, acquired, stamp, counter, quality, frame, link, out);
+        let output = Output {
+            acquired,
+            stamp,
+            device_counter: u32::from(self.sequence.unwrap_or(0)),
+            ..Output::new(0, frame, quality, Reading::Imu(imu))
+        };
+        self.give(output, frame, link, out);
     }
 
-    #[allow(clippy::too_many_arguments)]
+    /// Adds a reading; the first one after something was lost is marked.
     fn give(
         &mut self,
-        imu: Imu,
-        acquired: Nanos,
-        stamp: StampKind,
-        device_counter: u32,
-        mut quality: Quality,
+        mut output: Output,
         frame: &Frame,
         link: &mut Supervision<Configure>,
         out: &mut Decoded,
     ) {
-        if core::mem::take(&mut self.gap) | link.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
+        if core::mem::take(&mut self.gap) {
+            output.quality |= Quality::GAP_BEFORE;
         }
         self.seen = true;
-        let output = Output {
-            acquired,
-            stamp,
-            device_counter,
-            ..Output::new(0, frame, quality, Reading::Imu(imu))
-        };
-        out.push(output, frame.id);
+        link.give(output, frame, out);
     }
 
     fn triple(
@@ -289,7 +284,12 @@ impl ImuDevice {
             set(true, rate);
             (acquired, stamp) = (t, kind);
         }
-        self.give(imu, acquired, stamp, 0, Quality::GOOD, frame, link, out);
+        let output = Output {
+            acquired,
+            stamp,
+            ..Output::new(0, frame, Quality::GOOD, Reading::Imu(imu))
+        };
+        self.give(output, frame, link, out);
     }
 }
 
@@ -349,7 +349,7 @@ impl Driver for IcubImuOptions {
         };
         let period = Nanos::from_millis(i64::from(plan.period_ms));
         // Legacy boards have no such configuration.
-        let configure = Configure::new(spec, (!is_legacy).then_some(setting), icub::TIMING);
+        let configure = Configure::new(spec, (!is_legacy).then_some(setting), Timing::USUAL);
         let this = ImuDevice {
             acquisition: Acquisition::NONE,
             sequence: None,
@@ -413,7 +413,7 @@ impl Family for ImuDevice {
     fn on_sent(&mut self, _frame: &Frame, outcome: Result<Nanos, NotSent>) {
         // It takes the command within the time of an answer, and sends a period later.
         if let Ok(t) = outcome {
-            self.may_jump = t + icub::TIMING.answer_timeout + self.together + self.together;
+            self.may_jump = t + Timing::USUAL.answer_timeout + self.together + self.together;
         }
     }
 

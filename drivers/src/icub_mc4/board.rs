@@ -2,7 +2,7 @@
 
 use super::{
     CALIBRATION, FRAME, IcubMc4Options, JOINTS, POSITION_CONTROL, StepSizes, fault, kind,
-    quality_of,
+    status_quality,
 };
 use crate::icub::{self, class};
 use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, bytes};
@@ -104,7 +104,7 @@ impl Board for Mc4Board {
         let velocity = Some(state.velocity).filter(|velocity| velocity.is_finite());
         joint.steps = velocity.map(|v| bytes::quantise_i16(v, joint.scale.velocity));
         let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT | Quality::NOT_CALIBRATED;
-        let known = quality_of(u32::from(joint.faults), u32::from(joint.mode));
+        let known = status_quality(u32::from(joint.faults), u32::from(joint.mode));
         if known.0 != quality.0 & told.0 {
             let set = |flag, bit: u32| if quality.contains(flag) { bit as u8 } else { 0 };
             joint.faults = set(Quality::DEVICE_FAULT, fault::ABSOLUTE_ENCODER)

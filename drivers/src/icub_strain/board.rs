@@ -7,7 +7,7 @@ use super::options::{IcubStrainOptions, StrainStream};
 use crate::icub::{self, class, command};
 use crate::{Board, EncodeError, Frame, Frames, Mode, Simulate, Spec, SpecError, board, bytes};
 use alloc::boxed::Box;
-use proprio_topics::{Nanos, Quality, Reading, Saturation, Temperature};
+use proprio_topics::{Nanos, Quality, Reading, Saturation, Temperature, Wrench};
 
 /// Default full scales: the iCub's usual sensor \[N, Nm\]. A simulated board reports them on
 /// request.
@@ -49,6 +49,68 @@ impl StrainBoard {
             let id = icub::stream(class::PERIODIC_ANALOG, self.address, kind);
             let _ = out.try_push(StrainHalf { counts, saturation }.frame(id));
         }
+    }
+
+    fn encode_wrench(
+        &mut self,
+        wrench: &Wrench,
+        mut quality: Quality,
+        out: &mut Frames,
+    ) -> Result<(), EncodeError> {
+        let values = board::axes(wrench)?;
+        if !self.scale_known {
+            return Err(EncodeError::NoFullScale);
+        }
+        let mut counts = [ZERO; 6];
+        for (axis, ((count, value), full_scale)) in
+            (0..).zip(counts.iter_mut().zip(values).zip(self.full_scale))
+        {
+            // With a full scale of zero (a corrupt memory) a board sends zero for any load.
+            let per_step = if full_scale > 0.0 {
+                full_scale / STEPS
+            } else {
+                f64::INFINITY
+            };
+            let steps = bytes::quantise(value, per_step, i64::from(i32::MIN), i64::from(i32::MAX))
+                + i64::from(ZERO);
+            *count = u16::try_from(steps).unwrap_or_else(|_| {
+                let high = steps > 0;
+                quality = quality.with_saturation(
+                    axis,
+                    if high {
+                        Saturation::High
+                    } else {
+                        Saturation::Low
+                    },
+                );
+                if high { u16::MAX } else { 0 }
+            });
+        }
+        let raw = counts;
+        self.gauges = raw;
+        for (count, tare) in counts.iter_mut().zip(self.tare) {
+            let sum = signed(i32::from(*count) - i32::from(ZERO) + i32::from(tare));
+            // Back to the code of the stream: the sign bit is inverted.
+            *count = sum.cast_unsigned() ^ ZERO;
+        }
+        if !quality.contains(Quality::SATURATED) {
+            self.last_good = Some(counts);
+        } else if !quality.contains(Quality::FROZEN) {
+            // (A reading with FROZEN is from a recording: it already is the last good
+            // vector.)
+            counts = self.last_good.unwrap_or(counts);
+        }
+        let saturation = saturation_bytes(quality);
+        // A board that was not started encodes a recording, in which a wrench is a
+        // calibrated reading.
+        let stream = self.stream.unwrap_or_default();
+        if stream != StrainStream::Uncalibrated {
+            self.send(kind::FORCE, counts, saturation, out);
+        }
+        if stream != StrainStream::Calibrated {
+            self.send(kind::RAW_FORCE, raw, saturation, out);
+        }
+        Ok(())
     }
 }
 
@@ -160,63 +222,7 @@ impl Board for StrainBoard {
     ) -> Result<(), EncodeError> {
         board::only_output(output)?;
         match reading {
-            Reading::Wrench(wrench) => {
-                let values = board::axes(wrench)?;
-                if !self.scale_known {
-                    return Err(EncodeError::NoFullScale);
-                }
-                let mut quality = quality;
-                let mut counts = [ZERO; 6];
-                for (axis, ((count, value), full_scale)) in
-                    (0..).zip(counts.iter_mut().zip(values).zip(self.full_scale))
-                {
-                    // With a full scale of zero (a corrupt memory) a board sends zero for any load.
-                    let per_step = if full_scale > 0.0 {
-                        full_scale / STEPS
-                    } else {
-                        f64::INFINITY
-                    };
-                    let steps =
-                        bytes::quantise(value, per_step, i64::from(i32::MIN), i64::from(i32::MAX))
-                            + i64::from(ZERO);
-                    *count = u16::try_from(steps).unwrap_or_else(|_| {
-                        let high = steps > 0;
-                        quality = quality.with_saturation(
-                            axis,
-                            if high {
-                                Saturation::High
-                            } else {
-                                Saturation::Low
-                            },
-                        );
-                        if high { u16::MAX } else { 0 }
-                    });
-                }
-                let raw = counts;
-                self.gauges = raw;
-                for (count, tare) in counts.iter_mut().zip(self.tare) {
-                    let sum = signed(i32::from(*count) - i32::from(ZERO) + i32::from(tare));
-                    // Back to the code of the stream: the sign bit is inverted.
-                    *count = sum.cast_unsigned() ^ ZERO;
-                }
-                if !quality.contains(Quality::SATURATED) {
-                    self.last_good = Some(counts);
-                } else if !quality.contains(Quality::FROZEN) {
-                    // (A reading with FROZEN is from a recording: it already is the last good
-                    // vector.)
-                    counts = self.last_good.unwrap_or(counts);
-                }
-                let saturation = saturation_bytes(quality);
-                // A board that was not started encodes a recording, in which a wrench is a
-                // calibrated reading.
-                let stream = self.stream.unwrap_or_default();
-                if stream != StrainStream::Uncalibrated {
-                    self.send(kind::FORCE, counts, saturation, out);
-                }
-                if stream != StrainStream::Calibrated {
-                    self.send(kind::RAW_FORCE, raw, saturation, out);
-                }
-            }
+            Reading::Wrench(wrench) => self.encode_wrench(wrench, quality, out)?,
             Reading::Gauges(gauges) => {
                 #[allow(clippy::cast_sign_loss, clippy::cast_possible_truncation)]
                 // limited to 16 bits

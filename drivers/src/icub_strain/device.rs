@@ -4,7 +4,7 @@
 use super::exchange::{Exchange, Told};
 use super::frames::{CELSIUS_PER_LSB, STEPS, StrainHalf, ZERO, kind};
 use super::options::{IcubStrainOptions, StrainStream};
-use crate::bringup::{Ask, Attempts, Bringup, Inquiry};
+use crate::bringup::{Ask, Attempts, Bringup, Inquiry, Timing};
 use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
@@ -47,7 +47,7 @@ impl StrainScales {
             refusal: None,
             address,
             axis: 0,
-            attempts: Attempts::new(icub::TIMING),
+            attempts: Attempts::new(Timing::USUAL),
             asked: 0,
             open: [0; 6],
         }
@@ -171,6 +171,16 @@ struct Whole {
     quality: Quality,
 }
 
+impl Whole {
+    fn output(&self, quality: Quality, reading: Reading, frame: &Frame) -> Output {
+        Output {
+            acquired: self.acquired,
+            stamp: self.stamp,
+            ..Output::new(0, frame, quality, reading)
+        }
+    }
+}
+
 /// One of the two streams: its halves, and whether a reading was lost since the last one.
 #[derive(Debug)]
 struct Pair {
@@ -242,32 +252,6 @@ pub(super) struct Strain {
 }
 
 impl Strain {
-    /// Outputs a reading from its two frames.
-    fn give(
-        &mut self,
-        whole: &Whole,
-        quality: Quality,
-        reading: Reading,
-        frame: &Frame,
-        link: &mut Supervision<StrainScales>,
-        out: &mut Decoded,
-    ) {
-        if quality.contains(Quality::SATURATED) {
-            out.fault(Counter::Saturated, 1, frame.id);
-        }
-        let gap = if link.bringup.reading(frame.t) {
-            Quality::GAP_BEFORE
-        } else {
-            Quality::GOOD
-        };
-        let output = Output {
-            acquired: whole.acquired,
-            stamp: whole.stamp,
-            ..Output::new(0, frame, quality | gap, reading)
-        };
-        out.push(output, frame.id);
-    }
-
     fn wrench(
         &mut self,
         second: bool,
@@ -308,7 +292,7 @@ impl Strain {
             Quality::GOOD
         };
         let quality = whole.quality | frozen | step | self.calibrated.take_gap();
-        self.give(&whole, quality, reading, frame, link, out);
+        link.give(whole.output(quality, reading, frame), frame, out);
     }
 
     fn gauges(
@@ -327,7 +311,7 @@ impl Strain {
             counts: [a, b, c, d, e, f].map(i32::from),
         });
         let quality = whole.quality | self.raw.take_gap();
-        self.give(&whole, quality, reading, frame, link, out);
+        link.give(whole.output(quality, reading, frame), frame, out);
     }
 }
 

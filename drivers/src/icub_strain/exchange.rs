@@ -1,7 +1,7 @@
 //! The host's side of what an operator asks of a board that streams: a tare, which is commanded and
 //! then read back, or the board's calibration, which is only read.
 
-use crate::bringup::Attempts;
+use crate::bringup::{Attempts, Timing};
 use crate::icub::{self, class, command};
 use crate::{COMMAND_TIME, Command, CommandFailed, Decoded, Frame, Mode, NotSent};
 use proprio_topics::{Counter, Nanos};
@@ -52,7 +52,7 @@ impl Exchange {
             what: Command::Tare,
             step: ExchangeStep::Idle,
             limit: Nanos::MIN,
-            attempts: Attempts::new(icub::TIMING),
+            attempts: Attempts::new(Timing::USUAL),
             under_way: None,
             open: [0; ALL],
             told: [0; ALL],

@@ -94,8 +94,7 @@ impl Jr3 {
     ) {
         self.joined = true;
         if self.waiting.replace((frame.t, frame.stamp, half)).is_some() {
-            link.bringup.lost();
-            out.fault(Counter::Unpaired, 1, frame.id);
+            link.lost(Counter::Unpaired, 1, frame, out);
         }
     }
 
@@ -109,8 +108,7 @@ impl Jr3 {
         let force = (self.waiting).take_if(|(_, _, force)| force.counter == half.counter);
         let Some((acquired, stamp, force)) = force else {
             if self.joined {
-                link.bringup.lost();
-                out.fault(Counter::Unpaired, 1, frame.id);
+                link.lost(Counter::Unpaired, 1, frame, out);
             }
             return;
         };
@@ -120,10 +118,7 @@ impl Jr3 {
                 0 => quality |= Quality::FROZEN,
                 samples => {
                     let lost = self.periods(samples).saturating_sub(1);
-                    if lost > 0 {
-                        link.bringup.lost();
-                        out.fault(Counter::Lost, lost, frame.id);
-                    }
+                    link.lost(Counter::Lost, lost, frame, out);
                 }
             }
         }
@@ -140,12 +135,6 @@ impl Jr3 {
             *value *= f64::from(count);
             quality = quality.with_saturation(axis, at_end(count, i16::MIN, i16::MAX));
         }
-        if quality.contains(Quality::SATURATED) {
-            out.fault(Counter::Saturated, 1, frame.id);
-        }
-        if link.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
-        }
         quality |= self.zero.mark(frame.t);
         let [fx, fy, fz, tx, ty, tz] = values;
         let (force, torque) = ([fx, fy, fz], [tx, ty, tz]);
@@ -155,7 +144,7 @@ impl Jr3 {
             device_counter: u32::from(half.counter),
             ..Output::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        out.push(output, frame.id);
+        link.give(output, frame, out);
     }
 
     /// The number of periods in which the sensor takes `samples`, to the nearest.

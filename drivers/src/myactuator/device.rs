@@ -161,12 +161,9 @@ impl Family for MyactuatorMotor {
         if !is_motion && frame.id != self.keys.answers() {
             return;
         }
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = bytes::payload_of(LENGTH, frame, out) else {
             return;
         };
-        if data.len() != LENGTH {
-            return out.fault(Counter::Length, 1, frame.id);
-        }
         if is_motion {
             return self.motion(data, frame, link, out);
         }

@@ -1,6 +1,7 @@
 //! The keys of a motor in gateway.toml, for both sides of the driver.
 
 use super::frames::{ANSWERS, COMMANDS, ENCODER_ERROR, MOTION, MyactuatorProtocol};
+use crate::family::quality_of;
 use crate::keys::{above_zero, address, duration};
 use crate::mit::Scale;
 use crate::{Id, Spec, SpecError};
@@ -179,13 +180,6 @@ impl MyactuatorKeys {
 
     /// The quality of readings with these errors.
     pub(super) fn quality(&self, errors: u16) -> Quality {
-        let mut quality = Quality::GOOD;
-        if errors & self.encoder_errors() != 0 {
-            quality |= Quality::DEVICE_FAULT;
-        }
-        if errors & !self.encoder_errors() != 0 {
-            quality |= Quality::DRIVE_FAULT;
-        }
-        quality
+        quality_of(errors.into(), self.encoder_errors().into())
     }
 }

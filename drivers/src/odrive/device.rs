@@ -40,8 +40,7 @@ impl OdriveAxis {
     ) {
         let (position, velocity) = (float(data, 0) * TAU, float(data, 1) * TAU);
         if !position.is_finite() {
-            link.bringup.lost();
-            return out.fault(Counter::Value, 1, frame.id);
+            return link.lost(Counter::Value, 1, frame, out);
         }
         let current = self.current.at(frame, self.keys.hold);
         let torque = match self.keys.torque_constant {
@@ -127,12 +126,9 @@ impl Family for OdriveAxis {
         if is_request(frame) {
             return;
         }
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = bytes::payload_of(usize::from(LENGTH), frame, out) else {
             return;
         };
-        if data.len() != usize::from(LENGTH) {
-            return out.fault(Counter::Length, 1, frame.id);
-        }
         match command {
             command::ESTIMATES => self.estimates(data, frame, link, out),
             command::IQ => self.current = HeldValue::new(frame, float(data, 1)),

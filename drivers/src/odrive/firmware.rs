@@ -1,7 +1,7 @@
 //! The two generations of firmware: their messages and their axis errors.
 
 use super::frames::command::{ESTIMATES, HEARTBEAT, IQ, TEMPERATURE, TORQUES};
-use core::fmt;
+use crate::family::quality_of;
 use proprio_topics::Quality;
 use serde::Deserialize;
 
@@ -18,55 +18,6 @@ pub(super) mod error {
     /// What the flags of firmware 0.5 say: bit 0 of bytes 5, 6 and 7.
     pub(in crate::odrive) const FLAGS: [u32; 3] = [MOTOR_FAILED, ENCODER_FAILED, CONTROLLER_FAILED];
 }
-
-/// The axis errors of firmware 0.6 by bit, in the maker's words.
-const ERRORS_0_6: &[(u32, &str)] = &[
-    (0, "initializing"),
-    (1, "system level"),
-    (2, "timing error"),
-    (3, "missing estimate"),
-    (4, "bad config"),
-    (5, "DRV fault"),
-    (6, "missing input"),
-    (8, "DC bus over voltage"),
-    (9, "DC bus under voltage"),
-    (10, "DC bus over current"),
-    (11, "DC bus over regen current"),
-    (12, "current limit violation"),
-    (13, "motor over temp"),
-    (14, "inverter over temp"),
-    (15, "velocity limit violation"),
-    (16, "position limit violation"),
-    (17, "requested current too high"),
-    (24, "watchdog timer expired"),
-    (25, "estop requested"),
-    (26, "spinout detected"),
-    (27, "brake resistor disarmed"),
-    (28, "thermistor disconnected"),
-    (30, "calibration error"),
-];
-
-/// Those of all versions of firmware 0.5.
-const ERRORS_0_5: &[(u32, &str)] = &[
-    (0, "invalid state"),
-    (1, "DC bus under voltage"),
-    (2, "DC bus over voltage"),
-    (3, "current measurement timeout"),
-    (4, "brake resistor disarmed"),
-    (5, "motor disarmed"),
-    (6, "motor failed"),
-    (7, "sensorless estimator failed"),
-    (8, "encoder failed"),
-    (9, "controller failed"),
-    (10, "pos ctrl during sensorless"),
-    (11, "watchdog timer expired"),
-    (12, "min endstop pressed"),
-    (13, "max endstop pressed"),
-    (14, "estop requested"),
-    (17, "homing without endstop"),
-    (18, "over temp"),
-    (19, "unknown position"),
-];
 
 /// The generation of an ODrive's firmware.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
@@ -108,46 +59,6 @@ impl Firmware {
 
     /// The quality of readings under these axis errors.
     pub(super) fn quality(self, errors: u32) -> Quality {
-        let mut quality = Quality::GOOD;
-        if errors & self.encoder_errors() != 0 {
-            quality |= Quality::DEVICE_FAULT;
-        }
-        if errors & !self.encoder_errors() != 0 {
-            quality |= Quality::DRIVE_FAULT;
-        }
-        quality
-    }
-}
-
-/// The axis errors `faults` (`Actuator::faults`) of an ODrive in words, for a log: "DRV
-/// fault, bit 7" where bit 7 has no name.
-#[must_use]
-pub fn error_words(firmware: Firmware, faults: u32) -> impl fmt::Display {
-    ErrorWords { firmware, faults }
-}
-
-struct ErrorWords {
-    firmware: Firmware,
-    faults: u32,
-}
-
-impl fmt::Display for ErrorWords {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let names = match self.firmware {
-            Firmware::V0_6 => ERRORS_0_6,
-            Firmware::V0_5 => ERRORS_0_5,
-        };
-        if self.faults == 0 {
-            return f.write_str("no error");
-        }
-        let mut separator = "";
-        for bit in (0..32).filter(|bit| self.faults >> bit & 1 != 0) {
-            f.write_str(core::mem::replace(&mut separator, ", "))?;
-            match names.iter().find(|(named, _)| *named == bit) {
-                Some((_, name)) => f.write_str(name)?,
-                None => write!(f, "bit {bit}")?,
-            }
-        }
-        Ok(())
+        quality_of(errors, self.encoder_errors())
     }
 }

@@ -17,15 +17,12 @@ use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Saturation};
 
 /// How long the host waits for these sensors, which answer nothing.
 const TIMING: Timing = Timing {
-    power_on_silence: Nanos::ZERO,
     answer_timeout: Nanos::from_millis(100),
     attempts: 5,
-    slow_attempt: Nanos::from_millis(500),
-    answer_counts: Nanos::from_millis(100),
     // A period of half a second, and time to claim an address.
     start: Nanos::from_millis(1000),
     start_most: Nanos::from_millis(2000),
-    send_within: Nanos::from_millis(100),
+    ..Timing::LISTENED
 };
 
 /// What the messages of a period hold.
@@ -153,11 +150,9 @@ impl Family for OpenImuSensor {
         let Some((position, &quantity)) = found.filter(|_| source == self.plan.address) else {
             return;
         };
-        let Some(data) = bytes::payload(frame, out) else {
+        let data = bytes::payload_of(8, frame, out);
+        let Some(data) = data.and_then(|data| data.first_chunk::<8>()) else {
             return;
-        };
-        let Ok(data) = <&[u8; 8]>::try_from(data) else {
-            return out.fault(Counter::Length, 1, frame.id);
         };
         let Some(part) = OpenImuSample::of(&self.plan, quantity, data) else {
             return out.fault(Counter::Value, 1, frame.id);
@@ -165,29 +160,15 @@ impl Family for OpenImuSensor {
         let mut dropped = 0;
         let add = |sample: &mut OpenImuSample| sample.add(quantity, part);
         let whole = (self.group).push(position, frame, OpenImuSample::EMPTY, add, &mut dropped);
-        if dropped > 0 {
-            link.bringup.lost();
-            out.fault(Counter::Unpaired, dropped, frame.id);
-        }
+        link.lost(Counter::Unpaired, dropped, frame, out);
         let Some(whole) = whole else { return };
-        let OpenImuSample { imu, mut quality } = whole.content;
-        for (flag, counter) in [
-            (Quality::DEVICE_FAULT, Counter::DeviceFault),
-            (Quality::SATURATED, Counter::Saturated),
-        ] {
-            if quality.contains(flag) {
-                out.fault(counter, 1, frame.id);
-            }
-        }
-        if link.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
-        }
+        let OpenImuSample { imu, quality } = whole.content;
         let output = Output {
             acquired: whole.acquired,
             stamp: whole.stamp,
             ..Output::new(0, frame, quality, Reading::Imu(imu))
         };
-        out.push(output, frame.id);
+        link.give(output, frame, out);
     }
 
     fn reset(&mut self) {

@@ -107,15 +107,8 @@ impl Opto {
                 quality = wrench::overloaded(quality, axis, value);
             }
         }
-        if quality.contains(Quality::SATURATED) {
-            out.fault(Counter::Saturated, 1, frame.id);
-        }
         if status & ERRORS != 0 {
             quality |= Quality::DEVICE_FAULT;
-            out.fault(Counter::DeviceFault, 1, frame.id);
-        }
-        if link.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
         }
         quality |= self.zero.mark(frame.t);
         let torque = [f64::NAN; 3];
@@ -126,7 +119,7 @@ impl Opto {
             device_counter: u32::from(counter),
             ..Output::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        out.push(output, frame.id);
+        link.give(output, frame, out);
     }
 }
 

@@ -9,7 +9,7 @@ use super::background::{NEAR, common, identifier};
 use super::traffic::Traffic;
 use super::{Certainty, Explained, Finding, IdUse, PRIOR, probability};
 use crate::Id;
-use alloc::collections::BTreeSet;
+use alloc::collections::{BTreeMap, BTreeSet};
 use alloc::vec::Vec;
 
 /// What two senders on one identifier count.
@@ -102,48 +102,52 @@ impl OpenFinding {
         }
         bits
     }
+
+    /// The bits for it, where `sure` are there: as far as nothing that contests it is there.
+    fn odds(&self, seen: &Traffic, sure: &[Finding]) -> f64 {
+        let alone = self.bits(seen, sure, true);
+        let taken = 1.0 - self.free;
+        if taken <= 0.0 {
+            return alone;
+        }
+        // What contests it is not there, or it is there all the same.
+        let beside = self.bits(seen, sure, false);
+        let yes = self.free * probability(alone) + taken * probability(beside);
+        let no = self.free * probability(-alone) + taken * probability(-beside);
+        libm::log2(yes / no)
+    }
+}
+
+/// `findings`, none of them judged.
+fn unjudged(seen: &Traffic, findings: Vec<Finding>) -> Vec<OpenFinding> {
+    let mut families: BTreeMap<&str, BTreeSet<Id>> = BTreeMap::new();
+    for finding in &findings {
+        let family = families.entry(finding.driver).or_default();
+        family.extend(finding.explains.iter().map(|explained| explained.id));
+    }
+    let open = findings.into_iter().map(|finding| {
+        let family = families.get(finding.driver).cloned().unwrap_or_default();
+        let mut others = [0; 2];
+        for stream in seen.streams().filter(|stream| !family.contains(&stream.id)) {
+            *of_format(&mut others, stream.id) += 1;
+        }
+        OpenFinding {
+            finding,
+            free: 1.0,
+            others,
+            family,
+        }
+    });
+    open.collect()
 }
 
 /// `findings` with the odds that each has beside the others, the surest first. In: what speaks for
 /// each but for its identifiers.
 pub(crate) fn explain(seen: &Traffic, findings: Vec<Finding>) -> Vec<Finding> {
-    let own = |finding: &Finding| {
-        let explains = finding.explains.iter();
-        explains.map(|explained| explained.id).collect::<Vec<Id>>()
-    };
-    let mut open: Vec<OpenFinding> = Vec::new();
-    let all: Vec<(&'static str, Vec<Id>)> = findings
-        .iter()
-        .map(|finding| (finding.driver, own(finding)))
-        .collect();
-    for finding in findings {
-        let mine = all.iter().filter(|(driver, _)| *driver == finding.driver);
-        let family: BTreeSet<Id> = mine.flat_map(|(_, ids)| ids).copied().collect();
-        let mut others = [0; 2];
-        for stream in seen.streams().filter(|stream| !family.contains(&stream.id)) {
-            *of_format(&mut others, stream.id) += 1;
-        }
-        open.push(OpenFinding {
-            finding,
-            free: 1.0,
-            others,
-            family,
-        });
-    }
+    let mut open = unjudged(seen, findings);
     let mut sure: Vec<Finding> = Vec::new();
     loop {
-        let odds = |one: &OpenFinding| {
-            let alone = one.bits(seen, &sure, true);
-            let taken = 1.0 - one.free;
-            if taken <= 0.0 {
-                return alone;
-            }
-            // What contests it is not there, or it is there all the same.
-            let beside = one.bits(seen, &sure, false);
-            let yes = one.free * probability(alone) + taken * probability(beside);
-            let no = one.free * probability(-alone) + taken * probability(-beside);
-            libm::log2(yes / no)
-        };
+        let odds = |one: &OpenFinding| one.odds(seen, &sure);
         let all: Vec<f64> = open.iter().map(odds).collect();
         let best = (all.iter().enumerate()).max_by(|a, b| a.1.total_cmp(b.1).then(b.0.cmp(&a.0)));
         let Some((place, bits)) = best.map(|(place, bits)| (place, *bits)) else {
@@ -178,8 +182,9 @@ pub(crate) fn explain(seen: &Traffic, findings: Vec<Finding>) -> Vec<Finding> {
         }
         if bits >= Certainty::LIKELY {
             for one in &mut open {
-                for id in own(&best).iter().filter(|id| one.family.insert(**id)) {
-                    let count = of_format(&mut one.others, *id);
+                let ids = best.explains.iter().map(|explained| explained.id);
+                for id in ids.filter(|id| one.family.insert(*id)) {
+                    let count = of_format(&mut one.others, id);
                     *count = count.saturating_sub(1);
                 }
             }

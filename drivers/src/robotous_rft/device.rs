@@ -139,12 +139,6 @@ impl Rft {
     ) {
         let [a, b] = halves;
         let (wrench, mut quality) = self.wrench(a, b);
-        if quality.contains(Quality::SATURATED) {
-            out.fault(Counter::Saturated, 1, frame.id);
-        }
-        if link.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
-        }
         quality |= self.zero.mark(frame.t);
         let (acquired, stamp) = first;
         let output = Output {
@@ -152,7 +146,7 @@ impl Rft {
             stamp,
             ..Output::new(0, frame, quality, Reading::Wrench(wrench))
         };
-        out.push(output, frame.id);
+        link.give(output, frame, out);
     }
 }
 
@@ -196,18 +190,13 @@ impl Family for Rft {
         if !second && frame.id != self.ids.first {
             return;
         }
-        let Some(data) = bytes::payload(frame, out) else {
+        let data = bytes::payload_of(8, frame, out);
+        let Some(&half) = data.and_then(|data| data.first_chunk()) else {
             return;
-        };
-        let Ok(half) = <[u8; 8]>::try_from(data) else {
-            return out.fault(Counter::Length, 1, frame.id);
         };
         let mut unpaired = 0;
         let paired = self.pairing.push(second, frame, half, &mut unpaired);
-        if unpaired > 0 {
-            link.bringup.lost();
-            out.fault(Counter::Unpaired, unpaired, frame.id);
-        }
+        link.lost(Counter::Unpaired, unpaired, frame, out);
         let Paired::With(acquired, stamp, halves) = paired else {
             return;
         };

@@ -2,9 +2,10 @@
 //! commanded once a period.
 
 use super::frames::{
-    JOINT, LENGTH, MOTOR, OF_STATE, RUNNING, RobstrideState, fault, id, kind, parameter, quality_of,
+    JOINT, LENGTH, MOTOR, OF_STATE, RUNNING, RobstrideState, fault, id, kind, parameter,
 };
 use super::options::{RobstrideKeys, RobstrideOptions, RobstrideProtocol};
+use crate::family::quality_of;
 use crate::{
     Board, EncodeError, Format, Frame, Frames, Id, Simulate, Spec, SpecError, board, bytes, mit,
 };

@@ -2,11 +2,11 @@
 
 use super::frames::{
     JOINT, LENGTH, MOTOR, OF_STATE, RUNNING, RobstrideMessage, RobstrideState, claim, id, kind,
-    parameter, quality_of,
+    parameter,
 };
 use super::options::{RobstrideKeys, RobstrideOptions, RobstrideProtocol};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Rounds, Supervised, Supervision, temperature};
+use crate::family::{Family, Rounds, Supervised, Supervision, quality_of, temperature};
 use crate::held::{HeldValue, OnChange};
 use crate::{
     Claim, Decoded, Device, Driver, Frame, Id, Mode, Output, OutputInfo, Spec, SpecError, bytes,
@@ -116,11 +116,7 @@ impl RobstrideMotor {
             RobstrideProtocol::Mit if frame.id == Id::standard(host.into()) => None,
             RobstrideProtocol::Mit => return None,
         };
-        let data = bytes::payload(frame, out)?;
-        if data.len() != LENGTH {
-            out.fault(Counter::Length, 1, frame.id);
-            return None;
-        }
+        let data = bytes::payload_of(LENGTH, frame, out)?;
         let [_, _, upper, _] = frame.id.raw().to_le_bytes();
         match kind {
             Some(kind) => Some(RobstrideMessage::of_private(kind, upper, data)),

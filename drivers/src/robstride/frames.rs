@@ -2,7 +2,6 @@
 
 use crate::bytes::{u16_be, u16_le, u32_le};
 use crate::{Claim, Id, mit};
-use proprio_topics::Quality;
 
 /// The outputs.
 pub(super) const JOINT: u8 = 0;
@@ -42,18 +41,6 @@ pub(super) mod fault {
     pub(in crate::robstride) const MAGNETIC_ENCODER: u32 = 1 << 27;
     pub(in crate::robstride) const HALL_ENCODER: u32 = 1 << 28;
     pub(in crate::robstride) const STATE_NOT_CALIBRATED: u32 = 1 << 29;
-}
-
-/// The quality of readings with these faults, of which those in `encoder` concern the position.
-pub(super) fn quality_of(faults: u32, encoder: u32) -> Quality {
-    let mut quality = Quality::GOOD;
-    if faults & encoder != 0 {
-        quality |= Quality::DEVICE_FAULT;
-    }
-    if faults & !encoder != 0 {
-        quality |= Quality::DRIVE_FAULT;
-    }
-    quality
 }
 
 /// The identifier of a frame of the private protocol.

@@ -11,7 +11,7 @@ use crate::held::HeldValue;
 use crate::{Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use proprio_topics::{Actuator, Counter, JointState, Kind, Quality, Reading};
+use proprio_topics::{Actuator, JointState, Kind, Quality, Reading};
 
 /// The host's side of a controller.
 #[derive(Debug)]
@@ -97,12 +97,9 @@ impl Family for VescController {
         let Some(command) = commands.into_iter().find(is_its) else {
             return;
         };
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = bytes::payload_of(LENGTH, frame, out) else {
             return;
         };
-        if data.len() != LENGTH {
-            return out.fault(Counter::Length, 1, frame.id);
-        }
         match (command, self.keys.position) {
             (command::STATUS, _) => self.status(data, frame, out),
             (command::STATUS_4, position) => {

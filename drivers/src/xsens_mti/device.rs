@@ -13,19 +13,6 @@ use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Saturation};
 
-/// Only the watching counts: nothing is sent. A sensor that was never heard is silent after a
-/// second and a half.
-const TIMING: Timing = Timing {
-    power_on_silence: Nanos::ZERO,
-    answer_timeout: Nanos::from_millis(100),
-    attempts: 3,
-    slow_attempt: Nanos::from_millis(500),
-    answer_counts: Nanos::from_millis(100),
-    start: Nanos::from_millis(250),
-    start_most: Nanos::from_millis(500),
-    send_within: Nanos::from_millis(100),
-};
-
 /// What the messages of a sample hold.
 #[derive(Debug, Clone, Copy)]
 struct MtiSample {
@@ -136,23 +123,9 @@ impl Mti {
             let last = self.counter.replace(sample.counter);
             match last.map(|last| sample.counter.wrapping_sub(last)) {
                 Some(0) => return out.fault(Counter::Unexpected, 1, frame.id),
-                Some(ahead) if ahead > 1 => {
-                    out.fault(Counter::Lost, u32::from(ahead) - 1, frame.id);
-                    link.bringup.lost();
-                }
-                _ => {}
+                Some(ahead) => link.lost(Counter::Lost, u32::from(ahead) - 1, frame, out),
+                None => {}
             }
-        }
-        for (flag, counter) in [
-            (Quality::DEVICE_FAULT, Counter::DeviceFault),
-            (Quality::SATURATED, Counter::Saturated),
-        ] {
-            if quality.contains(flag) {
-                out.fault(counter, 1, frame.id);
-            }
-        }
-        if link.bringup.reading(frame.t) {
-            quality |= Quality::GAP_BEFORE;
         }
         let device_time = if self.plan.wants(MtiMessage::SampleTime) {
             self.time(sample.ticks)
@@ -166,7 +139,7 @@ impl Mti {
             device_counter: u32::from(sample.counter),
             ..Output::new(0, frame, quality, Reading::Imu(sample.imu))
         };
-        out.push(output, frame.id);
+        link.give(output, frame, out);
     }
 }
 
@@ -181,7 +154,7 @@ impl Driver for XsensMtiOptions {
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
         let plan = MtiKeys::new(spec, self)?;
         let watched = plan.messages.first().map_or(plan.error, |(id, _)| *id);
-        let bringup = Bringup::new(spec, Mode::Listen, TIMING, watched);
+        let bringup = Bringup::new(spec, Mode::Listen, Timing::LISTENED, watched);
         let streams = plan.messages.iter().map(|(id, _)| *id);
         let claims: Vec<Claim> = (streams.chain([plan.error]))
             .map(Claim::exclusive)
@@ -207,26 +180,19 @@ impl Family for Mti {
             None if frame.id == self.plan.error => (0, MtiMessage::Error),
             None => return,
         };
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = bytes::payload_of(message.length(), frame, out) else {
             return;
         };
-        if data.len() != message.length() {
-            return out.fault(Counter::Length, 1, frame.id);
-        }
         if message == MtiMessage::Error {
             if data.first() != Some(&BUFFER_OVERFLOW) {
                 return out.fault(Counter::Value, 1, frame.id);
             }
-            link.bringup.lost();
-            return out.fault(Counter::DeviceFault, 1, frame.id);
+            return link.lost(Counter::DeviceFault, 1, frame, out);
         }
         let mut dropped = 0;
         let add = |sample: &mut MtiSample| sample.add(&self.plan, message, data);
         let whole = (self.group).push(position, frame, MtiSample::EMPTY, add, &mut dropped);
-        if dropped > 0 {
-            link.bringup.lost();
-            out.fault(Counter::Unpaired, dropped, frame.id);
-        }
+        link.lost(Counter::Unpaired, dropped, frame, out);
         if let Some(whole) = whole {
             self.give(&whole, frame, link, out);
         }

@@ -2,9 +2,9 @@
 //! estimates for a while, faults, and requests.
 
 use crate::rig::{
-    FD, Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec, supervisor,
+    FD, Rig, board, count, decode, encode, frame, joint, listener, options, shown_keys, spec,
+    supervisor,
 };
-use proprio_drivers::odrive::{Firmware, error_words};
 use proprio_drivers::{
     Decoded, Device, EncodeError, Frame, Frames, Id, Mode, NotSent, SpecError, State,
 };
@@ -27,13 +27,6 @@ fn device(keys: &str) -> Box<dyn Device> {
     options("odrive", keys)
         .device(&spec(5, Mode::Listen, &[0]))
         .unwrap()
-}
-
-fn joint(reading: &Reading) -> JointState {
-    match reading {
-        Reading::Joint(joint) => *joint,
-        other => panic!("{other:?}"),
-    }
 }
 
 fn actuator(reading: &Reading) -> Actuator {
@@ -119,35 +112,6 @@ fn frames_of_the_makers_description_are_read() {
         }
     }
     assert_eq!(seen, [8, 6, 3, 3, 43]);
-}
-
-/// Each error alone has the maker's name, and two have both.
-#[test]
-fn errors_have_the_makers_names() {
-    let plain = |words: String| words.to_lowercase();
-    let mut named = [0_u32; 2];
-    for line in FRAMES.lines() {
-        let words: Vec<&str> = line.split(' ').collect();
-        let [firmware, "error", bit, name] = words[..] else {
-            continue;
-        };
-        let (firmware, known) = match firmware {
-            "0.5" => (Firmware::V0_5, &mut named[0]),
-            _ => (Firmware::V0_6, &mut named[1]),
-        };
-        let error = 1 << bit.parse::<u32>().unwrap();
-        *known |= error;
-        let name = name.replace('_', " ").to_lowercase();
-        assert_eq!(plain(error_words(firmware, error).to_string()), name);
-    }
-    for (firmware, known) in [Firmware::V0_5, Firmware::V0_6].into_iter().zip(named) {
-        assert_eq!(error_words(firmware, 0).to_string(), "no error");
-        let all = error_words(firmware, u32::MAX).to_string();
-        assert_eq!(all.split(", ").count(), 32);
-        assert_eq!(all.matches("bit ").count() as u32, (!known).count_ones());
-    }
-    let words = error_words(Firmware::V0_6, 1 << 5 | 1 << 7).to_string();
-    assert_eq!(words, "DRV fault, bit 7");
 }
 
 /// Current and torque are used as long as `hold_ms` says, and never for an earlier reading.

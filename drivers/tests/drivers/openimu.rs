@@ -9,8 +9,8 @@
 //! formulas of `CAN_MTLT.py` (Aceinna/python-mtlt 1b99f92e) read them as roll -30.50, pitch 5.25;
 //! 2.25, 1.50, 9.75; -20.25, 10.50, 100.125. All others are computed by hand.
 
-use crate::rig::{FD, Rig, board, count, decode, encode, frame, listener, options, spec};
-use proprio_drivers::{EncodeError, Format, Frame, Frames, Id, Mode, Output, SpecError, State};
+use crate::rig::{FD, Rig, board, count, decode, encode, frame, imu, listener, options, spec};
+use proprio_drivers::{EncodeError, Format, Frame, Frames, Id, Mode, SpecError, State};
 use proprio_topics::{Counter, Imu, Nanos, Quality, Reading, Saturation, StampKind, Temperature};
 use proptest::array::uniform3;
 use proptest::prelude::*;
@@ -22,13 +22,6 @@ const RATE: &str = "0CF02A80#E072408210AF3F02";
 
 const ALL: &str = r#"quantities = ["angular_velocity", "orientation", "acceleration"]"#;
 const DEGREE: f64 = PI / 180.0;
-
-fn imu(output: &Output) -> Imu {
-    match output.reading {
-        Reading::Imu(imu) => imu,
-        other => panic!("{other:?}"),
-    }
-}
 
 fn frames(texts: &[&str]) -> Vec<Frame> {
     (0..)

@@ -5,7 +5,9 @@ use proprio_drivers::{
     Board, Decoded, Device, Fault, Format, Frame, Frames, Id, Mode, NotSent, Options, Output,
     Outputs, Spec, SpecError, State,
 };
-use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind};
+use proprio_topics::{
+    Actuator, Counter, Imu, JointState, Nanos, Quality, Reading, StampKind, Wrench,
+};
 
 /// The keys of a driver, read from TOML.
 pub(crate) fn options(driver: &str, keys: &str) -> Options {
@@ -396,4 +398,39 @@ pub(crate) fn refused(driver: &str, keys: &str, address: u32) -> String {
         SpecError::Address { least, most, .. } => format!("{least} to {most}"),
         other => panic!("{other:?}"),
     }
+}
+
+pub(crate) fn joint(reading: &Reading) -> JointState {
+    match reading {
+        Reading::Joint(joint) => *joint,
+        other => panic!("{other:?}"),
+    }
+}
+
+pub(crate) fn imu(output: &Output) -> Imu {
+    match output.reading {
+        Reading::Imu(imu) => imu,
+        other => panic!("{other:?}"),
+    }
+}
+
+pub(crate) fn wrench(reading: &Reading) -> Wrench {
+    match reading {
+        Reading::Wrench(wrench) => *wrench,
+        other => panic!("{other:?}"),
+    }
+}
+
+pub(crate) fn reading(force: [f64; 3], torque: [f64; 3]) -> Reading {
+    Reading::Wrench(Wrench { force, torque })
+}
+
+/// Why `driver` refuses `keys` at `address`.
+pub(crate) fn refused_at(driver: &str, keys: &str, address: u32) -> SpecError {
+    let options = options(driver, keys);
+    let spec = spec(address, Mode::Supervise, &[]);
+    let device = options.device(&spec).map(|_| ()).unwrap_err();
+    let board = options.board(&spec).map(|_| ()).unwrap_err();
+    assert_eq!(device, board);
+    device
 }

@@ -1,37 +1,16 @@
 //! Robotous RFT and AIDIN AFT200 sensors: two frames without a sequence number for each reading.
 
 use crate::rig::{
-    Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec, supervisor,
-    texts,
+    Rig, board, count, decode, encode, frame, listener, options, reading, refused_at, shown_keys,
+    spec, supervisor, texts, wrench,
 };
 use proprio_drivers::{Device, Format, Frame, Frames, Id, Mode, NotSent, Output, SpecError, State};
 use proprio_topics::{Counter, Nanos, Quality, Reading, Saturation, StampKind, Wrench};
 use proptest::array::{uniform3, uniform6};
 use proptest::prelude::*;
 
-fn wrench(reading: &Reading) -> Wrench {
-    match reading {
-        Reading::Wrench(wrench) => *wrench,
-        other => panic!("{other:?}"),
-    }
-}
-
-fn reading(force: [f64; 3], torque: [f64; 3]) -> Reading {
-    Reading::Wrench(Wrench { force, torque })
-}
-
 fn near(a: f64, b: f64, step: f64) -> bool {
     (a - b).abs() <= step * 0.5 + 1e-9
-}
-
-/// Why `driver` refuses `keys` at `address`.
-fn refused(driver: &str, keys: &str, address: u32) -> SpecError {
-    let options = options(driver, keys);
-    let spec = spec(address, Mode::Supervise, &[]);
-    let device = options.device(&spec).map(|_| ()).unwrap_err();
-    let board = options.board(&spec).map(|_| ()).unwrap_err();
-    assert_eq!(device, board);
-    device
 }
 
 /// Halves of several readings: `F3` is the first half of reading 3, `S3` the second, at times in
@@ -426,7 +405,7 @@ fn wrong_keys_of_an_rft_are_refused() {
         value,
         expected,
     };
-    assert_eq!(refused("robotous_rft", "rate_hz = 250", 0x64), rate);
+    assert_eq!(refused_at("robotous_rft", "rate_hz = 250", 0x64), rate);
     for (keys, key, value) in [
         ("id_first = 0", "id_first", 0.0),
         ("id_first = 256", "id_first", 256.0),
@@ -438,10 +417,10 @@ fn wrong_keys_of_an_rft_are_refused() {
             value,
             expected,
         };
-        assert_eq!(refused("robotous_rft", keys, 0x64), id);
+        assert_eq!(refused_at("robotous_rft", keys, 0x64), id);
     }
     for keys in ["id_second = 1", "id_first = 100", "id_second = 100"] {
-        let same = refused("robotous_rft", keys, 0x64);
+        let same = refused_at("robotous_rft", keys, 0x64);
         assert!(matches!(same, SpecError::Keys { .. }), "{same:?}");
     }
     for address in [0, 256] {
@@ -451,7 +430,7 @@ fn wrong_keys_of_an_rft_are_refused() {
             least,
             most,
         };
-        assert_eq!(refused("robotous_rft", "", address), wrong);
+        assert_eq!(refused_at("robotous_rft", "", address), wrong);
     }
     assert_eq!(options("robotous_rft", "").default_address(), Some(0x64));
 }
@@ -673,9 +652,9 @@ fn wrong_keys_of_an_aft_are_refused() {
             value,
             expected,
         };
-        assert_eq!(refused("aidin_aft200", keys, 1), wrong);
+        assert_eq!(refused_at("aidin_aft200", keys, 1), wrong);
     }
-    let same = refused("aidin_aft200", "id_force = 2", 1);
+    let same = refused_at("aidin_aft200", "id_force = 2", 1);
     assert!(matches!(same, SpecError::Keys { .. }), "{same:?}");
     for address in [0, 255] {
         let (least, most) = (1, 254);
@@ -684,7 +663,7 @@ fn wrong_keys_of_an_aft_are_refused() {
             least,
             most,
         };
-        assert_eq!(refused("aidin_aft200", "", address), wrong);
+        assert_eq!(refused_at("aidin_aft200", "", address), wrong);
     }
     let shown = shown_keys(include_str!(
         "../../../docs/book/src/devices/aidin_aft200.md"

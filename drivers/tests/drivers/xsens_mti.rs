@@ -11,8 +11,8 @@
 //! The file has no step 1/32767 of the quaternion and no sample time in units of 100 us: these
 //! values are computed by hand.
 
-use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, spec};
-use proprio_drivers::{Claim, EncodeError, Frame, Frames, Id, Mode, Output, SpecError, State};
+use crate::rig::{Rig, board, count, decode, encode, frame, imu, listener, options, spec};
+use proprio_drivers::{Claim, EncodeError, Frame, Frames, Id, Mode, SpecError, State};
 use proprio_topics::{
     Counter, Gauges, Imu, Nanos, Quality, Reading, Saturation, StampKind, Temperature,
 };
@@ -32,13 +32,6 @@ quantities = ["magnetic_field", "orientation", "sample_time", "group_counter", "
               "acceleration", "angular_velocity"]
 magnetic_unit = 50e-6
 "#;
-
-fn imu(output: &Output) -> Imu {
-    match output.reading {
-        Reading::Imu(imu) => imu,
-        other => panic!("{other:?}"),
-    }
-}
 
 fn frames(texts: &[&str]) -> Vec<Frame> {
     (0..)

@@ -214,7 +214,7 @@ impl<'a> Iterator for Attributes<'a> {
 /// interface, which with a USB adapter can take seconds. It is not joined: it ends within a period
 /// after the end was asked for.
 #[derive(Debug)]
-pub struct Observer(Arc<Mutex<Vec<InterfaceHealth>>>);
+pub(crate) struct Observer(Arc<Mutex<Vec<InterfaceHealth>>>);
 
 impl Observer {
     /// Asks for each of `interfaces` (`None` has no answer) every `period` until `stop`. Adapters
@@ -222,7 +222,7 @@ impl Observer {
     ///
     /// # Errors
     /// The system's: the thread could not be started.
-    pub fn start(
+    pub(crate) fn start(
         interfaces: Vec<Option<Adapter>>,
         mut source: impl Interfaces + 'static,
         period: Duration,
@@ -276,7 +276,7 @@ impl Observer {
     /// The newest answers, in the order of the interfaces; all zero before the first and where
     /// there is none.
     #[must_use]
-    pub fn newest(&self) -> Vec<InterfaceHealth> {
+    pub(crate) fn newest(&self) -> Vec<InterfaceHealth> {
         let newest = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         newest.clone()
     }

@@ -1,5 +1,5 @@
 //! A link to a CAN bus: one trait, three implementations, one conformance suite for all
-//! (tests/conformance.rs).
+//! (tests/conformance).
 //!
 //! | link | the bus | stamps |
 //! |---|---|---|

@@ -55,7 +55,7 @@ impl Matching {
     ///
     /// # Errors
     /// The log cannot be read.
-    pub fn in_log(self, log: &mut LogReader<impl BufRead>) -> io::Result<Option<Self>> {
+    pub(crate) fn in_log(self, log: &mut LogReader<impl BufRead>) -> io::Result<Option<Self>> {
         let takes_all = self.is_alone && !log.has_interface(|name| self.takes(name))?;
         Ok((!takes_all).then_some(self))
     }

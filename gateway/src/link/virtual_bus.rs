@@ -90,6 +90,51 @@ fn group(key: &[u8]) -> SocketAddrV4 {
     )
 }
 
+/// A socket of bus `name` in `group`.
+fn join(name: &str, group: SocketAddrV4) -> Result<Socket, OpenError> {
+    let action = |what: &str| {
+        let action = format!("{what} for virtual bus {name}");
+        move |cause| OpenError::System { action, cause }
+    };
+    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))
+        .map_err(action("create a socket"))?;
+    // Every multicast datagram goes to all sockets that share the address this way.
+    // SO_REUSEPORT would additionally require that all of them belong to one user.
+    socket
+        .set_reuse_address(true)
+        .map_err(action("share the address"))?;
+    // Bound to the group, so that datagrams to this port of another group or of the host do not
+    // arrive here. The buffer fills from here on, so options that concern its frames are set
+    // before.
+    setsockopt(&socket, sockopt::ReceiveTimestampns, &true)
+        .map_err(|e| action("enable time stamps")(e.into()))?;
+    setsockopt(&socket, sockopt::RxqOvfl, &1)
+        .map_err(|e| action("enable drop counts")(e.into()))?;
+    enlarge_receive_buffer(&socket, RECEIVE_BUFFER);
+    socket
+        .bind(&group.into())
+        .map_err(action(&format!("bind to {group}")))?;
+    // Always through lo, also without a route (as in a new network namespace), and never through
+    // another interface.
+    let lo = "through 127.0.0.1 (is the loopback interface up? `ip link set lo up`)";
+    socket
+        .set_multicast_if_v4(&Ipv4Addr::LOCALHOST)
+        .map_err(action(&format!("send {lo}")))?;
+    socket
+        .set_multicast_ttl_v4(0)
+        .map_err(action("limit frames to this host"))?;
+    socket
+        .set_multicast_loop_v4(true)
+        .map_err(action("reach this host"))?;
+    socket
+        .join_multicast_v4(group.ip(), &Ipv4Addr::LOCALHOST)
+        .map_err(action(&format!("join {group} {lo}")))?;
+    socket
+        .set_nonblocking(true)
+        .map_err(action("set up the socket"))?;
+    Ok(socket)
+}
+
 impl VirtualBus {
     /// Joins bus `name` of `domain` and receives frames that match one of `claims` (all if there
     /// are none).
@@ -98,7 +143,6 @@ impl VirtualBus {
     /// [`OpenError::System`]: domain and name are too long or contain a zero byte; the loopback
     /// interface is down or missing; the port computed from the names is used by another program.
     pub fn open(domain: &str, name: &str, claims: &[Claim]) -> Result<Self, OpenError> {
-        let fail = |action: String| move |cause: io::Error| OpenError::System { action, cause };
         let key = [domain.as_bytes(), &[0], name.as_bytes()].concat();
         if key.len() > LONGEST_KEY
             || domain.contains('\0')
@@ -109,53 +153,13 @@ impl VirtualBus {
                 "domain and name may have {} bytes in all, the name at least one, and no zero byte",
                 LONGEST_KEY - 1
             );
-            return Err(fail(format!(
-                "open virtual bus {name:?} in domain {domain:?}"
-            ))(io::Error::new(
-                io::ErrorKind::InvalidInput,
-                cause,
-            )));
+            return Err(OpenError::System {
+                action: format!("open virtual bus {name:?} in domain {domain:?}"),
+                cause: io::Error::new(io::ErrorKind::InvalidInput, cause),
+            });
         }
         let group = group(&key);
-        let action = |what: &str| fail(format!("{what} for virtual bus {name}"));
-
-        let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))
-            .map_err(action("create a socket"))?;
-        // Every multicast datagram goes to all sockets that share the address this way.
-        // SO_REUSEPORT would additionally require that all of them belong to one user.
-        socket
-            .set_reuse_address(true)
-            .map_err(action("share the address"))?;
-        // Bound to the group, so that datagrams to this port of another group or of the host do not
-        // arrive here. The buffer fills from here on, so options that concern its frames are set
-        // before.
-        setsockopt(&socket, sockopt::ReceiveTimestampns, &true)
-            .map_err(|e| action("enable time stamps")(e.into()))?;
-        setsockopt(&socket, sockopt::RxqOvfl, &1)
-            .map_err(|e| action("enable drop counts")(e.into()))?;
-        enlarge_receive_buffer(&socket, RECEIVE_BUFFER);
-        socket
-            .bind(&group.into())
-            .map_err(action(&format!("bind to {group}")))?;
-        // Always through lo, also without a route (as in a new network namespace), and never
-        // through another interface.
-        let lo = "through 127.0.0.1 (is the loopback interface up? `ip link set lo up`)";
-        socket
-            .set_multicast_if_v4(&Ipv4Addr::LOCALHOST)
-            .map_err(action(&format!("send {lo}")))?;
-        socket
-            .set_multicast_ttl_v4(0)
-            .map_err(action("limit frames to this host"))?;
-        socket
-            .set_multicast_loop_v4(true)
-            .map_err(action("reach this host"))?;
-        socket
-            .join_multicast_v4(group.ip(), &Ipv4Addr::LOCALHOST)
-            .map_err(action(&format!("join {group} {lo}")))?;
-        socket
-            .set_nonblocking(true)
-            .map_err(action("set up the socket"))?;
-
+        let socket = join(name, group)?;
         // RandomState draws its keys from the system's random numbers once per thread and then
         // increments them.
         let sender = std::hash::RandomState::new()
@@ -164,10 +168,9 @@ impl VirtualBus {
             .to_le_bytes();
         let mut template = [0; DATAGRAM];
         #[allow(clippy::cast_possible_truncation)] // checked above
-        let key_len = key.len() as u8;
         let fixed = [
             &MAGIC[..],
-            &[VERSION, 0, 0, key_len],
+            &[VERSION, 0, 0, key.len() as u8],
             &sender,
             &[0; 4],
             &key,

@@ -439,11 +439,39 @@ fn parse(
     start: Option<Nanos>,
 ) -> Result<OwnedRecord, LineError> {
     let short = LineError::Object;
-    let size = u32_at(object, 8).and_then(|size| usize::try_from(size).ok());
-    let size = size.ok_or(short)?;
     if !(HEADER..=LONGEST_HEADER).contains(&header) {
         return Err(short);
     }
+    let (channel, direction, frame) = parse_body(kind, header, object)?;
+    let unit = match u32_at(object, 16).ok_or(short)? {
+        1 => 10_000,
+        _ => 1,
+    };
+    // Some files have times before the start, as negative numbers.
+    let t = u64_at(object, 24).ok_or(short)?.cast_signed();
+    let t = Nanos(t.saturating_mul(unit));
+    let stamp = match start {
+        Some(start) => (start.saturating_add(t), StampForm::Absolute),
+        None => (t, StampForm::Origin),
+    };
+    Ok(OwnedRecord {
+        stamp: Some(stamp),
+        interface: Interface::channel(channel),
+        direction,
+        frame,
+        whole: true,
+    })
+}
+
+/// Channel, direction and frame of an object.
+fn parse_body(
+    kind: u32,
+    header: usize,
+    object: &[u8],
+) -> Result<(u16, Option<FrameDirection>, Frame), LineError> {
+    let short = LineError::Object;
+    let size = u32_at(object, 8).and_then(|size| usize::try_from(size).ok());
+    let size = size.ok_or(short)?;
     let body = object.get(header..).ok_or(short)?;
     let byte = |at: usize| body.get(at).copied().ok_or(short);
     let word = |at: usize| u32_at(body, at).ok_or(short);
@@ -459,7 +487,7 @@ fn parse(
         })
     };
     let wide_channel = || u16_at(body, 0).ok_or(short);
-    let (channel, direction, frame) = match kind {
+    Ok(match kind {
         1 | 86 => {
             let (flags, length) = (byte(2)?, byte(3)?.min(8));
             let data = body.get(8..16).ok_or(short)?;
@@ -501,24 +529,6 @@ fn parse(
         }
         104 => (u16::from(byte(0)?), None, bus_error()),
         _ => (wide_channel()?, None, bus_error()),
-    };
-    let unit = match u32_at(object, 16).ok_or(short)? {
-        1 => 10_000,
-        _ => 1,
-    };
-    // Some files have times before the start, as negative numbers.
-    let t = u64_at(object, 24).ok_or(short)?.cast_signed();
-    let t = Nanos(t.saturating_mul(unit));
-    let stamp = match start {
-        Some(start) => (start.saturating_add(t), StampForm::Absolute),
-        None => (t, StampForm::Origin),
-    };
-    Ok(OwnedRecord {
-        stamp: Some(stamp),
-        interface: Interface::channel(channel),
-        direction,
-        frame,
-        whole: true,
     })
 }
 

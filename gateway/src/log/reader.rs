@@ -326,7 +326,7 @@ impl<R: BufRead> LogReader<R> {
     ///
     /// # Errors
     /// A read error of `inner`.
-    pub fn has_interface(&mut self, wanted: impl Fn(&str) -> bool) -> io::Result<bool> {
+    pub(crate) fn has_interface(&mut self, wanted: impl Fn(&str) -> bool) -> io::Result<bool> {
         let (most, mut size) = LOOK_FOR_INTERFACE;
         loop {
             let held = self.inner.hold(size)?;

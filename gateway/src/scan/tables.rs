@@ -28,7 +28,7 @@ pub struct ScannedBus {
 const USUAL_PERIOD_MS: u32 = 25;
 
 /// What the comment behind a placeholder begins with.
-pub const FILL_IN: &str = "fill in";
+pub(crate) const FILL_IN: &str = "fill in";
 
 /// The lines of a gateway.toml whose placeholders are not filled in, with their numbers. Nobody
 /// can tell a placeholder from a value that is right: the comment is the mark.

@@ -64,19 +64,9 @@ pub(in crate::log) fn parse_line(line: &[u8]) -> Result<ParsedLine, LineError> {
 
     // All these slices end where the line ends, so their lengths give the positions.
     let start = line.len() - rest.len();
-    let length = rest
-        .iter()
-        .position(|c| *c == b' ' || *c == b'\t')
-        .unwrap_or(rest.len());
-    let interface = start..start + length;
-    // A name with control characters would reach a terminal.
-    let is_name = |name: &[u8]| {
-        std::str::from_utf8(name).is_ok_and(|name| !name.chars().any(char::is_control))
-    };
-    if length == 0 || rest.first() == Some(&b'(') || !rest.get(..length).is_some_and(is_name) {
-        return Err(LineError::Interface);
-    }
-    rest = rest.get(length..).unwrap_or(&[]).trim_ascii_start();
+    let (name, after) = split_interface(rest)?;
+    let interface = start..start + name.len();
+    rest = after.trim_ascii_start();
 
     let (columns, after) = parse_columns(rest);
     rest = after;
@@ -110,20 +100,31 @@ pub(in crate::log) fn parse_line(line: &[u8]) -> Result<ParsedLine, LineError> {
         _ if digits != 3 && digits != 8 => return Err(LineError::Identifier { digits }),
         _ => return Err(LineError::Separator),
     };
-    let form = |absolute: bool| {
-        if absolute {
-            StampForm::Absolute
-        } else {
-            relative
-        }
-    };
     Ok(ParsedLine::Record(OwnedRecord {
-        stamp: stamp.map(|s| (s.t, form(s.absolute))),
+        stamp: stamp.map(|s| match s.absolute {
+            true => (s.t, StampForm::Absolute),
+            false => (s.t, relative),
+        }),
         interface: Interface::Text(interface),
         direction,
         frame: frame.frame,
         whole: frame.whole,
     }))
+}
+
+/// Splits the name of an interface from what follows.
+fn split_interface(text: &[u8]) -> Result<(&[u8], &[u8]), LineError> {
+    let end = text.iter().position(|c| *c == b' ' || *c == b'\t');
+    let split = text.split_at_checked(end.unwrap_or(text.len()));
+    // A name with control characters would reach a terminal.
+    let is_name = |name: &[u8]| {
+        std::str::from_utf8(name).is_ok_and(|name| !name.chars().any(char::is_control))
+    };
+    match split {
+        Some(([] | [b'(', ..], _)) | None => Err(LineError::Interface),
+        Some((name, _)) if !is_name(name) => Err(LineError::Interface),
+        Some(split) => Ok(split),
+    }
 }
 
 /// The columns of `candump -x`: the direction, and whether bit rate switch and error state are set.
@@ -310,8 +311,35 @@ fn parse_screen_frame(
         });
     }
     let mut bytes = [0_u8; Frame::MAX_LEN];
-    let mut backwards = false;
     let data = bytes.get_mut(..declared).ok_or(LineError::Length)?;
+    rest = parse_screen_bytes(rest, data)?;
+    match rest.trim_ascii_start() {
+        [] | [b'\'' | b'`', ..] => {}
+        b"ERRORFRAME" if error => {}
+        _ => return Err(LineError::Trailing),
+    }
+    let format = match (fd, error) {
+        (true, true) => return Err(LineError::Contradiction),
+        (true, false) => Format::Fd {
+            bit_rate_switch,
+            error_state,
+        },
+        (false, true) => Format::Error,
+        (false, false) => Format::Classic,
+    };
+    let frame = Frame::with_format(id, format, data).ok_or(LineError::TooLong { most: 8 })?;
+    // `[0]` could be the beginning of a remote request.
+    Ok(ParsedFrame {
+        frame,
+        whole: declared > 0,
+    })
+}
+
+/// Parses as many bytes as `data` has, in hexadecimal or binary digits, and returns the rest. Signs
+/// like `` ` `` between them say that they are in reversed order.
+fn parse_screen_bytes<'a>(mut rest: &'a [u8], data: &mut [u8]) -> Result<&'a [u8], LineError> {
+    let declared = data.len();
+    let mut backwards = false;
     for (found, byte) in data.iter_mut().enumerate() {
         if found > 0 {
             rest = match rest {
@@ -338,26 +366,7 @@ fn parse_screen_frame(
     if backwards {
         data.reverse();
     }
-    match rest.trim_ascii_start() {
-        [] | [b'\'' | b'`', ..] => {}
-        b"ERRORFRAME" if error => {}
-        _ => return Err(LineError::Trailing),
-    }
-    let format = match (fd, error) {
-        (true, true) => return Err(LineError::Contradiction),
-        (true, false) => Format::Fd {
-            bit_rate_switch,
-            error_state,
-        },
-        (false, true) => Format::Error,
-        (false, false) => Format::Classic,
-    };
-    let frame = Frame::with_format(id, format, data).ok_or(LineError::TooLong { most: 8 })?;
-    // `[0]` could be the beginning of a remote request.
-    Ok(ParsedFrame {
-        frame,
-        whole: declared > 0,
-    })
+    Ok(rest)
 }
 
 /// Parses a frame in cansend's format: `123#DEADBEEF`, `123##1AABB`, `00000123#R4`, `123#11.22.33`.

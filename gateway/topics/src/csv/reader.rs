@@ -157,14 +157,8 @@ impl<R: io::Read> TableReader<R> {
             .from_reader(input);
         let header = csv.headers()?.clone();
         let Some(t_column) = header.iter().position(|name| name == "t") else {
-            let begin: String = header
-                .iter()
-                .collect::<Vec<_>>()
-                .join(",")
-                .chars()
-                .take(60)
-                .collect();
-            return Err(TableError::NoHeader(begin));
+            let names = header.iter().collect::<Vec<_>>().join(",");
+            return Err(TableError::NoHeader(names.chars().take(60).collect()));
         };
         let mut seen = HashMap::new();
         let (mut series, mut numbers) = (Vec::new(), HashMap::new());

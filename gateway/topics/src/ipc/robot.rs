@@ -9,7 +9,7 @@
 
 use super::clock::monotonic;
 use super::presence::Watch;
-use super::{Domain, DomainConfig, Freshness, Presence, Reader, Topic};
+use super::{Domain, DomainConfig, Freshness, PortError, Presence, Reader, Topic};
 use crate::{
     Code, ContactEstimate, Description, Entry, EstimatorHealth, GatewayHealth, Imu, JointState,
     Kind, MAX_CHANNELS, Name, Nanos, Publisher, Quality, Reading, Reason, Role, Sample,
@@ -746,76 +746,17 @@ impl Attacher {
     }
 
     fn look(&mut self, now: Nanos) -> Missing {
-        if self
-            .domain
-            .as_ref()
-            .is_some_and(|domain| !domain.is_usable())
-        {
-            // Somebody has deleted or damaged the domain's files, or the last other process has
-            // left it.
-            self.shared.recall.store(true, Relaxed);
-            if self.passed.contains(&true) {
-                return Missing {
-                    problem: Some(format!(
-                        "files of the domain {:?} were deleted or damaged; waiting for new ones",
-                        self.config.name
-                    )),
-                    ..Missing::default()
-                };
-            }
-            (self.gateway, self.estimator) = (Watch::default(), Watch::default());
-            self.domain = None;
-        }
-        self.shared.recall.store(false, Relaxed);
-        if self.domain.is_none() {
-            match Domain::existing(&self.config) {
-                Ok(domain) => self.domain = Some(domain),
-                Err(error) => {
-                    let mut problem = error.to_string();
-                    let siblings = self.config.siblings();
-                    if !siblings.is_empty() {
-                        problem.push_str("; the domains here are ");
-                        problem.push_str(&siblings.join(", "));
-                    }
-                    return Missing {
-                        problem: Some(problem),
-                        ..Missing::default()
-                    };
-                }
-            }
-        }
+        let mut problem = match self.renew_domain() {
+            Ok(()) => self.open_ports(),
+            Err(problem) => Some(problem),
+        };
         let Some(domain) = &self.domain else {
-            return Missing::default();
+            return Missing {
+                problem,
+                ..Missing::default()
+            };
         };
-        let mut problem = None;
-        let [torques, contacts, descriptions, samples] = &mut self.passed;
         let robot = &self.robot;
-        let mut pass = |passed: &mut bool, opened: Result<Passed, super::PortError>| match opened {
-            Ok(port) => {
-                *passed = self.send.try_send(port).is_ok();
-                self.shared.has_arrivals.store(true, Release);
-            }
-            Err(super::PortError::NotYet { .. }) => {}
-            Err(error) => problem = Some(error.to_string()),
-        };
-        if !*torques {
-            pass(torques, Reader::open_in(domain, robot).map(Passed::Torques));
-        }
-        if !*contacts {
-            pass(
-                contacts,
-                Reader::open_in(domain, robot).map(Passed::Contacts),
-            );
-        }
-        if !*descriptions {
-            pass(
-                descriptions,
-                Reader::open_in(domain, robot).map(Passed::Descriptions),
-            );
-        }
-        if !*samples {
-            pass(samples, Reader::open_in(domain, robot).map(Passed::Samples));
-        }
         let gateway = self.gateway.look(domain, robot, now);
         let estimator = self.estimator.look(domain, robot, now);
         if (gateway, estimator) == (Presence::NotStarted, Presence::NotStarted) && problem.is_none()
@@ -835,5 +776,60 @@ impl Attacher {
             estimator,
             problem,
         }
+    }
+
+    /// Opens the domain, or a new one for one that is gone, of which the cycle gives all ports
+    /// back.
+    fn renew_domain(&mut self) -> Result<(), String> {
+        let is_gone = |domain: &Domain<_>| !domain.is_usable();
+        if self.domain.as_ref().is_some_and(is_gone) {
+            // Somebody has deleted or damaged the domain's files, or the last other process has
+            // left it.
+            self.shared.recall.store(true, Relaxed);
+            if self.passed.contains(&true) {
+                return Err(format!(
+                    "files of the domain {:?} were deleted or damaged; waiting for new ones",
+                    self.config.name
+                ));
+            }
+            (self.gateway, self.estimator) = (Watch::default(), Watch::default());
+            self.domain = None;
+        }
+        self.shared.recall.store(false, Relaxed);
+        if self.domain.is_none() {
+            let domain = Domain::existing(&self.config).map_err(|error| {
+                let siblings = self.config.siblings();
+                match siblings.is_empty() {
+                    true => error.to_string(),
+                    false => format!("{error}; the domains here are {}", siblings.join(", ")),
+                }
+            })?;
+            self.domain = Some(domain);
+        }
+        Ok(())
+    }
+
+    /// Opens the ports that the cycle has not, and passes them to it; returns a problem.
+    fn open_ports(&mut self) -> Option<String> {
+        let (domain, robot) = (self.domain.as_ref()?, &self.robot);
+        let mut problem = None;
+        let missing = self.passed.iter_mut().enumerate();
+        for (number, passed) in missing.filter(|(_, passed)| !**passed) {
+            let opened = match number {
+                0 => Reader::open_in(domain, robot).map(Passed::Torques),
+                1 => Reader::open_in(domain, robot).map(Passed::Contacts),
+                2 => Reader::open_in(domain, robot).map(Passed::Descriptions),
+                _ => Reader::open_in(domain, robot).map(Passed::Samples),
+            };
+            match opened {
+                Ok(port) => {
+                    *passed = self.send.try_send(port).is_ok();
+                    self.shared.has_arrivals.store(true, Release);
+                }
+                Err(PortError::NotYet { .. }) => {}
+                Err(error) => problem = Some(error.to_string()),
+            }
+        }
+        problem
     }
 }
