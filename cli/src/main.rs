@@ -1,4 +1,5 @@
 #![doc = include_str!("../README.md")]
+#![cfg_attr(not(test), warn(clippy::too_many_lines))]
 // The comments are the text of --help, where units stand in brackets as they are.
 #![allow(rustdoc::broken_intra_doc_links, rustdoc::invalid_html_tags)]
 

@@ -1,4 +1,5 @@
 #![doc = include_str!("../README.md")]
+#![cfg_attr(not(test), warn(clippy::too_many_lines))]
 #![no_std]
 // Without a feature, what only its modules use is not used.
 #![cfg_attr(

@@ -261,7 +261,7 @@ impl Bench {
             let (paused, counts) = online.state(group).expect("a group");
             assert!(
                 counts.learnt * 20 > (counts.suspected + counts.outlier) && counts.failed == 0,
-                "{paused} {counts:?}"
+                "{paused:?} {counts:?}"
             );
         }
     }

@@ -1,4 +1,5 @@
 #![doc = include_str!("../README.md")]
+#![cfg_attr(not(test), warn(clippy::too_many_lines))]
 // The comments are those of the C header, where units stand in brackets as they are.
 #![allow(rustdoc::broken_intra_doc_links)]
 // Names are those of the header. It has no links.

@@ -161,7 +161,13 @@ impl TorqueCase {
     }
 
     /// Why a torque is withheld.
-    // Long: a table of what is said of each reason.
+    #[cfg_attr(
+        not(test),
+        expect(
+            clippy::too_many_lines,
+            reason = "a table of what is said of each reason"
+        )
+    )]
     fn withheld(&self, budget: &TorqueBudget, reason: Reason) -> Story {
         let channel = self.cause.as_deref().unwrap_or("a channel");
         let (likelier, residual) = (budget.likelier.as_str(), budget.unexplained.as_str());

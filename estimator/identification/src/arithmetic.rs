@@ -79,17 +79,18 @@ pub(crate) fn forward(factor: &[f64], count: usize, values: &mut [f64], width: u
     }
 }
 
+/// The mean of the finite values; NaN of none.
+pub(crate) fn mean<'a>(values: impl IntoIterator<Item = &'a f64>) -> f64 {
+    let finite = values.into_iter().filter(|x| x.is_finite());
+    let (sum, count) = finite.fold((0.0, 0.0), |(sum, count), x| (sum + x, count + 1.0));
+    sum / count
+}
+
+/// The root mean square of the finite values; NaN of none.
 pub(crate) fn rms(values: impl Iterator<Item = f64>) -> f64 {
-    let (mut sum, mut count) = (0.0, 0.0);
-    for value in values.filter(|x| x.is_finite()) {
-        sum += value * value;
-        count += 1.0;
-    }
-    if count > 0.0 {
-        (sum / count).sqrt()
-    } else {
-        f64::NAN
-    }
+    let finite = values.filter(|x| x.is_finite());
+    let (sum, count) = finite.fold((0.0, 0.0), |(sum, count), x| (sum + x * x, count + 1.0));
+    (sum / count).sqrt()
 }
 
 /// Normal deviates for tests: splitmix64 and Box, Muller.

@@ -21,6 +21,7 @@ mod gains;
 use crate::batch::gains::fit_gains;
 use crate::cross_validation;
 use crate::dataset::{Dataset, LogRole};
+use crate::diagnose::load::LoadChange;
 use crate::diagnose::search::{Search, wrong_signs};
 use crate::diagnose::undeclared::{self, Undeclared};
 use crate::diagnose::{configuration, load};
@@ -31,15 +32,13 @@ use crate::fit::{
     unsettled, walk_limits, without_negative_rotors,
 };
 use crate::measurement::model::MeasurementModel;
-use crate::measurement::noise_model::Seconds;
-use crate::measurement::reduction::{reduce, residuals};
-use crate::prior::MapEstimate;
+use crate::measurement::noise_model::{NoiseModel, Seconds};
 use crate::report::assemble;
 use crate::report::outcome::Outcome;
 use crate::robot::{IdentificationInput, Robot, TorqueSide};
 use crate::training::{
-    SEGMENT_INSTANTS, TrainingLog, map_segments, no_log, prepare, refuse_repeated, sample,
-    segments_of, training_logs, training_logs_mut,
+    SEGMENT_INSTANTS, TrainingLog, no_log, prepare, reduced_segments, refuse_repeated, sample,
+    segment_residuals, segments_of, training_instants, training_logs, training_logs_mut,
 };
 use proprio_dynamics::calibration::{Gain, Kind};
 use std::ops::ControlFlow;
@@ -80,7 +79,7 @@ pub fn identify(
     if !datasets.iter().any(|log| log.role == LogRole::Train) {
         return Err(IdentifyError::NoLogs);
     }
-    let mut report_progress = |step: String, done: f64| progress(&Progress { step, done });
+    let mut progress = |step: String, done: f64| progress(&Progress { step, done });
     let inputs = chosen_inputs(robot, inputs);
 
     // 1. Logs.
@@ -95,82 +94,65 @@ pub fn identify(
         gain: Gain::None,
         ..robot.calibrated
     };
-    measurement.set_calibration_unknowns(
-        temperature_only,
-        training_logs(&logs)
-            .iter()
-            .flat_map(|log| log.instants.iter()),
-    );
+    measurement.set_calibration_unknowns(temperature_only, training_instants(&logs));
 
     // 3. Noise and MAP estimate, without undeclared disturbances.
-    let mut clean = exclude_disturbed(robot, &measurement, &mut logs, &mut report_progress)?;
+    let mut clean = exclude_disturbed(&measurement, &mut logs, &mut progress)?;
 
     let signs = wrong_signs(&measurement, &training_logs(&logs), &clean.estimate);
 
     // 4. Gains of the F/T sensors.
-    let gain = match robot.calibrated.gain {
-        Gain::Auto if measurement.unknowns().sensors.is_empty() => Gain::None,
-        Gain::Auto => Gain::Full,
-        wanted => wanted,
-    };
-    let calibrated = Kind {
-        gain,
-        ..robot.calibrated
-    };
-    if gain != Gain::None {
+    let calibrated = calibrated(&measurement);
+    if calibrated.gain != Gain::None {
         clean = with_gains(
-            robot,
             &mut measurement,
             &mut logs,
             calibrated,
             clean,
-            &mut report_progress,
+            &mut progress,
         )?;
     }
     let measurement = measurement;
-    let CleanFit {
-        estimate,
-        undeclared,
-        not_converged,
-    } = clean;
-    undeclared.report(&measurement, &mut logs, &estimate);
+    let (undeclared, not_converged) = (clean.undeclared, clean.not_converged);
+    undeclared.report(&measurement, &mut logs, &clean.estimate);
 
     // 5. Cross-validation.
     let mut identified = cross_validated_fit(
         &measurement,
         &training_logs(&logs),
-        inputs.clone(),
+        inputs,
         calibrated,
-        estimate,
-        &mut report_progress,
+        clean.estimate,
+        &mut progress,
     )?;
-
     identified.findings.extend(not_converged);
-    identified
-        .findings
-        .extend(not_available(robot, &identified.inputs));
+    let notes = not_available(robot, &identified.inputs);
+    identified.findings.extend(notes);
 
     // 6. Disturbances in validation logs, encoder errors, delays.
     undeclared::report_validation(&measurement, &mut logs, &identified);
-    let training = training_logs(&logs);
-    report_progress("figures".into(), 0.88);
+    progress("figures".into(), 0.88);
     let (found, time_offsets) = if signs.is_empty() {
-        Search::new(&measurement, &training, &identified).findings()
+        Search::new(&measurement, &training_logs(&logs), &identified).findings()
     } else {
         (signs, Vec::new())
     };
 
     // 7. Figures.
-    let outcome = assemble::outcome(
-        robot,
-        &measurement,
-        &logs,
-        &training,
-        &identified,
-        (found, time_offsets),
-    );
-    report_progress("done".into(), 1.0);
+    let outcome = assemble::outcome(&measurement, &logs, &identified, (found, time_offsets));
+    progress("done".into(), 1.0);
     Ok(outcome)
+}
+
+/// The parameters of the sensors' calibrations that are identified.
+fn calibrated(measurement: &MeasurementModel<'_>) -> Kind {
+    let wanted = measurement.robot().calibrated;
+    let gain = match wanted.gain {
+        Gain::Auto if measurement.unknowns().sensors.is_empty() => Gain::None,
+        Gain::Auto => Gain::Full,
+        gain => gain,
+    };
+    Kind { gain, ..wanted }
 }
 
 /// The inputs that are configured, or else those that the robot has.
@@ -243,18 +225,13 @@ pub(crate) fn plausible_model<'a>(
 fn not_available(robot: &Robot, inputs: &[IdentificationInput]) -> Vec<Finding> {
     let mut notes = Vec::new();
     if !robot.calibrated.is_empty() && !inputs.contains(&IdentificationInput::Wrench) {
-        let requested = [
-            (
-                !matches!(robot.calibrated.gain, Gain::None | Gain::Auto),
-                "identification.gain",
-            ),
-            (robot.calibrated.temperature, "identification.temperature"),
-        ];
-        let requested: Vec<&str> = requested
-            .iter()
-            .filter(|(is, _)| *is)
-            .map(|(_, key)| *key)
-            .collect();
+        let mut requested = Vec::new();
+        if !matches!(robot.calibrated.gain, Gain::None | Gain::Auto) {
+            requested.push("identification.gain");
+        }
+        if robot.calibrated.temperature {
+            requested.push("identification.temperature");
+        }
         let requested = requested.join(" and ");
         let text = format!(
             "{requested} requested but not available: F/T sensors are not among the inputs of \
@@ -283,109 +260,108 @@ pub(crate) struct CleanFit {
     not_converged: Option<Finding>,
 }
 
+/// The rounds of fits and exclusions.
+struct Exclusion<'a, 'r> {
+    measurement: &'a MeasurementModel<'r>,
+    logs: &'a mut [TrainingLog],
+    undeclared: Undeclared,
+    drift: OffsetDrift,
+    progress: &'a mut dyn FnMut(String, f64),
+}
+
+impl Exclusion<'_, '_> {
+    /// A fit without what is excluded by now, with this initial noise.
+    fn fit(&mut self, from: Option<NoiseModel>) -> Result<NoiseAndMap, IdentifyError> {
+        let training = training_logs(self.logs);
+        alternate_noise_and_map(self.measurement, &training, self.drift, from, self.progress)
+    }
+
+    /// Excludes a load. The fit without it, if the noise is so much less then that the load is
+    /// accepted; otherwise it is not excluded.
+    fn fit_without(
+        &mut self,
+        load: LoadChange,
+        estimate: &NoiseAndMap,
+    ) -> Result<Option<NoiseAndMap>, IdentifyError> {
+        let before = self.undeclared.loads.clone();
+        let channels = self.measurement.channels_of(&load.units);
+        self.undeclared.add_load(load);
+        self.undeclared.mark(training_logs_mut(self.logs));
+        let without = self.fit(Some(estimate.noise.clone()))?;
+        let unknowns = self.measurement.unknowns();
+        let (with, noise) = (&estimate.noise, &without.noise);
+        let ratio = noise.variance_ratio(with, unknowns, &channels);
+        if ratio > LOAD_VARIANCE_RATIO {
+            return Ok(Some(without));
+        }
+        self.undeclared.loads = before;
+        self.undeclared.mark(training_logs_mut(self.logs));
+        Ok(None)
+    }
+
+    /// Limits the drift of the offsets from now on. Returns whether that changes the fit: where no
+    /// offset drifts faster than the limit, it does not.
+    fn limit_drift(&mut self, noise: &NoiseModel) -> bool {
+        self.drift = OffsetDrift::AsStated;
+        let rates = walk_limits(self.measurement, self.drift).rates;
+        let mut pairs = noise.drift.iter().zip(&rates);
+        pairs.any(|(found, most)| found > most)
+    }
+}
+
 /// Fits, excludes what an undeclared disturbance acted on, and fits again, until the excluded set
 /// does not change.
 pub(crate) fn exclude_disturbed(
-    robot: &Robot,
     measurement: &MeasurementModel<'_>,
     logs: &mut [TrainingLog],
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<CleanFit, IdentifyError> {
-    let mut estimate = alternate_noise_and_map(
-        robot,
-        measurement,
-        &training_logs(logs),
-        OffsetDrift::Free,
-        None,
-        progress,
-    )?;
-    // Rounds start again with each fit: their fraction done is not shown.
-    let mut progress = |step: String, _| progress(step, 0.62);
-    let mut undeclared = Undeclared::none(training_logs_mut(logs));
-    let mut rejected_loads = 0;
-    let mut converged = false;
     // Offsets drift freely at first: with the limited drift, a load that comes or goes would look
     // like noise of every channel.
-    let mut drift = OffsetDrift::Free;
+    let drift = OffsetDrift::Free;
+    let training = training_logs(logs);
+    let mut estimate = alternate_noise_and_map(measurement, &training, drift, None, progress)?;
+    let mut exclusion = Exclusion {
+        measurement,
+        undeclared: Undeclared::none(training_logs_mut(logs)),
+        logs,
+        drift,
+        // Rounds start again with each fit: their fraction done is not shown.
+        progress: &mut |step: String, _| progress(step, 0.62),
+    };
+    let mut rejected_loads = 0;
+    let mut converged = false;
     for _ in 0..EXCLUSION_ROUNDS {
-        progress("undeclared contacts".into(), 0.62);
-        let training = training_logs(logs);
-        let load = (rejected_loads < MAX_REJECTED_LOADS && undeclared.loads.len() < MAX_LOADS)
-            .then(|| {
-                load::find(
-                    measurement,
-                    &estimate.prior,
-                    &training,
-                    &estimate.noise,
-                    estimate.fit.tau,
-                )
-            })
-            .flatten();
-        if let Some(load) = load {
-            let before = undeclared.loads.clone();
-            let channels = measurement.channels_of(&load.units);
-            undeclared.add_load(load);
-            undeclared.mark(training_logs_mut(logs));
-            let without = alternate_noise_and_map(
-                robot,
-                measurement,
-                &training_logs(logs),
-                drift,
-                Some(estimate.noise.clone()),
-                &mut progress,
-            )?;
-            let ratio =
-                without
-                    .noise
-                    .variance_ratio(&estimate.noise, measurement.unknowns(), &channels);
-            if ratio > LOAD_VARIANCE_RATIO {
+        (exclusion.progress)("undeclared contacts".into(), 0.62);
+        let may_be_more =
+            rejected_loads < MAX_REJECTED_LOADS && exclusion.undeclared.loads.len() < MAX_LOADS;
+        if may_be_more
+            && let Some(load) = load::find(measurement, &training_logs(exclusion.logs), &estimate)
+        {
+            if let Some(without) = exclusion.fit_without(load, &estimate)? {
                 estimate = without;
                 continue;
             }
-            undeclared.loads = before;
             rejected_loads += 1;
-            undeclared.mark(training_logs_mut(logs));
         }
-        if let OffsetDrift::Free = drift {
-            drift = OffsetDrift::AsStated;
-            let rates = walk_limits(robot, measurement.unknowns(), drift).rates;
-            if estimate
-                .noise
-                .drift
-                .iter()
-                .zip(&rates)
-                .any(|(found, most)| found > most)
-            {
-                // Without an initial noise model: with freely drifting offsets, noise is divided
-                // differently among the channels. Where no offset drifts faster than the bound, the
-                // bound changes nothing.
-                estimate = alternate_noise_and_map(
-                    robot,
-                    measurement,
-                    &training_logs(logs),
-                    drift,
-                    None,
-                    &mut progress,
-                )?;
-            }
+        if let OffsetDrift::Free = exclusion.drift
+            && exclusion.limit_drift(&estimate.noise)
+        {
+            // Without an initial noise model: with freely drifting offsets, noise is divided
+            // differently among the channels.
+            estimate = exclusion.fit(None)?;
         }
         let NoiseAndMap { noise, fit, .. } = &estimate;
-        converged = undeclared.update(measurement, training_logs_mut(logs), noise, &fit.x);
+        let training = training_logs_mut(exclusion.logs);
+        converged = (exclusion.undeclared).update(measurement, training, noise, &fit.x);
         if converged {
             break;
         }
-        estimate = alternate_noise_and_map(
-            robot,
-            measurement,
-            &training_logs(logs),
-            drift,
-            Some(estimate.noise),
-            &mut progress,
-        )?;
+        estimate = exclusion.fit(Some(estimate.noise))?;
     }
     Ok(CleanFit {
         estimate,
-        undeclared,
+        undeclared: exclusion.undeclared,
         not_converged: (!converged).then(|| undeclared::not_converged(EXCLUSION_ROUNDS)),
     })
 }
@@ -395,39 +371,22 @@ pub(crate) fn exclude_disturbed(
 /// differ, gains are fitted again, [`GAIN_ROUNDS`] times at most. (Each time some of the excluded
 /// instants come back, and add information about the gains.)
 fn with_gains(
-    robot: &Robot,
     measurement: &mut MeasurementModel<'_>,
     logs: &mut [TrainingLog],
     calibrated: Kind,
     mut clean: CleanFit,
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<CleanFit, IdentifyError> {
-    clean.estimate = fit_gains(
-        robot,
-        measurement,
-        logs,
-        calibrated,
-        clean.estimate,
-        progress,
-    )?;
+    clean.estimate = fit_gains(measurement, logs, calibrated, clean.estimate, progress)?;
     clean.not_converged = Some(undeclared::not_converged(GAIN_ROUNDS));
     for _ in 0..GAIN_ROUNDS {
         let NoiseAndMap { noise, fit, .. } = &clean.estimate;
-        if clean
-            .undeclared
-            .update(measurement, training_logs_mut(logs), noise, &fit.x)
-        {
+        let training = training_logs_mut(logs);
+        if (clean.undeclared).update(measurement, training, noise, &fit.x) {
             clean.not_converged = None;
             break;
         }
-        clean.estimate = fit_gains(
-            robot,
-            measurement,
-            logs,
-            calibrated,
-            clean.estimate,
-            progress,
-        )?;
+        clean.estimate = fit_gains(measurement, logs, calibrated, clean.estimate, progress)?;
     }
     Ok(clean)
 }
@@ -444,40 +403,28 @@ fn cross_validated_fit(
 ) -> Result<Identified, IdentifyError> {
     let unknowns = measurement.unknowns().clone();
     let segments = segments_of(training, SEGMENT_INSTANTS);
-    let NoiseAndMap {
-        prior,
-        noise,
-        fit: MapEstimate { tau, x, .. },
-        change,
-        ..
-    } = estimate;
+    let (prior, noise) = (estimate.prior, estimate.noise);
     progress("cross-validation".into(), 0.69);
     let sampled = sample(measurement, training);
+    let tau = estimate.fit.tau;
     let mut retention = cross_validation::held_out(measurement, &prior, &sampled, &noise, tau)?;
-    retention.findings.extend(unsettled(change));
+    retention.findings.extend(unsettled(estimate.change));
     // The fit has absorbed a part of the noise of its own data, most of all noise that is as slow
     // as the motion.
-    let walk_limits = walk_limits(measurement.robot(), &unknowns, OffsetDrift::AsStated);
+    let walk_limits = walk_limits(measurement, OffsetDrift::AsStated);
     let mut noise = retention.noise(measurement, &sampled, noise, &walk_limits);
     // Of the seconds that were not sampled, too.
-    let left = map_segments(measurement, &segments, |measurement, _, segment| {
-        residuals(measurement, segment, &noise, std::slice::from_ref(&x))
-    });
+    let left = segment_residuals(measurement, &segments, &noise, &estimate.fit.x);
     noise.seconds = Seconds::of(&unknowns, &segments, &left, 0);
-    let reduced = map_segments(measurement, &segments, |measurement, _, segment| {
-        reduce(measurement, segment, &noise)
-    });
+    let reduced = reduced_segments(measurement, &segments, &noise);
     let information = added(&reduced, unknowns.parameters());
     let fit = posterior(&prior, &unknowns, &information)?.maximise_evidence()?;
-    retention
-        .findings
-        .extend(negative_rotors(measurement.robot(), &unknowns, &fit));
+    let rotors = negative_rotors(measurement.robot(), &unknowns, &fit);
+    retention.findings.extend(rotors);
     let cad = parameters_without_cad(&unknowns, &information);
     let mut d = without_negative_rotors(&prior, &unknowns, &information, &fit)?;
-    for (column, share) in per_column(&unknowns, &retention.share)
-        .into_iter()
-        .enumerate()
-    {
+    let shares = per_column(&unknowns, &retention.share);
+    for (column, share) in shares.into_iter().enumerate() {
         d[column] = cad[column] + share * (d[column] - cad[column]);
     }
     Ok(Identified {

@@ -15,23 +15,23 @@
 //! fifteen choices of the real leg's spans with CAD, although the best share predicts other spans
 //! with .6 to .99 of CAD's error (and 1.03 once, from a span in which the leg hardly moves).
 
+use crate::dataset::observation::Annotated;
 use crate::finding::{Finding, FindingCode, Severity};
 use crate::fit::{
     IdentifyError, added, parameters_without_cad, posterior, without_negative_rotors,
 };
 use crate::linear::information::Information;
-use crate::measurement::model::{Groups, MeasurementModel};
+use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_estimate::estimate_noise;
 use crate::measurement::noise_model::{DriftLimits, NoiseModel};
 use crate::measurement::reduction::{LogSegment, Residuals, reduce_with, residuals};
+use crate::measurement::unknowns::Unknowns;
 use crate::parallel;
 use crate::prior::Prior;
-use crate::report::prediction::{
-    self, FittedOffsets, JudgedParameters, PredictionError, PredictionErrors,
-};
+use crate::report::prediction::{self, JudgedParameters, PredictionError, PredictionErrors};
 use crate::training::{MIN_FOLD, MIN_SECONDS, folds, map_segments};
 use nalgebra::DVector;
-use proprio_topics::Nanos;
+use std::collections::BTreeSet;
 use std::ops::Range;
 
 /// Most folds; as [`folds`] allows.
@@ -68,9 +68,8 @@ impl Retention {
                 residuals_of_folds(residuals(measurement, segment, &noise, &self.sets), own)
             });
         let unknowns = measurement.unknowns();
-        noise
-            .seconds
-            .standardise(unknowns, segments, &mut own_residuals);
+        let seconds = &noise.seconds;
+        seconds.standardise(unknowns, segments, &mut own_residuals);
         noise.cross_validated_noise(&estimate_noise(
             unknowns,
             &own_residuals,
@@ -86,6 +85,12 @@ struct FoldBlock {
     segment: usize,
     range: Range<usize>,
     fold: usize,
+}
+
+impl FoldBlock {
+    fn instants<'a>(&self, segments: &[LogSegment<'a>]) -> &'a [Annotated] {
+        &segments[self.segment].instants[self.range.clone()]
+    }
 }
 
 /// Holds out one fold after another of these segments of the training logs.
@@ -117,24 +122,15 @@ pub(crate) fn held_out(
         |measurement, number| {
             let (fold, segment) = (number / segments.len(), number % segments.len());
             let mut held = vec![false; segments[segment].instants.len()];
-            for block in blocks
-                .iter()
-                .filter(|b| b.fold == fold && b.segment == segment)
-            {
+            let is_held = |block: &&FoldBlock| block.fold == fold && block.segment == segment;
+            for block in blocks.iter().filter(is_held) {
                 held[block.range.clone()].fill(true);
             }
-            reduce_with(
-                measurement,
-                segments[segment],
-                noise,
-                &held,
-                0,
-                &mut |_, _, _, _| (),
-            )
+            let segment = segments[segment];
+            reduce_with(measurement, segment, noise, &held, 0, &mut |_, _, _, _| ())
         },
     );
-    let mut sets: Vec<DVector<f64>> = Vec::new();
-    let mut candidates: Vec<JudgedParameters> = Vec::new();
+    let (mut sets, mut candidates) = (Vec::new(), Vec::new());
     // Per fold, CAD and the parameters from the others.
     let mut pairs: Vec<[usize; 2]> = Vec::new();
     let cad_is_one = unknowns.parameters_without_cad().is_empty() && unknowns.joints.is_empty();
@@ -145,56 +141,30 @@ pub(crate) fn held_out(
         let own = without_negative_rotors(prior, unknowns, &others, &own)?;
         let both = [parameters_without_cad(unknowns, &others), own];
         let of_others = blocks.iter().filter(|block| block.fold != fold);
-        let instants =
-            of_others.flat_map(|block| &segments[block.segment].instants[block.range.clone()]);
+        let instants = of_others.flat_map(|block| block.instants(segments));
         let friction = prediction::friction(measurement, instants, &both);
-        let both_judged = both
-            .iter()
-            .zip(friction)
-            .map(|(d, friction)| JudgedParameters {
-                course: vec![(Nanos::ZERO, d.clone())],
-                friction,
-            });
+        let judged = both.iter().zip(friction);
+        let judged = judged.map(|(d, friction)| JudgedParameters::constant(d, friction));
         let cad_is_known = cad_is_one && fold > 0;
-        candidates.extend(both_judged.skip(usize::from(cad_is_known)));
+        candidates.extend(judged.skip(usize::from(cad_is_known)));
         let last = candidates.len() - 1;
         pairs.push([if cad_is_known { 0 } else { last - 1 }, last]);
-        sets.push(both.into_iter().nth(1).unwrap_or_default());
+        let [_, own] = both;
+        sets.push(own);
     }
-    let errors: Vec<Vec<PredictionErrors>> = segments
-        .iter()
-        .map(|segment| {
-            PredictionError::of_fit(measurement, segment.instants).errors(
-                unknowns,
-                &candidates,
-                FittedOffsets::Constants,
-            )
-        })
-        .collect();
-    // Per channel: sums of e0 (e0 - e1) and (e0 - e1)^2.
+    let errors = |segment: &LogSegment<'_>| {
+        let log = PredictionError::of_fit(measurement, segment.instants);
+        log.errors(unknowns, &candidates, false)
+    };
+    let judgement = HeldOutErrors {
+        segments,
+        blocks: &blocks,
+        errors: segments.iter().map(errors).collect(),
+        pairs,
+        noise,
+    };
     let sums: Vec<(f64, f64)> = (0..unknowns.channels())
-        .map(|channel| {
-            let (mut cross, mut square) = (0.0, 0.0);
-            for block in &blocks {
-                let [e0, e1] = pairs[block.fold]
-                    .map(|set| &errors[block.segment][set].channels[channel][block.range.clone()]);
-                let instants = &segments[block.segment].instants[block.range.clone()];
-                let log = segments[block.segment].log;
-                for ((e0, e1), instant) in e0.iter().zip(e1).zip(instants) {
-                    if e0.is_finite() && e1.is_finite() {
-                        let weight = if channel < 6 * unknowns.sensors.len() {
-                            noise.seconds.factor(log, instant.t).recip()
-                        } else {
-                            1.0
-                        };
-                        cross += weight * e0 * (e0 - e1);
-                        square += weight * (e0 - e1).powi(2);
-                    }
-                }
-            }
-            let scale = unknowns.scale(channel).powi(2);
-            (scale * cross, scale * square)
-        })
+        .map(|channel| judgement.sums(unknowns, channel))
         .collect();
     let (share, findings) = retained_fraction(measurement, &sums);
     Ok(Retention {
@@ -203,6 +173,45 @@ pub(crate) fn held_out(
         blocks,
         sets,
     })
+}
+
+/// The prediction errors of held-out data.
+struct HeldOutErrors<'a> {
+    segments: &'a [LogSegment<'a>],
+    blocks: &'a [FoldBlock],
+    /// Per segment, of each candidate.
+    errors: Vec<Vec<PredictionErrors>>,
+    /// Per fold, the candidates of CAD and of the parameters from the others.
+    pairs: Vec<[usize; 2]>,
+    noise: &'a NoiseModel,
+}
+
+impl HeldOutErrors<'_> {
+    /// Of a channel, the sums of `e0 (e0 - e1)` and `(e0 - e1)^2`.
+    fn sums(&self, unknowns: &Unknowns, channel: usize) -> (f64, f64) {
+        let is_wrench = channel < 6 * unknowns.sensors.len();
+        let (mut cross, mut square) = (0.0, 0.0);
+        for block in self.blocks {
+            let [e0, e1] = self.pairs[block.fold].map(|candidate| {
+                let errors = &self.errors[block.segment][candidate];
+                &errors.channels[channel][block.range.clone()]
+            });
+            let log = self.segments[block.segment].log;
+            for ((e0, e1), instant) in e0.iter().zip(e1).zip(block.instants(self.segments)) {
+                if e0.is_finite() && e1.is_finite() {
+                    let weight = if is_wrench {
+                        self.noise.seconds.factor(log, instant.t).recip()
+                    } else {
+                        1.0
+                    };
+                    cross += weight * e0 * (e0 - e1);
+                    square += weight * (e0 - e1).powi(2);
+                }
+            }
+        }
+        let scale = unknowns.scale(channel).powi(2);
+        (scale * cross, scale * square)
+    }
 }
 
 /// Divides segments into blocks, and assigns these to `count` folds in the order of time.
@@ -266,18 +275,13 @@ fn retained_fraction(
     sums: &[(f64, f64)],
 ) -> (Vec<f64>, Vec<Finding>) {
     let unknowns = measurement.unknowns();
-    let Groups {
-        links,
-        extra,
-        channels,
-    } = measurement.groups();
+    let groups = measurement.groups();
+    let (links, extra) = (&groups.links, &groups.extra);
     let mut share = vec![0.0; links.len() + extra.len()];
     let mut findings = Vec::new();
-    let mut groups: Vec<usize> = links.clone();
-    groups.sort_unstable();
-    groups.dedup();
-    for group in groups {
-        let own = sums.iter().zip(channels).filter(|(_, g)| **g == group);
+    for group in links.iter().copied().collect::<BTreeSet<usize>>() {
+        let own = sums.iter().zip(&groups.channels);
+        let own = own.filter(|(_, g)| **g == group);
         let (cross, square) = own.fold((0.0, 0.0), |sum, (own, _)| (sum.0 + own.0, sum.1 + own.1));
         let retained_fraction = if square > 0.0 {
             (cross / square).clamp(0.0, 1.0)
@@ -285,14 +289,10 @@ fn retained_fraction(
             0.0
         };
         if retained_fraction < 1.0 {
-            let of_group = unknowns
-                .links
-                .iter()
-                .zip(links)
-                .filter(|(_, g)| **g == group);
-            let names: Vec<&str> = of_group
-                .map(|(link, _)| measurement.robot().model.link_name(*link))
-                .collect();
+            let own = unknowns.links.iter().zip(links);
+            let own = own.filter(|(_, g)| **g == group);
+            let model = &measurement.robot().model;
+            let names: Vec<&str> = own.map(|(link, _)| model.link_name(*link)).collect();
             findings.push(shrunk(retained_fraction, names.join(", ")));
         }
         let all = share.iter_mut().zip(links.iter().chain(extra));

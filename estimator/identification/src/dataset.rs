@@ -16,7 +16,7 @@ pub mod recording;
 mod repeats;
 pub mod resampling;
 pub mod smooth;
-mod stream;
+pub(crate) mod stream;
 
 use crate::finding::{Finding, FindingCode};
 use crate::robot::{ChannelRole, Robot};
@@ -25,9 +25,10 @@ use proprio_topics::Nanos;
 use recording::Recording;
 
 /// The use of a log.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LogRole {
     /// Parameters are identified from it.
+    #[default]
     Train,
     /// Only for assessment: its offsets and friction are fitted to it, for CAD and for the
     /// identified parameters alike.
@@ -68,29 +69,25 @@ impl Dataset {
         role: LogRole,
         mut recording: Recording,
     ) -> Result<Self, DatasetError> {
-        recording
-            .declared
-            .iter_mut()
-            .for_each(|d| d.sort_by_key(|(t, _)| *t));
-        let temperatures = recording.temperatures.iter_mut();
-        temperatures.for_each(|own| own.sort_by_key(|(t, _)| *t));
+        for declared in &mut recording.declared {
+            declared.sort_by_key(|(t, _)| *t);
+        }
+        for temperatures in &mut recording.temperatures {
+            temperatures.sort_by_key(|(t, _)| *t);
+        }
         cleaning::clean(&mut recording, robot);
         recording.span();
         for channel in &recording.channels {
             let imu = &recording.imu;
-            let empty = match channel.role {
-                ChannelRole::Joint(dof) => recording
-                    .joints
-                    .get(dof)
-                    .is_none_or(|j| j.position.t.is_empty()),
+            let is_empty = match channel.role {
+                ChannelRole::Joint(dof) => recording.joints[dof].position.t.is_empty(),
                 ChannelRole::Base => {
                     imu.proper_acceleration.t.is_empty() || imu.angular_velocity.t.is_empty()
                 }
                 ChannelRole::Sensor(_) => false,
             };
-            if empty {
-                let label = cleaning::label(channel);
-                return Err(DatasetError::NoSamples(label));
+            if is_empty {
+                return Err(DatasetError::NoSamples(cleaning::label(channel)));
             }
         }
         inspection::inspect(&mut recording, robot);

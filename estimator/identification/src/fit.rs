@@ -8,11 +8,11 @@ use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_estimate::estimate_noise;
 use crate::measurement::noise_model::Seconds;
 use crate::measurement::noise_model::{DriftLimits, NoiseModel};
-use crate::measurement::reduction::{ReducedLog, reduce, residuals};
+use crate::measurement::reduction::ReducedLog;
 use crate::measurement::unknowns::{ExtraParameter, Unknowns};
 use crate::prior::{MapEstimate, Posterior, Prior, PriorError};
 use crate::robot::{IdentificationInput, Robot};
-use crate::training::{TrainingLog, map_segments, sample};
+use crate::training::{TrainingLog, reduced_segments, sample, segment_residuals};
 use nalgebra::DVector;
 use proprio_dynamics::DynamicsError;
 use proprio_dynamics::calibration::{Kind, Unknown};
@@ -147,9 +147,8 @@ pub(crate) fn parameters_without_cad(
 }
 
 fn is_rotor(unknowns: &Unknowns, column: usize) -> bool {
-    let extra = column
-        .checked_sub(unknowns.inertial())
-        .and_then(|k| unknowns.extra.get(k));
+    let place = column.checked_sub(unknowns.inertial());
+    let extra = place.and_then(|place| unknowns.extra.get(place));
     matches!(extra, Some(ExtraParameter::RotorInertia(_)))
 }
 
@@ -182,9 +181,9 @@ pub(crate) fn without_negative_rotors(
         )?
         .fit(fit.tau)?;
         x = DVector::zeros(unknowns.parameters());
-        keep.iter()
-            .zip(&own.x)
-            .for_each(|(&column, value)| x[column] = *value);
+        for (&column, value) in keep.iter().zip(&own.x) {
+            x[column] = *value;
+        }
     }
     Ok(x)
 }
@@ -239,22 +238,19 @@ pub(crate) struct NoiseAndMap {
 /// Estimates noise and MAP parameters in turn until both converge. `from`: the initial noise, of a
 /// fit to nearly the same data; without it, the residuals of CAD give it.
 pub(crate) fn alternate_noise_and_map(
-    robot: &Robot,
     measurement: &MeasurementModel<'_>,
     training: &[&TrainingLog],
     drift: OffsetDrift,
     from: Option<NoiseModel>,
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<NoiseAndMap, IdentifyError> {
-    let mut unknowns = measurement.unknowns().clone();
+    let (robot, mut unknowns) = (measurement.robot(), measurement.unknowns().clone());
     let prior = Prior::new(robot.model.inertias())?.with_roughly(robot.urdf_relative_std);
     let least = least_variances(robot, &unknowns);
-    let limits = walk_limits(robot, &unknowns, drift);
+    let limits = walk_limits(measurement, drift);
     let sampled = sample(measurement, training);
     let noise_of_residuals = |noise: &NoiseModel, d: &DVector<f64>| {
-        let mut residuals = map_segments(measurement, &sampled, |measurement, _, segment| {
-            residuals(measurement, segment, noise, std::slice::from_ref(d))
-        });
+        let mut residuals = segment_residuals(measurement, &sampled, noise, d);
         let unknowns = measurement.unknowns();
         let seconds = Seconds::of(unknowns, &sampled, &residuals, 0);
         seconds.standardise(unknowns, &sampled, &mut residuals);
@@ -270,9 +266,7 @@ pub(crate) fn alternate_noise_and_map(
             let cad = if has_cad {
                 DVector::zeros(unknowns.parameters())
             } else {
-                let reduced = map_segments(measurement, &sampled, |measurement, _, segment| {
-                    reduce(measurement, segment, &noise)
-                });
+                let reduced = reduced_segments(measurement, &sampled, &noise);
                 parameters_without_cad(&unknowns, &added(&reduced, unknowns.parameters()))
             };
             noise_of_residuals(&noise, &cad)
@@ -286,9 +280,7 @@ pub(crate) fn alternate_noise_and_map(
             0.62 * (round - 1) as f64 / ROUNDS as f64,
         );
         let last = &rounds[round - 1];
-        let reduced = map_segments(measurement, &sampled, |measurement, _, segment| {
-            reduce(measurement, segment, last)
-        });
+        let reduced = reduced_segments(measurement, &sampled, last);
         let information = added(&reduced, unknowns.parameters());
         let fit = posterior(&prior, &unknowns, &information)?.maximise_evidence()?;
         unknowns.precision = gain_precision(robot, &unknowns, &fit);
@@ -337,12 +329,8 @@ fn gain_precision(robot: &Robot, unknowns: &Unknowns, fit: &MapEstimate) -> Vec<
     }
     let root = fit.covariance_root();
     let (mut square, mut gamma) = (1.0, 1.0);
-    for (place, extra) in unknowns
-        .extra
-        .iter()
-        .enumerate()
-        .filter(|(_, own)| is_gain(own))
-    {
+    let extra = unknowns.extra.iter().enumerate();
+    for (place, extra) in extra.filter(|(_, own)| is_gain(own)) {
         let column = unknowns.inertial() + place;
         square += fit.x[column].powi(2) * extra.precision(robot);
         gamma += (1.0 - root.row(column).norm_squared() * precision[place]).max(0.0);
@@ -367,10 +355,11 @@ pub(crate) enum OffsetDrift {
     AsStated,
 }
 
-pub(crate) fn walk_limits(robot: &Robot, unknowns: &Unknowns, drift: OffsetDrift) -> DriftLimits {
+pub(crate) fn walk_limits(measurement: &MeasurementModel<'_>, drift: OffsetDrift) -> DriftLimits {
+    let stated = measurement.unknowns().stated(measurement.robot());
     let rates = match drift {
-        OffsetDrift::Free => vec![f64::INFINITY; 6 * unknowns.sensors.len()],
-        OffsetDrift::AsStated => unknowns.stated(robot).map(|x| x * x).collect(),
+        OffsetDrift::Free => stated.map(|_| f64::INFINITY).collect(),
+        OffsetDrift::AsStated => stated.map(|x| x * x).collect(),
     };
     DriftLimits {
         relative: (crate::measurement::reduction::BLOCK / DRIFT_TIME).powi(2),

@@ -10,12 +10,12 @@ use crate::dataset::observation::{Annotated, Observation};
 use crate::dataset::resampling::RATE;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
-use crate::measurement::reduction::{LogSegment, ReducedLog, reduce};
+use crate::measurement::reduction::{LogSegment, reduce};
 use crate::measurement::unknowns::ExtraParameter;
 use crate::prior::{Prior, PriorError};
 use crate::report::outcome::CovarianceRoot;
 use crate::report::uncertainty::covariance;
-use crate::robot::{IdentificationInput, Robot};
+use crate::robot::{IdentificationInput, Robot, stated_noise};
 use nalgebra::DMatrix;
 use proprio_dynamics::DynamicsError;
 use proprio_dynamics::calibration::{Gain, Kind};
@@ -37,14 +37,12 @@ impl SensorNoise {
     /// As the robot's configuration states it, without drift.
     #[must_use]
     pub fn stated(robot: &Robot) -> Vec<Self> {
-        let sensors = robot.structure.sensors().iter().map(|sensor| {
-            let ([fx, fy, fz], [tx, ty, tz]) = (sensor.noise().force, sensor.noise().torque);
-            Self {
-                deviation: [tx, ty, tz, fx, fy, fz],
-                drift: [0.0; 6],
-            }
+        let sensors = robot.structure.sensors().iter();
+        let stated = sensors.map(|cut| Self {
+            deviation: stated_noise(cut),
+            drift: [0.0; 6],
         });
-        sensors.collect()
+        stated.collect()
     }
 }
 
@@ -69,9 +67,6 @@ pub enum ForecastError {
     #[error("the URDF's inertial parameters cannot be used: {0}")]
     Prior(#[from] PriorError),
 }
-
-/// What the observations of one motion would tell.
-pub struct MotionInformation(ReducedLog);
 
 /// Forecasts for a robot whose F/T sensors are read.
 #[derive(Clone)]
@@ -140,30 +135,23 @@ impl<'a> Forecast<'a> {
         })
     }
 
-    /// What these consecutive observations tell.
-    #[must_use]
-    pub fn told(&self, observations: Vec<Observation>) -> MotionInformation {
+    /// The covariance after these consecutive observations.
+    ///
+    /// # Errors
+    /// [`ForecastError::Singular`].
+    pub fn after(&self, observations: Vec<Observation>) -> Result<CovarianceRoot, ForecastError> {
         let instants: Vec<Annotated> = observations.into_iter().map(Annotated::from).collect();
-        let segment = LogSegment {
-            instants: &instants,
-            log: None,
-        };
-        MotionInformation(reduce(&mut self.measurement.clone(), segment, &self.noise))
-    }
-
-    /// The covariance after these observations. None if it is singular.
-    #[must_use]
-    pub fn covariance(&self, told: MotionInformation) -> Option<CovarianceRoot> {
-        let (r, _) = told.0.information.to_triangle();
+        let segment = LogSegment::alone(&instants);
+        let reduced = reduce(&mut self.measurement.clone(), segment, &self.noise);
+        let (r, _) = reduced.information.to_triangle();
         let (count, unknowns) = (self.before.nrows(), self.before.ncols());
         let mut all = self.before.clone().resize_vertically(count + unknowns, 0.0);
         all.rows_mut(count, unknowns).copy_from(&r);
-        let root = all
-            .qr()
-            .r()
-            .solve_upper_triangular(&DMatrix::identity(unknowns, unknowns))?;
+        let unit = DMatrix::identity(unknowns, unknowns);
+        let root = all.qr().r().solve_upper_triangular(&unit);
+        let root = root.ok_or(ForecastError::Singular)?;
         let unknowns = self.measurement.unknowns();
-        Some(covariance(unknowns, std::slice::from_ref(&told.0), &root))
+        Ok(covariance(unknowns, std::slice::from_ref(&reduced), &root))
     }
 }
 

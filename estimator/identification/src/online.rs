@@ -208,13 +208,8 @@ impl Online {
     /// # Errors
     /// Sizes do not match, or numbers are not finite. Nothing is changed then.
     pub fn observe(&mut self, observation: &OnlineObservation<'_>) -> Result<(), DynamicsError> {
-        let OnlineObservation {
-            t,
-            kinematics,
-            readings,
-            active,
-            ..
-        } = *observation;
+        let (t, kinematics) = (observation.t, observation.kinematics);
+        let (readings, active) = (observation.readings, observation.active);
         let period = self.period.0.max(1);
         let slot = t.0.div_euclid(period);
         // A block has room for one observation per slot.
@@ -234,11 +229,8 @@ impl Online {
         {
             self.last_tick = t;
             self.tick_count += 1;
-            let motion = (
-                observation.state,
-                &observation.base_motion,
-                kinematics.base(),
-            );
+            let base_motion = &observation.base_motion;
+            let motion = (observation.state, base_motion, kinematics.base());
             tick.copy_from(slot, motion, readings, active);
             let all = self.components.iter().enumerate();
             let moving = all.filter(|(_, component)| component.is_moved(observation));
@@ -251,12 +243,8 @@ impl Online {
     /// its offset is learnt anew, and all else is kept. Does not allocate.
     pub fn forget_offset(&mut self, sensor: usize) {
         for component in &mut self.components {
-            if let Some(place) = component
-                .layout
-                .sensors
-                .iter()
-                .position(|own| *own == sensor)
-            {
+            let mut sensors = component.layout.sensors.iter();
+            if let Some(place) = sensors.position(|own| *own == sensor) {
                 component.forget_offset(place);
             }
         }
@@ -344,10 +332,9 @@ impl Online {
                 component.last_change = Some(*change);
                 std::mem::swap(information, &mut component.information);
                 // The limbs' information is from before the change too.
-                component
-                    .limbs
-                    .iter_mut()
-                    .for_each(|limb| limb.information.clear());
+                for limb in &mut component.limbs {
+                    limb.information.clear();
+                }
                 // The solution in use precedes the change; the next one includes it.
                 component.may_judge = false;
                 component.is_disturbed = false;

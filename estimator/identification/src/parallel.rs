@@ -4,7 +4,6 @@
 //! Nested calls run on one thread, since all cores are busy already.
 
 use std::cell::Cell;
-use std::ops::Range;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -61,32 +60,9 @@ pub(crate) fn map_with<S, T: Send>(
     taken.flatten().collect()
 }
 
-/// Numbers per chunk: enough work to be worth a thread.
-const CHUNK: usize = 2048;
-
-/// Applies `work` to consecutive ranges that cover the numbers below `count`, and concatenates its
-/// results.
-pub(crate) fn in_chunks<T: Send>(
-    count: usize,
-    work: impl Fn(Range<usize>) -> Vec<T> + Sync,
-) -> Vec<T> {
-    let chunks = map(count.div_ceil(CHUNK), |number| {
-        work(number * CHUNK..count.min((number + 1) * CHUNK))
-    });
-    chunks.into_iter().flatten().collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn chunks_are_concatenated() {
-        for count in [0, 1, CHUNK, 3 * CHUNK + 7] {
-            let all = in_chunks(count, |range| range.map(|number| 3 * number).collect());
-            assert_eq!(all, (0..count).map(|n| 3 * n).collect::<Vec<_>>());
-        }
-    }
 
     #[test]
     fn results_are_in_the_order_of_the_items() {

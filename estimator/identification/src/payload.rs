@@ -17,7 +17,7 @@ use crate::finding::Finding;
 use crate::fit::IdentifyError;
 use crate::report::outcome::{Outcome, Verdict};
 use crate::robot::{IdentificationInput, Robot};
-use crate::training::training_logs;
+use crate::training::training_instants;
 use nalgebra::{DMatrix, SMatrix, SVector};
 use proprio_dynamics::model::Frame;
 use proprio_dynamics::regressor::LINK_PARAMETERS;
@@ -96,7 +96,7 @@ pub fn payload(
     let unknowns = measurement.unknowns();
     let place = unknowns.links.iter().position(|link| *link == frame.link);
     let place = place.ok_or_else(|| PayloadError::Unseen(name()))?;
-    let clean = exclude_disturbed(robot, &measurement, &mut logs, &mut |_, _| ())?;
+    let clean = exclude_disturbed(&measurement, &mut logs, &mut |_, _| ())?;
     let estimate = clean.estimate;
     clean.undeclared.report(&measurement, &mut logs, &estimate);
 
@@ -132,11 +132,8 @@ pub fn payload(
     // All of it scales with the gain; cross-talk turns the first moment and the inertia.
     let gain = parameters * off;
     let size = |range: std::ops::Range<usize>| {
-        off * parameters.as_slice()[range]
-            .iter()
-            .map(|x| x * x)
-            .sum::<f64>()
-            .sqrt()
+        let squares = parameters.as_slice()[range].iter().map(|x| x * x);
+        off * squares.sum::<f64>().sqrt()
     };
     let (moment, inertia) = (size(1..4), size(4..10));
     let cross_talk = SVector::<f64, LINK_PARAMETERS>::from_fn(|i, _| match i {
@@ -149,10 +146,7 @@ pub fn payload(
         covariance: map * added.covariance * map.transpose()
             + gain * gain.transpose()
             + Square::from_diagonal(&cross_talk),
-        instants: training_logs(&logs)
-            .iter()
-            .map(|log| log.instants.len())
-            .sum(),
+        instants: training_instants(&logs).count(),
         findings: logs.into_iter().flat_map(|log| log.findings).collect(),
     })
 }
@@ -215,9 +209,8 @@ impl Payload {
     /// Centre of mass in the frame \[m\], and the standard deviation of each component.
     #[must_use]
     pub fn centre(&self) -> (Vec3, Vec3) {
-        let centre = |inertia: &RigidInertia| inertia.first_moment / inertia.mass;
-        let of = |inertia: RigidInertia| centre(&inertia).into();
-        let (value, deviation) = self.function::<3>(&of);
+        let centre = |inertia: RigidInertia| (inertia.first_moment / inertia.mass).into();
+        let (value, deviation) = self.function::<3>(&centre);
         (value.into(), deviation.into())
     }
 
@@ -225,7 +218,7 @@ impl Payload {
     /// standard deviation of each component.
     #[must_use]
     pub fn about_centre(&self) -> (Mat3, Mat3) {
-        let of = |inertia: RigidInertia| {
+        let about_centre = |inertia: RigidInertia| {
             let to_centre = Pose {
                 rotation: Mat3::identity(),
                 translation: -inertia.first_moment / inertia.mass,
@@ -233,7 +226,7 @@ impl Payload {
             let tensor = inertia.transformed(&to_centre).inertia;
             std::array::from_fn(|i| tensor[i])
         };
-        let (value, deviation) = self.function::<9>(&of);
+        let (value, deviation) = self.function::<9>(&about_centre);
         (
             Mat3::from_column_slice(&value),
             Mat3::from_column_slice(&deviation),

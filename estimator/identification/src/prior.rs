@@ -73,7 +73,7 @@ use std::f64::consts::FRAC_1_SQRT_2;
 
 use nalgebra::{Matrix4, SMatrix, SVector, SymmetricEigen};
 
-use proprio_dynamics::spatial::{Mat3, RigidInertia, Vec3};
+use proprio_dynamics::spatial::{Mat3, RigidInertia};
 
 pub use posterior::{MapEstimate, Posterior};
 
@@ -262,10 +262,7 @@ impl Prior {
     /// CAD is exact.
     #[must_use]
     pub fn with_relative_std(self, relative: f64) -> Self {
-        let median = (relative * FRAC_1_SQRT_2).clamp(LEAST_TAU, GREATEST_TAU);
-        let spread = QUALITY_FACTOR.ln();
-        let expected = Expected { median, spread };
-        Self { expected, ..self }
+        self.with_quality(relative, QUALITY_FACTOR.ln())
     }
 
     /// As [`Prior::with_relative_std`], with the quality known to a factor of e only: whole logs
@@ -275,18 +272,18 @@ impl Prior {
     /// whose CAD is worse than stated had an error of 11 % on held-out torques, where least squares
     /// has 9 % and no statement at all 4.5 %. Without any, half of a KUKA's postures predict the
     /// others 10 to 14 % worse.
-    #[must_use]
-    pub fn with_roughly(self, relative: f64) -> Self {
-        let Expected { median, .. } = self.clone().with_relative_std(relative).expected;
-        let expected = Expected {
-            median,
-            spread: 1.0,
-        };
+    pub(crate) fn with_roughly(self, relative: f64) -> Self {
+        self.with_quality(relative, 1.0)
+    }
+
+    fn with_quality(self, relative: f64, spread: f64) -> Self {
+        let median = (relative * FRAC_1_SQRT_2).clamp(LEAST_TAU, GREATEST_TAU);
+        let expected = Expected { median, spread };
         Self { expected, ..self }
     }
 
     /// `tau` without data.
-    pub fn expected_tau(&self) -> f64 {
+    pub(crate) fn expected_tau(&self) -> f64 {
         self.expected.median
     }
 
@@ -311,32 +308,6 @@ impl Prior {
     /// The divergence of a body from CAD; infinite if `phi` is not physical.
     pub fn divergence(&self, link: usize, phi: &[f64; 10]) -> f64 {
         divergence(&self.stretch(link, phi))
-    }
-
-    /// Gradient of the divergence by the ten parameters, `tr((J0^-1 - J^-1) E_a)`; not finite if
-    /// `phi` is not physical.
-    pub fn gradient(&self, link: usize, phi: &[f64; 10]) -> [f64; 10] {
-        let u = self.stretch(link, phi);
-        let inverse = (Matrix4::identity() + u)
-            .cholesky()
-            .map(|factor| factor.inverse());
-        let slope = inverse.map_or(Vector10::repeat(f64::NAN), |inverse| {
-            pack(&(Matrix4::identity() - inverse))
-        });
-        (self.centres[link].whiten.transpose() * slope).into()
-    }
-
-    /// Hessian of the divergence by the ten parameters, `tr(J^-1 E_a J^-1 E_b)`; not finite if
-    /// `phi` is not physical.
-    pub fn hessian(&self, link: usize, phi: &[f64; 10]) -> SMatrix<f64, 10, 10> {
-        let u = self.stretch(link, phi);
-        let root = (Matrix4::identity() + u)
-            .cholesky()
-            .and_then(|x| x.l().try_inverse());
-        let root = root.map_or(Matrix10::repeat(f64::NAN), |p| {
-            congruence(&p) * self.centres[link].whiten
-        });
-        root.transpose() * root
     }
 
     /// The Hessian at [`Prior::reference`], `M_ab = tr(J0^-1 E_a J0^-1 E_b)`: `D = 1/2 d^T M d` to
@@ -364,11 +335,8 @@ fn floored(link: usize, body: &RigidInertia) -> (RigidInertia, Matrix4<f64>, Opt
     let given: Mat3 = pseudo.fixed_view::<3, 3>(0, 0) - centre * body.first_moment.transpose();
     let eigen = SymmetricEigen::new((given + given.transpose()) / 2.0);
     let least = mass * LEAST_RADIUS * LEAST_RADIUS;
-    let directions = eigen
-        .eigenvalues
-        .iter()
-        .filter(|&&value| value < least)
-        .count();
+    let values = eigen.eigenvalues.iter();
+    let directions = values.filter(|&&value| value < least).count();
     let raised = eigen.eigenvalues.map(|value| value.max(least).sqrt());
     let extent = eigen.eigenvectors * Mat3::from_diagonal(&raised);
 
@@ -402,35 +370,29 @@ fn body_of(pseudo: &Matrix4<f64>) -> RigidInertia {
     }
 }
 
+/// The places of the different entries of a symmetric matrix.
+#[rustfmt::skip]
+const PLACES: [(usize, usize); 10] = [
+    (0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3),
+];
+
 /// The entries of a symmetric matrix as ten numbers with the same norm: off-diagonal entries are
 /// multiplied by the root of two.
 fn pack(matrix: &Matrix4<f64>) -> Vector10 {
-    let mut packed = Vector10::zeros();
-    let mut next = 0;
-    for row in 0..4 {
-        packed[next] = matrix[(row, row)];
-        next += 1;
-        for column in row + 1..4 {
-            packed[next] = (matrix[(row, column)] + matrix[(column, row)]) * FRAC_1_SQRT_2;
-            next += 1;
-        }
-    }
-    packed
+    let entry = |(i, j): (usize, usize)| match i == j {
+        true => matrix[(i, i)],
+        false => (matrix[(i, j)] + matrix[(j, i)]) * FRAC_1_SQRT_2,
+    };
+    PLACES.map(entry).into()
 }
 
 /// The inverse of [`pack`].
 fn unpack(packed: &Vector10) -> Matrix4<f64> {
     let mut matrix = Matrix4::zeros();
-    let mut next = 0;
-    for row in 0..4 {
-        matrix[(row, row)] = packed[next];
-        next += 1;
-        for column in row + 1..4 {
-            let value = packed[next] * FRAC_1_SQRT_2;
-            matrix[(row, column)] = value;
-            matrix[(column, row)] = value;
-            next += 1;
-        }
+    for (value, (i, j)) in packed.iter().zip(PLACES) {
+        let scale = if i == j { 1.0 } else { FRAC_1_SQRT_2 };
+        matrix[(i, j)] = value * scale;
+        matrix[(j, i)] = value * scale;
     }
     matrix
 }
@@ -506,10 +468,8 @@ fn mean_divergence(tau: f64) -> f64 {
         return 10.0 * square;
     }
     let freedom = 5.0 + 1.0 / square;
-    let logs: f64 = (0..4)
-        .map(|i| digamma((freedom - f64::from(i)) / 2.0))
-        .sum();
-    20.0 * square - logs - 4.0 * (2.0 * square).ln()
+    let logs = (0..4).map(|i| digamma((freedom - f64::from(i)) / 2.0));
+    20.0 * square - logs.sum::<f64>() - 4.0 * (2.0 * square).ln()
 }
 
 /// The derivative of `ln Gamma` for positive arguments: its asymptotic series (Abramowitz, Stegun
@@ -538,47 +498,17 @@ fn digamma(mut x: f64) -> f64 {
 /// [`LEAST_RADIUS`] are raised to these; otherwise the place of a point mass would be exact.
 #[must_use]
 pub fn cad_root(inertia: &RigidInertia, relative: f64) -> SMatrix<f64, 10, 10> {
-    let centre = inertia.centre().unwrap_or_default();
-    let sigma = Mat3::from_diagonal_element(inertia.inertia.trace() / 2.0) - inertia.inertia;
-    let central = sigma - centre * inertia.first_moment.transpose();
-    let mass = inertia.mass.max(LEAST_MASS);
-    let eigen = ((central + central.transpose()) / 2.0).symmetric_eigen();
-    let least = mass * LEAST_RADIUS * LEAST_RADIUS;
-    let radii = eigen.eigenvalues.map(|value| value.max(least).sqrt());
-    let mut l = Matrix4::zeros();
-    for column in 0..3 {
-        let axis: Vec3 = eigen.eigenvectors.column(column) * radii[column];
-        l.fixed_view_mut::<3, 1>(0, column).copy_from(&axis);
-    }
-    l.fixed_view_mut::<3, 1>(0, 3)
-        .copy_from(&(centre * mass.sqrt()));
-    l[(3, 3)] = mass.sqrt();
-    let mut root = SMatrix::zeros();
-    let pairs = (0..4).flat_map(|i| (i..4).map(move |j| (i, j)));
-    for (row, (i, j)) in pairs.enumerate() {
+    let (_, l, _) = floored(0, inertia);
+    let mut root = Matrix10::zeros();
+    for (row, (i, j)) in PLACES.into_iter().enumerate() {
         let (a, b) = (l.column(i).into_owned(), l.column(j).into_owned());
         let change = if i == j {
             a * a.transpose()
         } else {
             (a * b.transpose() + b * a.transpose()) * FRAC_1_SQRT_2
         } * relative;
-        let at = |r: usize, c: usize| change[(r, c)];
-        let half = at(0, 0) + at(1, 1) + at(2, 2);
-        let numbers = [
-            at(3, 3),
-            at(0, 3),
-            at(1, 3),
-            at(2, 3),
-            half - at(0, 0),
-            -at(0, 1),
-            -at(0, 2),
-            half - at(1, 1),
-            -at(1, 2),
-            half - at(2, 2),
-        ];
-        for (column, value) in numbers.into_iter().enumerate() {
-            root[(row, column)] = value;
-        }
+        let parameters = Vector10::from(body_of(&change).parameters());
+        root.set_row(row, &parameters.transpose());
     }
     root
 }

@@ -150,6 +150,11 @@ pub enum RobotError {
     Structure(#[from] StructureError),
 }
 
+/// The stated standard deviations of an F/T sensor's channels, [torque; force].
+pub(crate) fn stated_noise(cut: &SensorCut) -> [f64; 6] {
+    Wrench::from_parts(cut.noise().force, cut.noise().torque).torque_first()
+}
+
 /// The degrees of freedom that move a link against the root.
 pub(crate) fn dofs_above(model: &Model, mut link: usize) -> Vec<usize> {
     let mut dofs = Vec::new();
@@ -306,9 +311,8 @@ impl Robot {
     /// The number of a channel.
     #[must_use]
     pub fn channel(&self, kind: Kind, name: &str) -> Option<usize> {
-        self.channels
-            .iter()
-            .position(|c| c.kind == kind && c.name == name)
+        let mut channels = self.channels.iter();
+        channels.position(|c| c.kind == kind && c.name == name)
     }
 
     /// The number of a published contact.

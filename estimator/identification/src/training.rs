@@ -5,10 +5,12 @@ use crate::dataset::observation::{Annotated, Observation, UnitSet};
 use crate::dataset::{Dataset, LogRole};
 use crate::finding::{Finding, FindingCode, Severity};
 use crate::measurement::model::MeasurementModel;
-use crate::measurement::reduction::LogSegment;
+use crate::measurement::noise_model::NoiseModel;
+use crate::measurement::reduction::{LogSegment, ReducedLog, Residuals, reduce, residuals};
 use crate::measurement::rows::MeasurementRows;
 use crate::parallel;
 use crate::robot::{ChannelRole, Robot};
+use nalgebra::DVector;
 use proprio_dynamics::spatial::Wrench;
 use proprio_topics::{Nanos, Reason};
 use std::collections::BTreeMap;
@@ -92,9 +94,8 @@ impl TrainingLog {
 
     /// Adds findings about the whole log. A refusal among them refuses the log.
     pub(crate) fn add_findings(&mut self, findings: Vec<Finding>) {
-        self.refused |= findings
-            .iter()
-            .any(|finding| finding.severity == Severity::Refusal);
+        let is_refusal = |finding: &Finding| finding.severity == Severity::Refusal;
+        self.refused |= findings.iter().any(is_refusal);
         self.findings.extend(findings);
     }
 }
@@ -103,6 +104,11 @@ impl TrainingLog {
 pub(crate) fn training_logs(logs: &[TrainingLog]) -> Vec<&TrainingLog> {
     let is_used = |log: &&TrainingLog| log.role == LogRole::Train && !log.refused;
     logs.iter().filter(is_used).collect()
+}
+
+/// All instants of these logs.
+pub(crate) fn training_instants(logs: &[TrainingLog]) -> impl Iterator<Item = &Annotated> {
+    (training_logs(logs).into_iter()).flat_map(|log| &log.instants)
 }
 
 pub(crate) fn training_logs_mut(
@@ -162,10 +168,8 @@ pub(crate) fn no_log(logs: &[TrainingLog]) -> String {
     let training = logs.iter().filter(|log| log.role == LogRole::Train);
     let reasons: Vec<String> = training
         .flat_map(|log| {
-            let refusals = log
-                .findings
-                .iter()
-                .filter(|f| f.severity == Severity::Refusal);
+            let findings = log.findings.iter();
+            let refusals = findings.filter(|f| f.severity == Severity::Refusal);
             refusals.map(|f| format!("{}: {}", log.file, f.text))
         })
         .collect();
@@ -178,10 +182,8 @@ pub(crate) fn no_log(logs: &[TrainingLog]) -> String {
 #[must_use]
 pub fn judged(robot: &Robot, dataset: Dataset) -> Vec<Observation> {
     let log = prepare(robot, dataset);
-    log.instants
-        .iter()
-        .map(|own| own.observation().clone())
-        .collect()
+    let instants = log.instants.iter();
+    instants.map(|own| own.observation().clone()).collect()
 }
 
 /// A log with the observations at which the motion is known; the reasons why others are excluded.
@@ -199,35 +201,12 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
         (Some(first), Some(last)) => (first.t, last.t),
         _ => (Nanos::ZERO, Nanos::ZERO),
     };
-    let mut reasons: BTreeMap<String, Excluded> = BTreeMap::new();
-    let mut leave_out = |reason: String, t: Nanos| {
-        let entry = reasons.entry(reason.clone()).or_insert(Excluded {
-            reason,
-            instants: 0,
-            first: t,
-            last: t,
-        });
-        entry.instants += 1;
-        entry.last = t;
-    };
+    let mut reasons = ExclusionReasons::default();
     let mut instants = Vec::new();
     for instant in all {
         let t = instant.t;
         if !instant.has_motion(&robot.channels) {
-            let cause = robot.channels.iter().zip(&instant.faults);
-            let cause = cause
-                .filter(|(c, _)| !matches!(c.role, ChannelRole::Sensor(_)))
-                .find(|(_, f)| **f != Reason::None);
-            leave_out(
-                match cause {
-                    Some((_, Reason::Starting)) => {
-                        "too close to the beginning, the end or a gap for accelerations".into()
-                    }
-                    Some((channel, fault)) => format!("{} of {}", fault.word(), channel.name),
-                    None => instant.base_fault.word().into(),
-                },
-                t,
-            );
+            reasons.add(without_motion(robot, &instant), t);
             continue;
         }
         let mut excluded = Vec::new();
@@ -235,29 +214,25 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
             if let ChannelRole::Sensor(sensor) = channel.role
                 && *fault != Reason::None
             {
-                leave_out(format!("{} of {}", fault.word(), channel.name), t);
+                reasons.add(format!("{} of {}", fault.word(), channel.name), t);
                 excluded.push(sensor);
             }
         }
         for contact in instant.active.difference(&robot.always).iter() {
             let name = robot.contacts.get(contact).map_or("", |c| c.name.as_str());
-            leave_out(
-                format!("contact declared: {name} (the links that it touches)"),
-                t,
-            );
+            let reason = format!("contact declared: {name} (the links that it touches)");
+            reasons.add(reason, t);
         }
         let read = excluded
             .into_iter()
             .fold(instant, Observation::without_reading);
         instants.push(Annotated::from(read));
     }
+    let excluded: Vec<Excluded> = reasons.0.into_values().collect();
     let is_short = folds(instants.iter().map(|instant| instant.t)) < 1;
     if is_short && !refused {
-        findings.push(Finding::refusal(
-            FindingCode::TooShort,
-            "",
-            too_few(instants.len(), apart, &reasons, &findings),
-        ));
+        let text = too_few(instants.len(), apart, &excluded, &findings);
+        findings.push(Finding::refusal(FindingCode::TooShort, "", text));
     }
     TrainingLog {
         file,
@@ -265,9 +240,41 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
         span,
         refused: refused || is_short,
         instants,
-        excluded: reasons.into_values().collect(),
+        excluded,
         findings,
         disturbed: Vec::new(),
+    }
+}
+
+/// What is excluded, by reason.
+#[derive(Default)]
+struct ExclusionReasons(BTreeMap<String, Excluded>);
+
+impl ExclusionReasons {
+    fn add(&mut self, reason: String, t: Nanos) {
+        let entry = self.0.entry(reason.clone()).or_insert(Excluded {
+            reason,
+            instants: 0,
+            first: t,
+            last: t,
+        });
+        entry.instants += 1;
+        entry.last = t;
+    }
+}
+
+/// Why the motion is not known at an instant.
+fn without_motion(robot: &Robot, instant: &Observation) -> String {
+    let mut all = robot.channels.iter().zip(&instant.faults);
+    let cause = all.find(|(channel, fault)| {
+        !matches!(channel.role, ChannelRole::Sensor(_)) && **fault != Reason::None
+    });
+    match cause {
+        Some((_, Reason::Starting)) => {
+            "too close to the beginning, the end or a gap for accelerations".into()
+        }
+        Some((channel, fault)) => format!("{} of {}", fault.word(), channel.name),
+        None => instant.base_fault.word().into(),
     }
 }
 
@@ -287,7 +294,7 @@ pub(crate) fn stamps_apart(robot: &Robot, dataset: &Dataset) -> Option<String> {
 fn too_few(
     count: usize,
     apart: Option<String>,
-    excluded: &BTreeMap<String, Excluded>,
+    excluded: &[Excluded],
     findings: &[Finding],
 ) -> String {
     let why = if let Some(apart) = apart {
@@ -298,7 +305,7 @@ fn too_few(
     {
         dead.text.clone()
     } else {
-        let most = excluded.values().max_by_key(|l| l.instants);
+        let most = excluded.iter().max_by_key(|l| l.instants);
         most.map_or("record more motion".to_owned(), |l| {
             format!("{} excluded: {}", l.instants, l.reason)
         })
@@ -317,6 +324,29 @@ pub(crate) fn map_segments<'a, T: Send>(
         || measurement.clone(),
         |measurement, number| pass(measurement, number, segments[number]),
     )
+}
+
+/// The information of each segment.
+pub(crate) fn reduced_segments(
+    measurement: &MeasurementModel<'_>,
+    segments: &[LogSegment<'_>],
+    noise: &NoiseModel,
+) -> Vec<ReducedLog> {
+    map_segments(measurement, segments, |measurement, _, segment| {
+        reduce(measurement, segment, noise)
+    })
+}
+
+/// The residuals of each segment, for these parameters.
+pub(crate) fn segment_residuals(
+    measurement: &MeasurementModel<'_>,
+    segments: &[LogSegment<'_>],
+    noise: &NoiseModel,
+    d: &DVector<f64>,
+) -> Vec<Residuals> {
+    map_segments(measurement, segments, |measurement, _, segment| {
+        residuals(measurement, segment, noise, std::slice::from_ref(d))
+    })
 }
 
 /// All instants of all logs, in segments of at most `most`.
@@ -361,10 +391,8 @@ pub(crate) fn sample<'a>(
     let mut sampled: Vec<LogSegment<'a>> = taken.map(|segment| stretch(segment, 0)).collect();
     // How often each channel occurs, up to `MIN_FOLD`: without any sample of it, its noise would be
     // estimated as zero.
-    let (mut measurement, mut rows) = (
-        measurement.clone(),
-        MeasurementRows::new(measurement.unknowns()),
-    );
+    let mut rows = MeasurementRows::new(measurement.unknowns());
+    let mut measurement = measurement.clone();
     let mut appears = vec![0; measurement.unknowns().channels()];
     let mut count_channels = |instant: &Annotated, appears: &mut [usize]| -> bool {
         let made = measurement.make(instant, &mut rows).is_ok();

@@ -5,7 +5,7 @@
 mod common;
 
 use common::Random;
-use nalgebra::{DMatrix, DVector, Matrix4};
+use nalgebra::{DMatrix, DVector, Matrix4, SMatrix};
 use proprio_dynamics::spatial::{Mat3, Pose, RigidInertia, Vec3};
 use proprio_identification::prior::{
     GREATEST_TAU, LEAST_MASS, LEAST_RADIUS, MapEstimate, Posterior, Prior, PriorError,
@@ -98,6 +98,30 @@ fn is_body(body: &RigidInertia) -> bool {
     body.pseudo_inertia().cholesky().is_some()
 }
 
+/// The changes of the pseudo-inertia with each parameter, `E_a`.
+fn units() -> [Matrix4<f64>; 10] {
+    std::array::from_fn(|a| {
+        let mut unit = [0.0; 10];
+        unit[a] = 1.0;
+        RigidInertia::from_parameters(&unit).pseudo_inertia()
+    })
+}
+
+/// Gradient of the divergence by the ten parameters, `tr((J0^-1 - J^-1) E_a)`.
+fn gradient(prior: &Prior, link: usize, phi: &[f64; 10]) -> [f64; 10] {
+    let inverse = |body: &RigidInertia| body.pseudo_inertia().try_inverse().unwrap();
+    let change = inverse(prior.reference(link)) - inverse(&RigidInertia::from_parameters(phi));
+    units().map(|unit| (change * unit).trace())
+}
+
+/// Hessian of the divergence by the ten parameters, `tr(J^-1 E_a J^-1 E_b)`.
+fn hessian(phi: &[f64; 10]) -> SMatrix<f64, 10, 10> {
+    let body = RigidInertia::from_parameters(phi).pseudo_inertia();
+    let inverse = body.try_inverse().unwrap();
+    let products = units().map(|unit| inverse * unit);
+    SMatrix::from_fn(|a, b| (products[a] * products[b]).trace())
+}
+
 /// Gradient of the cost, and the size of its terms.
 fn optimality(
     prior: &Prior,
@@ -110,9 +134,7 @@ fn optimality(
     let of_data = data.transpose() * (data * &fit.x - right);
     let mut of_prior = DVector::zeros(fit.x.len());
     for (link, body) in fit.bodies.iter().enumerate() {
-        let gradient = prior
-            .gradient(link, &body.parameters())
-            .map(|value| value * weight);
+        let gradient = gradient(prior, link, &body.parameters()).map(|value| value * weight);
         of_prior.rows_mut(10 * link, 10).copy_from_slice(&gradient);
     }
     for (index, &precision) in precision.iter().enumerate() {
@@ -187,9 +209,9 @@ proptest! {
         let cad = body(random);
         let prior = Prior::new(&[cad]).unwrap();
         let at = deformed(&cad, 0.3, random).parameters();
-        let (gradient, hessian) = (prior.gradient(0, &at), prior.hessian(0, &at));
+        let (slopes, curvatures) = (gradient(&prior, 0, &at), hessian(&at));
         for a in 0..10 {
-            let step = 1e-5 / hessian[(a, a)].sqrt();
+            let step = 1e-5 / curvatures[(a, a)].sqrt();
             let moved = |sign: f64| {
                 let mut moved = at;
                 moved[a] += sign * step;
@@ -198,29 +220,22 @@ proptest! {
             let (up, down) = (moved(1.0), moved(-1.0));
             let slope = (prior.divergence(0, &up) - prior.divergence(0, &down)) / (2.0 * step);
             // In units of each parameter's curvature.
-            let tolerance = 1e-7 * hessian[(a, a)].sqrt() * (1.0 + prior.divergence(0, &at));
-            prop_assert!((slope - gradient[a]).abs() < tolerance);
-            let (up, down) = (prior.gradient(0, &up), prior.gradient(0, &down));
+            let tolerance = 1e-7 * curvatures[(a, a)].sqrt() * (1.0 + prior.divergence(0, &at));
+            prop_assert!((slope - slopes[a]).abs() < tolerance);
+            let (up, down) = (gradient(&prior, 0, &up), gradient(&prior, 0, &down));
             for b in 0..10 {
                 let curvature = (up[b] - down[b]) / (2.0 * step);
-                let size = (hessian[(a, a)] * hessian[(b, b)]).sqrt();
-                let expected = hessian[(a, b)];
+                let size = (curvatures[(a, a)] * curvatures[(b, b)]).sqrt();
+                let expected = curvatures[(a, b)];
                 let error = (curvature - expected).abs();
                 prop_assert!(error < 1e-6 * size, "{a} {b} {curvature} {expected}");
             }
         }
         // The metric is the trace form of its definition.
-        let inverse = cad.pseudo_inertia().try_inverse().unwrap();
-        let unit = |a: usize| {
-            let mut unit = [0.0; 10];
-            unit[a] = 1.0;
-            inverse * RigidInertia::from_parameters(&unit).pseudo_inertia()
-        };
-        let metric = prior.metric(0);
+        let (metric, expected) = (prior.metric(0), hessian(&cad.parameters()));
         for (a, b) in [(0, 0), (1, 4), (3, 9), (5, 5), (2, 8)] {
-            let expected = (unit(a) * unit(b)).trace();
             let size = (metric[(a, a)] * metric[(b, b)]).sqrt();
-            prop_assert!((metric[(a, b)] - expected).abs() < 1e-9 * size);
+            prop_assert!((metric[(a, b)] - expected[(a, b)]).abs() < 1e-9 * size);
         }
     }
 }
@@ -365,7 +380,7 @@ proptest! {
         let fit = posterior.fit(tau).unwrap();
         let mut curvature = DMatrix::zeros(21, 21);
         for (link, body) in fit.bodies.iter().enumerate() {
-            let block = prior.hessian(link, &body.parameters()) * (0.5 / (tau * tau));
+            let block = hessian(&body.parameters()) * (0.5 / (tau * tau));
             curvature.view_mut((10 * link, 10 * link), (10, 10)).copy_from(&block);
         }
         curvature[(20, 20)] = precision[0];
@@ -403,9 +418,7 @@ fn fit_converges_for_any_weight_of_the_data() {
     )
     .unwrap();
     let fit = none.fit(0.3).unwrap();
-    assert!(
-        fit.is_converged && fit.x.amax() == 0.0 && fit.effective.abs() < 1e-9 && none.rank() == 0
-    );
+    assert!(fit.is_converged && fit.x.amax() == 0.0 && fit.effective.abs() < 1e-9);
 
     // Of thirty directions some are known to 1e-9, some about as well as CAD, some hardly, the rest
     // not at all.

@@ -9,7 +9,7 @@
 
 use crate::knowledge::at_rest;
 use crate::motion::{Fence, FourierSeries, JointLimits, harmonics, reach, within};
-use crate::workspace::{Deviation, Puppet, TorqueRows, Workspace};
+use crate::workspace::{Deviation, MotionState, Puppet, TorqueRows, Workspace};
 use fastrand::Rng;
 use nalgebra::DVector;
 use proprio_dynamics::DynamicsError;
@@ -155,21 +155,13 @@ impl<'a> Planner<'a> {
             return Err(ExciteError::Boxes);
         }
         let mut puppet = Puppet::new(robot)?;
-        let dofs = robot.model.dof_count();
-        let examples = starts.iter().take(10).map(|position| {
-            let state = crate::workspace::MotionState {
-                position: position.clone(),
-                velocity: vec![0.0; dofs],
-                acceleration: vec![0.0; dofs],
-            };
-            puppet.observe(Nanos::ZERO, &state)
-        });
+        let examples = starts.iter().take(10);
+        let states = examples.map(|position| MotionState::at_rest(position.clone()));
+        let examples = states.map(|state| puppet.observe(Nanos::ZERO, &state));
         let examples: Vec<Observation> = examples.collect::<Result<_, _>>()?;
         let forecast = Forecast::new(robot, &examples, PERIOD, &task.noise, task.known.as_ref())?;
         let workspace = Workspace::new(at_work, STATES)?;
-        let layout = forecast
-            .covariance(forecast.told(examples))
-            .ok_or(ForecastError::Singular)?;
+        let layout = forecast.after(examples)?;
         let mut rows = workspace.in_columns(robot, &layout.columns, &layout.calibrations);
         rows.keep(&task.wanted);
         if rows.is_empty() {
@@ -277,8 +269,7 @@ impl<'a> Planner<'a> {
     /// # Errors
     /// [`ExciteError`].
     pub fn deviations(&self, series: &FourierSeries) -> Result<Vec<Deviation>, ExciteError> {
-        let told = self.forecast.told(self.observations(series)?);
-        let covariance = (self.forecast.covariance(told)).ok_or(ForecastError::Singular)?;
+        let covariance = self.forecast.after(self.observations(series)?)?;
         Ok(self.workspace.deviations(self.task.robot, &covariance))
     }
 
@@ -331,8 +322,7 @@ impl<'a> Planner<'a> {
         let Ok(observations) = self.observations(&series) else {
             return f64::INFINITY;
         };
-        let covariance = self.forecast.covariance(self.forecast.told(observations));
-        let Some(covariance) = covariance else {
+        let Ok(covariance) = self.forecast.after(observations) else {
             return f64::INFINITY;
         };
         let deviations = self.rows.deviations(&covariance.root);

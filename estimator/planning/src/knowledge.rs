@@ -173,12 +173,7 @@ pub fn at_rest(
     noise: &[SensorNoise],
     known: Option<&CovarianceRoot>,
 ) -> Result<CovarianceRoot, ForecastError> {
-    let dofs = robot.model.dof_count();
-    let mut state = MotionState {
-        position: robot.position_without_samples(),
-        velocity: vec![0.0; dofs],
-        acceleration: vec![0.0; dofs],
-    };
+    let mut state = MotionState::at_rest(robot.position_without_samples());
     for (dof, position) in state.position.iter_mut().enumerate() {
         if robot.locked[dof].is_nan() {
             let range = range(&robot.model, dof);
@@ -190,15 +185,8 @@ pub fn at_rest(
         (0..10).map(|k| puppet.observe(Nanos::from_seconds(0.1 * f64::from(k)), &state));
     let observations = observations.collect::<Result<Vec<_>, _>>()?;
     match Forecast::new(robot, &observations, 0.1, noise, known) {
-        Ok(forecast) => {
-            let told = forecast.told(observations);
-            forecast.covariance(told).ok_or(ForecastError::Singular)
-        }
-        Err(ForecastError::Nothing) => Ok(CovarianceRoot {
-            columns: Vec::new(),
-            calibrations: Vec::new(),
-            root: DMatrix::zeros(0, 0),
-        }),
+        Ok(forecast) => forecast.after(observations),
+        Err(ForecastError::Nothing) => Ok(CovarianceRoot::default()),
         Err(error) => Err(error),
     }
 }

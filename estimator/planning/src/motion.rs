@@ -20,7 +20,7 @@
 use crate::workspace::MotionState;
 use proprio_dynamics::model::{Frame, Limits};
 use proprio_dynamics::spatial::Vec3;
-use proprio_dynamics::{DynamicsError, FrameMotion, JointState, Kinematics};
+use proprio_dynamics::{DynamicsError, FrameMotion, Kinematics};
 use proprio_identification::Robot;
 use std::f64::consts::TAU;
 
@@ -82,14 +82,9 @@ impl<'a> Outside<'a> {
 
     /// The positions of a box's points in its axes.
     fn points(&mut self, fence: &Fence, position: &[f64]) -> Result<Vec<Vec3>, DynamicsError> {
-        let still = vec![0.0; position.len()];
-        let state = JointState {
-            position,
-            velocity: &still,
-            acceleration: &still,
-        };
+        let state = MotionState::at_rest(position.to_vec());
         let motion = FrameMotion::standing(&Vec3::zeros());
-        self.kinematics.update(&self.robot.model, state, &motion)?;
+        (self.kinematics).update(&self.robot.model, state.joints(), &motion)?;
         let pose = |frame: &Frame| *self.kinematics.pose(frame.link) * frame.pose;
         let base = pose(&fence.base).inverse();
         let points = fence.points.iter();
@@ -158,8 +153,7 @@ pub struct FourierSeries {
 }
 
 /// Number of harmonics of a motion of this duration \[s\].
-#[must_use]
-pub fn harmonics(seconds: f64) -> usize {
+pub(crate) fn harmonics(seconds: f64) -> usize {
     (FASTEST * seconds / CYCLES).round().clamp(2.0, 10.0) as usize
 }
 

@@ -44,6 +44,26 @@ pub struct MotionState {
     pub acceleration: Vec<f64>,
 }
 
+impl MotionState {
+    /// At rest at this position.
+    pub(crate) fn at_rest(position: Vec<f64>) -> Self {
+        let still = vec![0.0; position.len()];
+        Self {
+            position,
+            velocity: still.clone(),
+            acceleration: still,
+        }
+    }
+
+    pub(crate) fn joints(&self) -> JointState<'_> {
+        JointState {
+            position: &self.position,
+            velocity: &self.velocity,
+            acceleration: &self.acceleration,
+        }
+    }
+}
+
 /// The degrees of freedom that move and of which the torque is published.
 pub fn measured(robot: &Robot) -> impl Iterator<Item = usize> {
     robot.published().filter(|&dof| robot.locked[dof].is_nan())
@@ -117,11 +137,7 @@ impl<'a> Puppet<'a> {
                 (link, 0, motion, carrying().unwrap_or(link))
             }
         };
-        let joints = JointState {
-            position: &state.position,
-            velocity: &state.velocity,
-            acceleration: &state.acceleration,
-        };
+        let joints = state.joints();
         self.kinematics.set_base(model, known)?;
         self.kinematics.update(model, joints, &motion)?;
         let base = *self.kinematics.motion(base_link);
@@ -162,11 +178,7 @@ fn states(robot: &Robot, count: usize) -> Vec<MotionState> {
     let dofs = model.dof_count();
     let still = robot.position_without_samples();
     let mut state = || {
-        let mut state = MotionState {
-            position: still.clone(),
-            velocity: vec![0.0; dofs],
-            acceleration: vec![0.0; dofs],
-        };
+        let mut state = MotionState::at_rest(still.clone());
         for dof in 0..dofs {
             let mut within = |low: f64, high: f64| low + (high - low) * rng.f64();
             let Limits { lower, upper } = range(model, dof);
@@ -248,8 +260,7 @@ impl Workspace {
 
     /// These torques in the columns of a covariance. What the covariance does not contain has the
     /// uncertainty of CAD and of the configured offsets.
-    #[must_use]
-    pub fn in_columns(
+    pub(crate) fn in_columns(
         &self,
         robot: &Robot,
         columns: &[ParameterColumn],
@@ -319,7 +330,7 @@ pub struct Deviation {
 }
 
 /// The torques in the columns of a covariance.
-pub struct TorqueRows {
+pub(crate) struct TorqueRows {
     torques: Vec<(usize, Option<Block>)>,
 }
 
@@ -329,8 +340,7 @@ type Block = (DMatrix<f64>, DVector<f64>);
 
 impl TorqueRows {
     /// The deviation of each torque for the covariance `root root^T`.
-    #[must_use]
-    pub fn deviations(&self, root: &DMatrix<f64>) -> Vec<Deviation> {
+    pub(crate) fn deviations(&self, root: &DMatrix<f64>) -> Vec<Deviation> {
         let deviation = |(dof, rows): &(usize, Option<Block>)| {
             let torque = rows.as_ref().map(|(rows, rest)| {
                 let square = (rows * root).norm_squared() + rest.sum();
@@ -342,7 +352,7 @@ impl TorqueRows {
     }
 
     /// Keeps only the torques of these degrees of freedom that depend on the covariance.
-    pub fn keep(&mut self, dofs: &[usize]) {
+    pub(crate) fn keep(&mut self, dofs: &[usize]) {
         let depends = |rows: &Option<Block>| {
             (rows.as_ref()).is_some_and(|(rows, _)| rows.iter().any(|x| *x != 0.0))
         };
@@ -350,8 +360,7 @@ impl TorqueRows {
     }
 
     /// Whether there is none.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         self.torques.is_empty()
     }
 }

@@ -2,10 +2,9 @@
 
 use crate::fit::{IdentifyError, NoiseAndMap, OffsetDrift, alternate_noise_and_map};
 use crate::measurement::model::MeasurementModel;
-use crate::measurement::reduction::residuals;
-use crate::robot::Robot;
 use crate::training::{
-    SEGMENT_INSTANTS, TrainingLog, map_segments, segments_of, training_logs, training_logs_mut,
+    SEGMENT_INSTANTS, TrainingLog, segment_residuals, segments_of, training_instants,
+    training_logs, training_logs_mut,
 };
 use proprio_dynamics::calibration::Kind;
 use proprio_dynamics::spatial::Wrench;
@@ -13,7 +12,6 @@ use proprio_dynamics::spatial::Wrench;
 /// Fits gains, too, until they converge. A gain's column is the noise-free reading, as the previous
 /// fit predicts it ([`crate::measurement::model`]).
 pub(crate) fn fit_gains(
-    robot: &Robot,
     measurement: &mut MeasurementModel<'_>,
     logs: &mut [TrainingLog],
     calibrated: Kind,
@@ -26,15 +24,10 @@ pub(crate) fn fit_gains(
     const CONVERGED: f64 = 1e-3;
     let mut progress = |step: String, _| progress(format!("{step}, with gains"), 0.62);
     set_fitted_readings(measurement, logs, &estimate);
-    let instants = training_logs(logs);
-    measurement.set_calibration_unknowns(
-        calibrated,
-        instants.iter().flat_map(|log| log.instants.iter()),
-    );
+    measurement.set_calibration_unknowns(calibrated, training_instants(logs));
     let mut last: Option<Vec<f64>> = None;
     for _ in 0..MAX_FITS {
         estimate = alternate_noise_and_map(
-            robot,
             measurement,
             &training_logs(logs),
             OffsetDrift::AsStated,
@@ -44,18 +37,13 @@ pub(crate) fn fit_gains(
         measurement.set_precision(estimate.precision.clone());
         set_fitted_readings(measurement, logs, &estimate);
         let unknowns = measurement.unknowns();
-        let own = unknowns
-            .precision
-            .iter()
-            .copied()
-            .zip(unknowns.inertial()..);
-        let now: Vec<f64> = own
+        let extra = unknowns.precision.iter().zip(unknowns.inertial()..);
+        let now: Vec<f64> = extra
             .map(|(precision, column)| estimate.fit.x[column] * precision.sqrt())
             .collect();
         let has_converged = |last: &Vec<f64>| {
-            last.iter()
-                .zip(&now)
-                .all(|(a, b)| (a - b).abs() < CONVERGED)
+            let mut pairs = last.iter().zip(&now);
+            pairs.all(|(a, b)| (a - b).abs() < CONVERGED)
         };
         if last.as_ref().is_some_and(has_converged) {
             break;
@@ -66,7 +54,7 @@ pub(crate) fn fit_gains(
 }
 
 /// Stores in the training logs the noise-free readings that this fit predicts.
-pub(crate) fn set_fitted_readings(
+fn set_fitted_readings(
     measurement: &MeasurementModel<'_>,
     logs: &mut [TrainingLog],
     estimate: &NoiseAndMap,
@@ -74,14 +62,8 @@ pub(crate) fn set_fitted_readings(
     let unknowns = measurement.unknowns();
     let training = training_logs(logs);
     let segments = segments_of(&training, SEGMENT_INSTANTS);
-    let residuals = map_segments(measurement, &segments, |measurement, _, segment| {
-        residuals(
-            measurement,
-            segment,
-            &estimate.noise,
-            std::slice::from_ref(&estimate.fit.x),
-        )
-    });
+    let (noise, x) = (&estimate.noise, &estimate.fit.x);
+    let residuals = segment_residuals(measurement, &segments, noise, x);
     let mut fitted = Vec::new();
     for (segment, residuals) in segments.iter().zip(&residuals) {
         for (i, instant) in segment.instants.iter().enumerate() {

@@ -7,7 +7,7 @@ use crate::dataset::repeats::{ChannelRepeats, RepeatedReadings};
 use crate::dataset::smooth::quantum;
 use crate::dataset::stream::{JointTrack, MOTION, SampleStream};
 use crate::finding::{Finding, FindingCode};
-use crate::robot::{ChannelRole, Robot};
+use crate::robot::{Channel, ChannelRole, Robot};
 use crate::statistics::robust_std;
 use proprio_topics::Nanos;
 use std::ops::Range;
@@ -15,7 +15,7 @@ use std::ops::Range;
 /// A sensor whose reading repeats for longer is frozen, unless the robot rests.
 pub(crate) const FREEZE: Nanos = Nanos::from_millis(200);
 
-pub(crate) fn label(channel: &crate::robot::Channel) -> String {
+pub(crate) fn label(channel: &Channel) -> String {
     format!("{}/{}", channel.kind.word(), channel.name)
 }
 
@@ -29,12 +29,25 @@ struct Disorder {
 
 /// A stream of any number of axes.
 trait AnyStream {
+    fn stamps(&self) -> &[Nanos];
     fn order(&mut self) -> Disorder;
     fn remove(&mut self, stamps: &[Nanos]);
     fn measure(&mut self, max_silence: Nanos);
 }
 
 impl Recording {
+    /// Sets the stamps of the first and the last sample.
+    pub(crate) fn span(&mut self) {
+        let (mut first, mut last) = (Nanos::MAX, Nanos::MIN);
+        for channel in self.channels.clone() {
+            for stream in self.streams(channel.role) {
+                first = first.min(stream.stamps().first().copied().unwrap_or(Nanos::MAX));
+                last = last.max(stream.stamps().last().copied().unwrap_or(Nanos::MIN));
+            }
+        }
+        (self.first, self.last) = (first, last);
+    }
+
     /// Every stream of a channel.
     fn streams(&mut self, role: ChannelRole) -> Vec<&mut dyn AnyStream> {
         match role {
@@ -58,6 +71,10 @@ impl Recording {
 }
 
 impl<const D: usize> AnyStream for SampleStream<D> {
+    fn stamps(&self) -> &[Nanos] {
+        &self.t
+    }
+
     /// Removes as few samples as possible so that every stamp is later than the previous one: keeps
     /// a longest increasing subsequence.
     fn order(&mut self) -> Disorder {
@@ -84,35 +101,23 @@ impl<const D: usize> AnyStream for SampleStream<D> {
             keep[i] = true;
             at = before[i];
         }
-        let mut kept: Vec<Nanos> = self
-            .t
-            .iter()
-            .zip(&keep)
-            .filter(|(_, keep)| **keep)
-            .map(|(t, _)| *t)
-            .collect();
-        kept.sort_unstable();
-        for (t, _) in self.t.iter().zip(&keep).filter(|(_, keep)| !**keep) {
+        let before = self.t.clone();
+        self.retain(|i, _| keep[i]);
+        for (t, _) in before.iter().zip(&keep).filter(|(_, keep)| !**keep) {
             disorder.first.get_or_insert(*t);
-            if kept.binary_search(t).is_ok() {
+            if self.t.binary_search(t).is_ok() {
                 disorder.repeated += 1;
             } else {
                 disorder.backward += 1;
             }
         }
-        self.retain(|i| keep[i]);
         disorder
     }
 
     /// Removes the samples with these (sorted) stamps.
     fn remove(&mut self, stamps: &[Nanos]) {
         if !stamps.is_empty() {
-            let drop: Vec<bool> = self
-                .t
-                .iter()
-                .map(|t| stamps.binary_search(t).is_ok())
-                .collect();
-            self.retain(|i| !drop[i]);
+            self.retain(|_, t| stamps.binary_search(&t).is_err());
         }
     }
 
@@ -126,7 +131,6 @@ impl<const D: usize> SampleStream<D> {
     /// number, the largest deviation, and its time. Deviations up to `least` are accepted.
     fn despike(&mut self, axis: usize, least: f64) -> Option<(usize, f64, Nanos)> {
         let values = self.column(axis);
-        let mut neighbours = [0.0; 6];
         // Per sample: its deviation from the neighbours' median, and their range without the two
         // outermost, which may be another spike.
         let together = Nanos(self.spacing.0.saturating_mul(6)).saturating_add(self.max_gap);
@@ -135,24 +139,15 @@ impl<const D: usize> SampleStream<D> {
                 if i < 3 || i + 3 >= values.len() || self.t[i + 3] - self.t[i - 3] > together {
                     return (0.0, f64::INFINITY);
                 }
-                neighbours.copy_from_slice(&[
-                    values[i - 3],
-                    values[i - 2],
-                    values[i - 1],
-                    values[i + 1],
-                    values[i + 2],
-                    values[i + 3],
-                ]);
+                let around = [i - 3, i - 2, i - 1, i + 1, i + 2, i + 3];
+                let mut neighbours = around.map(|k| values[k]);
                 neighbours.sort_by(f64::total_cmp);
                 let middle = 0.5 * (neighbours[2] + neighbours[3]);
                 (values[i] - middle, neighbours[4] - neighbours[1])
             })
             .collect();
-        let usual = robust_std(
-            off.iter()
-                .filter(|(_, spread)| spread.is_finite())
-                .map(|(d, _)| *d),
-        );
+        let known = off.iter().filter(|(_, spread)| spread.is_finite());
+        let usual = robust_std(known.map(|(d, _)| *d));
         let floor = 8.0 * usual + 3.0 * quantum(&values);
         let far = |(d, spread): (f64, f64)| d.abs() > floor + spread && d.abs() > least;
         let count = off.iter().filter(|o| far(**o)).count();
@@ -160,7 +155,7 @@ impl<const D: usize> SampleStream<D> {
             .filter(|i| far(off[*i]))
             .max_by(|a, b| off[*a].0.abs().total_cmp(&off[*b].0.abs()))?;
         let found = (count, off[worst].0, self.t[worst]);
-        self.retain(|i| !far(off[i]));
+        self.retain(|i, _| !far(off[i]));
         Some(found)
     }
 }
@@ -187,9 +182,7 @@ pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
     }
     for (names, disorder) in merged(disorders, |a, b| a == b) {
         if let (Some(first), true) = (disorder.first, disorder.repeated + disorder.backward > 0) {
-            let Disorder {
-                repeated, backward, ..
-            } = disorder;
+            let (repeated, backward) = (disorder.repeated, disorder.backward);
             let text = format!(
                 "{names}: {repeated} stamps occur twice and {backward} go backward, the first at \
                  {first} s: these samples were excluded; check the recorder's clock"
@@ -207,14 +200,13 @@ pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
             let name = label(channel);
             if let Some((from, to)) = stopped(&recording.joints[dof].position) {
                 recording.frozen.push((name.clone(), from, to));
-                recording.joints[dof].each(|s| s.retain_outside(from, to));
+                recording.joints[dof].each(|s| s.retain(|_, t| t <= from || t > to));
             }
             for (from, to) in dead(&recording.joints[dof]) {
                 recording.frozen.push((format!("{name}/torque"), from, to));
                 // The first sample is removed too: its time of measurement is unknown.
-                let stamps = &recording.joints[dof].torque.t;
-                let drop: Vec<bool> = stamps.iter().map(|t| (from..=to).contains(t)).collect();
-                recording.joints[dof].torque.retain(|i| !drop[i]);
+                let torque = &mut recording.joints[dof].torque;
+                torque.retain(|_, t| !(from..=to).contains(&t));
             }
             let track = &mut recording.joints[dof];
             // A deviation within the configured position noise is no spike.
@@ -223,11 +215,8 @@ pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
                 ("position", &mut track.position, noise),
                 ("torque", &mut track.torque, 1e-9),
             ] {
-                found.extend(
-                    stream
-                        .despike(0, least)
-                        .map(|own| outliers(&name, axis, own)),
-                );
+                let own = stream.despike(0, least);
+                found.extend(own.map(|own| outliers(&name, axis, own)));
             }
         }
         if channel.role == ChannelRole::Base {
@@ -275,66 +264,65 @@ pub(crate) fn merged<T>(
             None => groups.push((vec![name], entry)),
         }
     }
-    let name = |names: Vec<String>| {
-        if names.len() == count && count > 1 {
-            "every channel".into()
-        } else {
-            names.join(", ")
-        }
+    let name = |names: Vec<String>| match names.len() == count && count > 1 {
+        true => "every channel".into(),
+        false => names.join(", "),
     };
-    groups
-        .into_iter()
-        .map(|(names, entry)| (name(names), entry))
-        .collect()
+    let groups = groups.into_iter();
+    groups.map(|(names, entry)| (name(names), entry)).collect()
+}
+
+/// Removes the repeated readings of a channel, and notes where it is frozen.
+fn remove_repeats(recording: &mut Recording, channel: &Channel, repeat: &mut ChannelRepeats) {
+    repeat.later.sort_unstable();
+    let (stamps, ..) = recording.stamps(channel.role);
+    let (mut drop, mut held_samples, all) = (Vec::new(), 0, stamps.len());
+    let mut frozen = Vec::new();
+    let but = match channel.role {
+        ChannelRole::Joint(dof) => Some(dof),
+        _ => None,
+    };
+    // Runs of repeats. Each run follows the sample that it repeats.
+    let mut i = 1;
+    while i < stamps.len() {
+        let begin = i;
+        while i < stamps.len() && repeat.later.binary_search(&stamps[i]).is_ok() {
+            i += 1;
+        }
+        if i > begin {
+            let (from, to) = (stamps[begin - 1], stamps[i - 1]);
+            let run = &stamps[begin..i];
+            if to - from < FREEZE {
+                drop.extend_from_slice(run);
+                held_samples += run.len();
+            } else if recording.moves(from, to, but) {
+                drop.extend_from_slice(run);
+                frozen.push((label(channel), from, to));
+            }
+        }
+        i += 1;
+    }
+    repeat.later = drop;
+    recording.frozen.append(&mut frozen);
+    let max_silence = recording.max_silence;
+    for stream in recording.streams(channel.role) {
+        stream.remove(&repeat.later);
+        // Mostly repeats: the sensor's own rate is that of the remaining samples.
+        if held_samples * 2 > all {
+            stream.measure(max_silence);
+        }
+    }
 }
 
 /// Removes repeated readings, and reports their kind: repeated rows, a slow sensor, a frozen one.
 fn repeated(
     recording: &mut Recording,
-    channels: &[crate::robot::Channel],
+    channels: &[Channel],
     repeats: &mut RepeatedReadings,
     found: &mut Vec<Finding>,
 ) {
     for (channel, repeat) in channels.iter().zip(&mut repeats.channels) {
-        repeat.later.sort_unstable();
-        let (stamps, ..) = recording.stamps(channel.role);
-        let (mut drop, mut held_samples, all) = (Vec::new(), 0, stamps.len());
-        let mut frozen = Vec::new();
-        // Runs of repeats. Each run follows the sample that it repeats.
-        let mut i = 1;
-        while i < stamps.len() {
-            let begin = i;
-            while i < stamps.len() && repeat.later.binary_search(&stamps[i]).is_ok() {
-                i += 1;
-            }
-            if i > begin {
-                let (from, to) = (stamps[begin - 1], stamps[i - 1]);
-                let but = if let ChannelRole::Joint(dof) = channel.role {
-                    Some(dof)
-                } else {
-                    None
-                };
-                let run = &stamps[begin..i];
-                if to - from < FREEZE {
-                    drop.extend_from_slice(run);
-                    held_samples += run.len();
-                } else if recording.moves(from, to, but) {
-                    drop.extend_from_slice(run);
-                    frozen.push((label(channel), from, to));
-                }
-            }
-            i += 1;
-        }
-        repeat.later = drop;
-        recording.frozen.append(&mut frozen);
-        let max_silence = recording.max_silence;
-        for stream in recording.streams(channel.role) {
-            stream.remove(&repeat.later);
-            // Mostly repeats: the sensor's own rate is that of the remaining samples.
-            if held_samples * 2 > all {
-                stream.measure(max_silence);
-            }
-        }
+        remove_repeats(recording, channel, repeat);
     }
     let of_rows = |r: &ChannelRepeats| {
         let mut all: Vec<Nanos> = r.later.iter().chain(&r.same_stamp).copied().collect();
@@ -343,10 +331,8 @@ fn repeated(
     };
     let seen: Vec<&ChannelRepeats> = repeats.channels.iter().filter(|r| r.readings > 0).collect();
     let rows = seen.first().map(|r| of_rows(r)).unwrap_or_default();
-    if let (Some(first), true) = (
-        rows.first(),
-        seen.len() > 1 && seen.iter().all(|r| of_rows(r) == rows),
-    ) {
+    let is_of_all = seen.len() > 1 && seen.iter().all(|r| of_rows(r) == rows);
+    if let (Some(first), true) = (rows.first(), is_of_all) {
         // Skipped if a frozen stretch of all channels was already reported.
         if recording.frozen.is_empty() {
             let text = format!(
@@ -360,23 +346,18 @@ fn repeated(
     }
     let mut found_repeats = Vec::new();
     for (channel, repeat) in channels.iter().zip(&repeats.channels) {
-        let frozen = recording.frozen.iter();
-        let frozen: usize = frozen
-            .filter(|(name, ..)| *name == label(channel))
-            .map(|(_, from, to)| {
-                repeat
-                    .later
-                    .iter()
-                    .filter(|t| *t > from && *t <= to)
-                    .count()
-            })
-            .sum();
+        let name = label(channel);
+        let in_frozen = |(other, from, to): &(String, Nanos, Nanos)| {
+            let is_within = |t: &&Nanos| *other == name && *t > from && *t <= to;
+            repeat.later.iter().filter(is_within).count()
+        };
+        let frozen: usize = recording.frozen.iter().map(in_frozen).sum();
         let samples = repeat.later.len() - frozen;
         // Six coarse numbers may repeat by chance now and then.
         let often = samples >= 10 && samples * 50 >= repeat.readings;
         let samples = if often { samples } else { 0 } + repeat.same_stamp.len();
         if samples > 0 {
-            found_repeats.push((label(channel), (samples, repeat.readings)));
+            found_repeats.push((name, (samples, repeat.readings)));
         }
     }
     let found_repeats = merged(found_repeats, |a, b| a == b).into_iter();
@@ -387,14 +368,6 @@ fn repeated(
         );
         Finding::warning(FindingCode::Repeated, channel, text)
     }));
-}
-
-impl<const D: usize> SampleStream<D> {
-    /// Removes the samples after `from` up to `to`.
-    fn retain_outside(&mut self, from: Nanos, to: Nanos) {
-        let outside: Vec<bool> = self.t.iter().map(|t| *t <= from || *t > to).collect();
-        self.retain(|i| outside[i]);
-    }
 }
 
 /// Where an encoder stops from one sample to the next out of fast motion and then stays for at
@@ -448,46 +421,42 @@ pub(crate) fn steep(values: &[f64], flat: &Range<usize>, step: f64) -> [bool; 2]
     ]
 }
 
+/// The runs of equal values.
+pub(crate) fn runs(values: &[f64]) -> Vec<Range<usize>> {
+    let mut end = 0;
+    let equal = values.chunk_by(|a, b| a.to_bits() == b.to_bits());
+    let run = |own: &[f64]| {
+        end += own.len();
+        end - own.len()..end
+    };
+    equal.map(run).collect()
+}
+
 /// Stretches in which a joint's torque repeats for longer than chance, coarse quantisation, a
 /// turning point or a standstill explain, while the joint moves.
 fn dead(track: &JointTrack) -> Vec<(Nanos, Nanos)> {
     /// Greatest probability of a dead stretch in a torque that repeats by chance.
     const CHANCE: f64 = 1e-9;
     let (t, x) = (&track.torque.t, track.torque.column(0));
-    // Stretches of equal samples, from the first to the last.
-    let mut stretches: Vec<(usize, usize)> = Vec::new();
-    for i in 0..x.len() {
-        match stretches.last_mut() {
-            Some((begin, end)) if x[*begin].to_bits() == x[i].to_bits() => *end = i,
-            _ => stretches.push((i, i)),
-        }
-    }
-    let is_long = |(begin, end): &(usize, usize)| t[*end] - t[*begin] >= FREEZE;
-    let steps = |some: &mut dyn Iterator<Item = &(usize, usize)>| {
-        some.map(|(begin, end)| end - begin).sum::<usize>()
-    };
+    let stretches = runs(&x);
+    let is_long = |run: &&Range<usize>| t[run.end - 1] - t[run.start] >= FREEZE;
     // The probability that two consecutive samples outside long stretches are equal.
-    let (all, long) = (
-        x.len().saturating_sub(1),
-        steps(&mut stretches.iter().filter(|s| is_long(s))),
-    );
-    let equal = steps(&mut stretches.iter()) - long;
-    let often = (equal as f64 + 1.0) / ((all - long) as f64 + 2.0);
+    let repeats = |run: &Range<usize>| run.len() - 1;
+    let long: usize = stretches.iter().filter(is_long).map(repeats).sum();
+    let equal = stretches.iter().map(repeats).sum::<usize>() - long;
+    let others = x.len().saturating_sub(1) - long;
+    let often = (equal as f64 + 1.0) / (others as f64 + 2.0);
     let step = quantum(&x);
-    let dead = |stretch: &&(usize, usize)| {
-        let (begin, end) = **stretch;
-        is_long(stretch)
-            && often.powf((end - begin) as f64) < CHANCE
-            && steep(&x, &(begin..end + 1), step).contains(&true)
-            && track.range(t[begin], t[end]) > MOTION
+    let is_dead = |run: &Range<usize>| {
+        is_long(&run)
+            && often.powf(repeats(run) as f64) < CHANCE
+            && steep(&x, run, step).contains(&true)
     };
     // A torque that never changes has no other samples to compare with.
-    let all_equal = stretches.len() == 1 && stretches.iter().any(is_long);
-    stretches
-        .iter()
-        .filter(|stretch| {
-            dead(stretch) || all_equal && track.range(t[stretch.0], t[stretch.1]) > MOTION
-        })
-        .map(|(begin, end)| (t[*begin], t[*end]))
+    let all_equal = stretches.len() == 1 && stretches.iter().any(|run| is_long(&run));
+    let spans = stretches.iter().filter(|run| is_dead(run) || all_equal);
+    spans
+        .map(|run| (t[run.start], t[run.end - 1]))
+        .filter(|(from, to)| track.range(*from, *to) > MOTION)
         .collect()
 }

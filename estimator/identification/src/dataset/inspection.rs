@@ -1,11 +1,11 @@
 //! Checks the recorded channels one by one: gaps, saturation, units, derivatives, motion.
 
-use crate::dataset::cleaning::{FREEZE, STEEP, label, merged, steep};
+use crate::dataset::cleaning::{FREEZE, STEEP, label, merged, runs, steep};
 use crate::dataset::recording::{Recording, SkippedRows};
 use crate::dataset::smooth::{Scratch, quantum};
 use crate::dataset::stream::{MOTION, SampleStream, range};
 use crate::finding::{Finding, FindingCode};
-use crate::robot::{AXES, ChannelRole, Robot};
+use crate::robot::{AXES, Channel, ChannelRole, Robot};
 use crate::statistics::median;
 use proprio_topics::{Nanos, Reason};
 use std::ops::Range;
@@ -30,92 +30,8 @@ pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
     gaps(recording, &channels, &mut found);
     for channel in &channels {
         match channel.role {
-            ChannelRole::Joint(dof) => {
-                let (track, joint) = (&recording.joints[dof], &channel.name);
-                if recording.stamped && range(track.position.value.iter().map(|[v]| *v)) == 0.0 {
-                    let channel = label(channel);
-                    let text = format!(
-                        "{channel} never changes: the joint stands still, or its encoder is dead; \
-                         parameters that need its motion keep their URDF values"
-                    );
-                    found.push(Finding::note(FindingCode::JointStill, channel, text));
-                }
-                let track = &mut recording.joints[dof];
-                // The velocity is the better reference for the acceleration, if it is a good one.
-                let mut reference = (track.position.clone(), 0);
-                let derivatives = [
-                    ("velocity", "rad/s", 1, &mut track.velocity),
-                    ("acceleration", "rad/s^2", 2, &mut track.acceleration),
-                ];
-                for (given, unit, order, stream) in derivatives {
-                    let Some(wrong) = wrong_derivative(&reference.0, stream, order - reference.1)
-                    else {
-                        if order == 1 && stream.t.len() >= LEAST_COMPARED {
-                            reference = (stream.clone(), 1);
-                        }
-                        continue;
-                    };
-                    let text = match wrong {
-                        Wrong::Factor(factor) => format!(
-                            "joint/{joint}: the logged {given} must be multiplied by {factor:.4} \
-                             to match the derivative of the position: check its unit and sign, or \
-                             remove the column"
-                        ),
-                        Wrong::Noise(off) => {
-                            *stream = SampleStream::default();
-                            format!(
-                                "joint/{joint}: the logged {given} is not that of the {}: \
-                                 {off:.3} {unit} off, most of it noise; it is not used",
-                                ["positions", "velocities"][reference.1]
-                            )
-                        }
-                    };
-                    found.push(Finding::warning(FindingCode::Derivative, joint, text));
-                }
-                let track = &recording.joints[dof];
-                let cut = cut_off(&track.torque, 0, |from, to| recording.moves(from, to, None));
-                let torque = &mut recording.joints[dof].torque;
-                found.extend(cut.and_then(|cut| saturated(torque, cut, label(channel), "torque")));
-            }
-            ChannelRole::Sensor(number) => {
-                let stream = &recording.sensors[number];
-                if stream.t.is_empty() && stream.faulty.is_empty() {
-                    let channel = label(channel);
-                    let text = format!(
-                        "{channel} is in the configuration but has no sample: everything that \
-                         needs it is excluded; record it, or remove it from the configuration"
-                    );
-                    found.push(Finding::warning(FindingCode::NeverSeen, channel, text));
-                    continue;
-                }
-                let marked = |reason| {
-                    let of = stream.faulty.iter().filter(|(_, r)| *r == reason);
-                    let mut stamps = of.map(|(t, _)| *t);
-                    let first = stamps.next()?;
-                    Some((first, 1 + stamps.count()))
-                };
-                if let Some((first, samples)) = marked(Reason::Saturated) {
-                    let channel = label(channel);
-                    let text = format!("{channel} reports saturation {}", at(samples, first));
-                    found.push(Finding::warning(FindingCode::Saturated, channel, text));
-                }
-                if let Some((first, samples)) = marked(Reason::Frozen) {
-                    let channel = label(channel);
-                    let text = format!(
-                        "{channel} is frozen in {samples} samples, the first at {first} s: its \
-                         board repeats its readings instead of measuring; they are excluded; check \
-                         the board, its cable and its temperature, and switch it off and on"
-                    );
-                    found.push(Finding::warning(FindingCode::Frozen, channel, text));
-                }
-                for (axis, word) in AXES.into_iter().enumerate() {
-                    let cut = cut_off(&recording.sensors[number], axis, |from, to| {
-                        recording.moves(from, to, None)
-                    });
-                    let stream = &mut recording.sensors[number];
-                    found.extend(cut.and_then(|cut| saturated(stream, cut, label(channel), word)));
-                }
-            }
+            ChannelRole::Joint(dof) => inspect_joint(recording, dof, channel, &mut found),
+            ChannelRole::Sensor(number) => inspect_sensor(recording, number, channel, &mut found),
             ChannelRole::Base => {}
         }
     }
@@ -124,11 +40,102 @@ pub(crate) fn inspect(recording: &mut Recording, robot: &Robot) {
     recording.findings = found;
 }
 
-fn gaps(recording: &Recording, channels: &[crate::robot::Channel], found: &mut Vec<Finding>) {
+fn inspect_joint(
+    recording: &mut Recording,
+    dof: usize,
+    channel: &Channel,
+    found: &mut Vec<Finding>,
+) {
+    let (track, joint) = (&mut recording.joints[dof], &channel.name);
+    if recording.stamped && range(track.position.value.iter().map(|[v]| *v)) == 0.0 {
+        let channel = label(channel);
+        let text = format!(
+            "{channel} never changes: the joint stands still, or its encoder is dead; parameters \
+             that need its motion keep their URDF values"
+        );
+        found.push(Finding::note(FindingCode::JointStill, channel, text));
+    }
+    // The velocity is the better reference for the acceleration, if it is a good one.
+    let mut reference = (track.position.clone(), 0);
+    let derivatives = [
+        ("velocity", "rad/s", 1, &mut track.velocity),
+        ("acceleration", "rad/s^2", 2, &mut track.acceleration),
+    ];
+    for (given, unit, order, stream) in derivatives {
+        let text = match wrong_derivative(&reference.0, stream, order - reference.1) {
+            None => {
+                if order == 1 && stream.t.len() >= LEAST_COMPARED {
+                    reference = (stream.clone(), 1);
+                }
+                continue;
+            }
+            Some(Wrong::Factor(factor)) => format!(
+                "joint/{joint}: the logged {given} must be multiplied by {factor:.4} to match the \
+                 derivative of the position: check its unit and sign, or remove the column"
+            ),
+            Some(Wrong::Noise(off)) => {
+                *stream = SampleStream::default();
+                format!(
+                    "joint/{joint}: the logged {given} is not that of the {}: {off:.3} {unit} off, \
+                     most of it noise; it is not used",
+                    ["positions", "velocities"][reference.1]
+                )
+            }
+        };
+        found.push(Finding::warning(FindingCode::Derivative, joint, text));
+    }
+    let track = &recording.joints[dof];
+    let cut = cut_off(&track.torque, 0, |from, to| recording.moves(from, to, None));
+    let torque = &mut recording.joints[dof].torque;
+    found.extend(cut.and_then(|cut| saturated(torque, cut, label(channel), "torque")));
+}
+
+fn inspect_sensor(
+    recording: &mut Recording,
+    number: usize,
+    channel: &Channel,
+    found: &mut Vec<Finding>,
+) {
+    let (stream, name) = (&recording.sensors[number], label(channel));
+    if stream.t.is_empty() && stream.faulty.is_empty() {
+        let text = format!(
+            "{name} is in the configuration but has no sample: everything that needs it is \
+             excluded; record it, or remove it from the configuration"
+        );
+        found.push(Finding::warning(FindingCode::NeverSeen, name, text));
+        return;
+    }
+    let marked = |reason| {
+        let of = stream.faulty.iter().filter(|(_, r)| *r == reason);
+        let mut stamps = of.map(|(t, _)| *t);
+        let first = stamps.next()?;
+        Some((first, 1 + stamps.count()))
+    };
+    if let Some((first, samples)) = marked(Reason::Saturated) {
+        let text = format!("{name} reports saturation {}", at(samples, first));
+        found.push(Finding::warning(FindingCode::Saturated, &name, text));
+    }
+    if let Some((first, samples)) = marked(Reason::Frozen) {
+        let text = format!(
+            "{name} is frozen in {samples} samples, the first at {first} s: its board repeats its \
+             readings instead of measuring; they are excluded; check the board, its cable and its \
+             temperature, and switch it off and on"
+        );
+        found.push(Finding::warning(FindingCode::Frozen, &name, text));
+    }
+    for (axis, word) in AXES.into_iter().enumerate() {
+        let stream = &recording.sensors[number];
+        let cut = cut_off(stream, axis, |from, to| recording.moves(from, to, None));
+        let stream = &mut recording.sensors[number];
+        found.extend(cut.and_then(|cut| saturated(stream, cut, name.clone(), word)));
+    }
+}
+
+fn gaps(recording: &Recording, channels: &[Channel], found: &mut Vec<Finding>) {
     if !recording.stamped {
         return;
     }
-    let of_channel = |channel: &crate::robot::Channel| {
+    let of_channel = |channel: &Channel| {
         let (stamps, max_gap, spacing) = recording.stamps(channel.role);
         let mut gaps = Vec::new();
         // A log of single postures has no gaps.
@@ -137,12 +144,8 @@ fn gaps(recording: &Recording, channels: &[crate::robot::Channel], found: &mut V
         {
             let late = max_gap.max(recording.max_silence);
             gaps.extend((*first - recording.first > late).then_some((recording.first, *first)));
-            gaps.extend(
-                stamps
-                    .windows(2)
-                    .filter(|w| w[1] - w[0] > max_gap)
-                    .map(|w| (w[0], w[1])),
-            );
+            let apart = stamps.windows(2).filter(|w| w[1] - w[0] > max_gap);
+            gaps.extend(apart.map(|w| (w[0], w[1])));
             gaps.extend((recording.last - *last > late).then_some((*last, recording.last)));
         }
         // Gaps by exclusion are reported with the reason for the exclusion.
@@ -157,14 +160,10 @@ fn gaps(recording: &Recording, channels: &[crate::robot::Channel], found: &mut V
     // Channels with their own rows do not end and begin again at the very same stamps.
     let near = |a: Nanos, b: Nanos| (a - b).0.abs() <= 30_000_000;
     let same = |a: &Vec<(Nanos, Nanos)>, b: &Vec<(Nanos, Nanos)>| {
-        a.len() == b.len()
-            && a.iter()
-                .zip(b)
-                .all(|(a, b)| near(a.0, b.0) && near(a.1, b.1))
+        let mut pairs = a.iter().zip(b);
+        a.len() == b.len() && pairs.all(|(a, b)| near(a.0, b.0) && near(a.1, b.1))
     };
-    let seen = channels
-        .iter()
-        .filter(|c| !recording.stamps(c.role).0.is_empty());
+    let seen = (channels.iter()).filter(|c| !recording.stamps(c.role).0.is_empty());
     let all = merged(seen.map(of_channel).collect(), same);
     for (channel, gaps) in all {
         if let Some(longest) = gaps.iter().max_by_key(|(from, to)| *to - *from) {
@@ -204,13 +203,7 @@ fn cut_off<const D: usize>(
         return None;
     }
     // A torque that is recorded faster than it is measured repeats everywhere.
-    let mut runs: Vec<Range<usize>> = Vec::new();
-    for i in 0..values.len() {
-        match runs.last_mut() {
-            Some(run) if values[run.start].to_bits() == values[i].to_bits() => run.end = i + 1,
-            _ => runs.push(i..i + 1),
-        }
-    }
+    let runs = runs(&values);
     let usual = median(runs.iter().map(|run| run.len() as f64).collect());
     let is_long =
         |run: &&Range<usize>| run.len() >= FLAT && run.len() as f64 >= FLAT as f64 * usual;
@@ -237,21 +230,15 @@ fn cut_off<const D: usize>(
     };
     let mut worst: Option<(f64, Vec<usize>)> = None;
     for extreme in [low, high] {
-        let at_it = runs
-            .iter()
-            .filter(|run| values[run.start].to_bits() == extreme.to_bits());
-        let flat: Vec<&Range<usize>> = at_it
-            .filter(is_long)
-            .filter(others_change)
-            .filter(|run| !rests(run))
-            .collect();
+        let is_at = |run: &&Range<usize>| values[run.start].to_bits() == extreme.to_bits();
+        let flat = runs.iter().filter(is_at).filter(is_long);
+        let flat = flat.filter(others_change).filter(|run| !rests(run));
+        let flat: Vec<&Range<usize>> = flat.collect();
         // A single saturated torque returns to the extreme.
         let enough = if D == 1 { 2 } else { 1 };
         let samples: Vec<usize> = flat.iter().flat_map(|run| (*run).clone()).collect();
-        let is_cut = flat.len() >= enough
-            && flat
-                .iter()
-                .any(|run| steep(&values, run, step) == [true; 2]);
+        let is_steep = |run: &&Range<usize>| steep(&values, run, step) == [true; 2];
+        let is_cut = flat.len() >= enough && flat.iter().any(is_steep);
         if is_cut && samples.len() > worst.as_ref().map_or(0, |(_, worst)| worst.len()) {
             worst = Some((extreme, samples));
         }
@@ -267,11 +254,10 @@ fn saturated<const D: usize>(
     axis: &'static str,
 ) -> Option<Finding> {
     let first = stream.t[*samples.first()?];
-    stream
-        .faulty
-        .extend(samples.iter().map(|i| (stream.t[*i], Reason::Saturated)));
+    let faulty = samples.iter().map(|i| (stream.t[*i], Reason::Saturated));
+    stream.faulty.extend(faulty);
     stream.faulty.sort_by_key(|(t, _)| *t);
-    stream.retain(|i| samples.binary_search(&i).is_err());
+    stream.retain(|i, _| samples.binary_search(&i).is_err());
     let text = format!(
         "{channel}: {axis} is saturated at {value} {}",
         at(samples.len(), first)
@@ -341,42 +327,23 @@ fn units(recording: &Recording, robot: &Robot, found: &mut Vec<Finding>) {
     for channel in &recording.channels {
         match channel.role {
             ChannelRole::Joint(dof) => {
-                let limits = robot
-                    .model
-                    .dof_joint(dof)
-                    .and_then(|j| robot.model.limits(j));
-                let most = |v: f64| {
-                    recording.joints[dof]
-                        .position
-                        .value
-                        .iter()
-                        .map(|[q]| (q * v).abs())
-                        .fold(0.0, f64::max)
-                };
-                if let Some(limits) = limits {
+                let joint = robot.model.dof_joint(dof);
+                let positions = recording.joints[dof].position.value.iter();
+                let most = positions.map(|[q]| q.abs()).fold(0.0, f64::max);
+                if let Some(limits) = joint.and_then(|joint| robot.model.limits(joint)) {
                     let reach = limits.lower.abs().max(limits.upper.abs());
-                    if most(1.0) > 2.0 * reach
-                        && most(1.0) > 6.3
-                        && most(1.0_f64.to_radians()) <= 1.1 * reach
-                    {
+                    if most > 2.0 * reach && most > 6.3 && most.to_radians() <= 1.1 * reach {
                         degrees.0.push(label(channel));
-                        degrees.1 = degrees.1.max(most(1.0));
+                        degrees.1 = degrees.1.max(most);
                     }
                 }
             }
             // Their units are compared with what CAD predicts.
             ChannelRole::Sensor(_) => {}
             ChannelRole::Base => {
-                let of = |v: &[f64; 3]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
-                let magnitude = median(
-                    recording
-                        .imu
-                        .proper_acceleration
-                        .value
-                        .iter()
-                        .map(of)
-                        .collect(),
-                );
+                let norm = |v: &[f64; 3]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
+                let accelerations = recording.imu.proper_acceleration.value.iter();
+                let magnitude = median(accelerations.map(norm).collect());
                 if !(3.0..=30.0).contains(&magnitude) {
                     let text = format!(
                         "a typical proper acceleration of {magnitude:.4} m/s^2 is not near 9.8: \

@@ -82,6 +82,7 @@ impl Recording {
         let Some(role) = self.channels.get(channel).map(|c| c.role) else {
             return;
         };
+        let device_fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
         match (role, reading) {
             (ChannelRole::Joint(dof), Reading::Joint(j)) => {
                 let Some(track) = self.joints.get_mut(dof) else {
@@ -91,38 +92,26 @@ impl Recording {
                 track.position.push(t, [j.position], fault);
                 track.velocity.push(t, [j.velocity], fault);
                 track.acceleration.push(t, [j.acceleration], fault);
-                track.torque.push(
-                    t,
-                    [j.torque],
-                    Reason::of_quality(quality, Quality::DEVICE_FAULT),
-                );
+                track.torque.push(t, [j.torque], device_fault);
             }
             (ChannelRole::Sensor(number), Reading::Wrench(w)) => {
                 let ([fx, fy, fz], [tx, ty, tz]) = (w.force, w.torque);
                 if let Some(stream) = self.sensors.get_mut(number) {
-                    stream.push(
-                        t,
-                        [fx, fy, fz, tx, ty, tz],
-                        Reason::of_quality(quality, Quality::DEVICE_FAULT),
-                    );
+                    stream.push(t, [fx, fy, fz, tx, ty, tz], device_fault);
                 }
             }
             (ChannelRole::Sensor(number), Reading::Temperature(temperature)) => {
-                let is_good =
-                    temperature.celsius.is_finite() && !quality.intersects(Quality::DEVICE_FAULT);
+                let celsius = temperature.celsius;
+                let is_good = celsius.is_finite() && !quality.intersects(Quality::DEVICE_FAULT);
                 if let Some(own) = self.temperatures.get_mut(number).filter(|_| is_good) {
-                    own.push((t, temperature.celsius));
+                    own.push((t, celsius));
                 }
             }
             (ChannelRole::Base, Reading::Imu(i)) => {
-                let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
-                self.imu
-                    .proper_acceleration
-                    .push(t, i.proper_acceleration, fault);
-                self.imu.angular_velocity.push(t, i.angular_velocity, fault);
-                self.imu
-                    .angular_acceleration
-                    .push(t, i.angular_acceleration, fault);
+                let imu = &mut self.imu;
+                (imu.proper_acceleration).push(t, i.proper_acceleration, device_fault);
+                (imu.angular_velocity).push(t, i.angular_velocity, device_fault);
+                (imu.angular_acceleration).push(t, i.angular_acceleration, device_fault);
             }
             _ => {}
         }
@@ -165,42 +154,13 @@ impl Recording {
         sensors.for_each(|(own, next)| own.append(next));
         let temperatures = self.temperatures.iter_mut().zip(next.temperatures);
         temperatures.for_each(|(own, next)| own.extend(next));
-        self.imu
-            .proper_acceleration
-            .append(next.imu.proper_acceleration);
-        self.imu.angular_velocity.append(next.imu.angular_velocity);
-        self.imu
-            .angular_acceleration
-            .append(next.imu.angular_acceleration);
+        let (imu, next_imu) = (&mut self.imu, next.imu);
+        (imu.proper_acceleration).append(next_imu.proper_acceleration);
+        imu.angular_velocity.append(next_imu.angular_velocity);
+        (imu.angular_acceleration).append(next_imu.angular_acceleration);
         let declared = self.declared.iter_mut().zip(next.declared);
         declared.for_each(|(own, next)| own.extend(next));
         self.stamped &= next.stamped;
-    }
-
-    pub(crate) fn span(&mut self) {
-        (self.first, self.last) = (Nanos::MAX, Nanos::MIN);
-        let (mut first, mut last) = (Nanos::MAX, Nanos::MIN);
-        self.each_stream(|t| {
-            first = first.min(t.first().copied().unwrap_or(Nanos::MAX));
-            last = last.max(t.last().copied().unwrap_or(Nanos::MIN));
-        });
-        (self.first, self.last) = (first, last);
-    }
-
-    fn each_stream(&self, mut f: impl FnMut(&[Nanos])) {
-        for j in &self.joints {
-            [&j.position, &j.velocity, &j.acceleration, &j.torque]
-                .iter()
-                .for_each(|s| f(&s.t));
-        }
-        self.sensors.iter().for_each(|s| f(&s.t));
-        [
-            &self.imu.proper_acceleration,
-            &self.imu.angular_velocity,
-            &self.imu.angular_acceleration,
-        ]
-        .iter()
-        .for_each(|s| f(&s.t));
     }
 
     /// Time from the first to the last sample; zero if the log has no stamps.
@@ -223,9 +183,8 @@ impl Recording {
     pub(crate) fn spacing(&self) -> Nanos {
         let joints = self.joints.iter().map(|joint| joint.position.spacing);
         let all = joints.chain([self.imu.angular_velocity.spacing]);
-        all.filter(|spacing| *spacing > Nanos::ZERO)
-            .min()
-            .unwrap_or(Nanos::ZERO)
+        let least = all.filter(|spacing| *spacing > Nanos::ZERO).min();
+        least.unwrap_or(Nanos::ZERO)
     }
 
     /// Whether the log has stamps.
@@ -258,19 +217,9 @@ impl Recording {
 
     /// Whether a joint other than `but` moves, or the base rotates.
     pub(crate) fn moves(&self, from: Nanos, to: Nanos, but: Option<usize>) -> bool {
-        let joint = self
-            .joints
-            .iter()
-            .enumerate()
-            .any(|(dof, j)| Some(dof) != but && j.range(from, to) > MOTION);
-        let gyro = &self.imu.angular_velocity;
-        let (begin, end) = (
-            gyro.t.partition_point(|t| *t < from),
-            gyro.t.partition_point(|t| *t <= to),
-        );
-        joint
-            || gyro.value[begin..end.max(begin)]
-                .iter()
-                .any(|w| w.iter().map(|x| x * x).sum::<f64>() > 0.01)
+        let mut joints = self.joints.iter().enumerate();
+        let mut rates = self.imu.angular_velocity.within(from, to).iter();
+        joints.any(|(dof, j)| Some(dof) != but && j.range(from, to) > MOTION)
+            || rates.any(|w| w.iter().map(|x| x * x).sum::<f64>() > 0.01)
     }
 }

@@ -102,34 +102,19 @@ impl Recording {
             }
             observation
         };
-        parallel::in_chunks(times.len(), |range| range.map(at).collect())
+        parallel::map(times.len(), at)
     }
 
     /// The times of the observations.
     fn times(&self, robot: &Robot, period: Nanos) -> Vec<Nanos> {
-        let stamps = |channel: &Channel| match channel.role {
-            ChannelRole::Joint(dof) => (
-                &self.joints[dof].position.t,
-                self.joints[dof].position.spacing,
-            ),
-            ChannelRole::Sensor(number) => (&self.sensors[number].t, self.sensors[number].spacing),
-            ChannelRole::Base => (
-                &self.imu.angular_velocity.t,
-                self.imu.angular_velocity.spacing,
-            ),
-        };
+        let stamps = |channel: &Channel| self.stamps(channel.role);
         let trigger = self.channels.get(robot.trigger).map(stamps);
-        let there = trigger.filter(|(t, _)| !t.is_empty());
-        let Some((stamps, spacing)) = there.or_else(|| {
-            self.channels
-                .iter()
-                .map(stamps)
-                .find(|(t, _)| !t.is_empty())
-        }) else {
+        let mut all = trigger.into_iter().chain(self.channels.iter().map(stamps));
+        let Some((stamps, _, spacing)) = all.find(|(t, ..)| !t.is_empty()) else {
             return Vec::new();
         };
         if !is_dense(spacing, period) {
-            return stamps.clone();
+            return stamps.to_vec();
         }
         let (first, mut times) = (stamps.first().copied().unwrap_or_default(), Vec::new());
         let mut block = -1;

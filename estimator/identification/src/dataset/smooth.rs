@@ -174,10 +174,8 @@ impl Smoother {
             .segments
             .partition_point(|s| self.times.get(s.first).is_some_and(|first| *first <= time));
         let segment = self.segments.get(number.checked_sub(1)?)?;
-        let (first, last) = (
-            *self.times.get(segment.first)?,
-            *self.times.get(segment.end - 1)?,
-        );
+        let first = *self.times.get(segment.first)?;
+        let last = *self.times.get(segment.end - 1)?;
         if segment.knots.is_empty() {
             return None;
         }
@@ -320,10 +318,8 @@ impl Smoother {
                             let Some(fit) = fits[knot * windows + window] else {
                                 continue;
                             };
-                            let (low, high) = (
-                                knot.saturating_sub(AVERAGED),
-                                (knot + AVERAGED + 1).min(count),
-                            );
+                            let low = knot.saturating_sub(AVERAGED);
+                            let high = (knot + AVERAGED + 1).min(count);
                             let mean = (sums[high].0 - sums[low].0) / (sums[high].1 - sums[low].1);
                             let risk = variance * fit.variance[degree][derivative] + mean.max(0.0);
                             if risk < least[knot] {
@@ -384,9 +380,9 @@ impl Scratch {
         let mut left: Vec<f64> = values.iter().map(|v| v - values[0]).collect();
         for (p, norm) in self.polynomials.iter().zip(norms).take(6) {
             let coefficient = dot(p, &left) / norm;
-            left.iter_mut()
-                .zip(p)
-                .for_each(|(l, p)| *l -= coefficient * p);
+            for (left, p) in left.iter_mut().zip(p) {
+                *left -= coefficient * p;
+            }
         }
         Some(dot(&left, &left))
     }
@@ -501,22 +497,15 @@ impl Scratch {
                 }
             }
         }
-        fit.estimate
-            .iter()
-            .flatten()
-            .all(|e| e.is_finite())
-            .then_some(fit)
+        let mut estimates = fit.estimate.iter().flatten();
+        estimates.all(|e| e.is_finite()).then_some(fit)
     }
 }
 
 /// The quantum of a signal: its least change, if all changes are multiples of it; else 0.
 pub(crate) fn quantum(values: &[f64]) -> f64 {
-    let changes = || {
-        values
-            .windows(2)
-            .map(|w| (w[1] - w[0]).abs())
-            .filter(|d| *d > 0.0)
-    };
+    let all = || values.windows(2).map(|w| (w[1] - w[0]).abs());
+    let changes = || all().filter(|d| *d > 0.0);
     let least = changes().fold(f64::INFINITY, f64::min);
     let (mut multiples, mut all) = (0, 0);
     for change in changes() {

@@ -47,13 +47,10 @@ impl JointTrack {
         if self.position.t.is_empty() {
             return Vec::new();
         }
-        let of_position = self
-            .velocity
-            .t
-            .is_empty()
-            .then(|| self.position.smoother(0));
-        let of_velocity = (!self.velocity.t.is_empty() && self.acceleration.t.is_empty())
-            .then(|| self.velocity.smoother(0));
+        let is_given = !self.acceleration.t.is_empty();
+        let has_velocity = !self.velocity.t.is_empty();
+        let of_position = (!has_velocity).then(|| self.position.smoother(0));
+        let of_velocity = (has_velocity && !is_given).then(|| self.velocity.smoother(0));
         let mut scratch = Scratch::default();
         let mut derivatives = |smoother: &Smoother, t, orders| {
             smoother
@@ -62,7 +59,6 @@ impl JointTrack {
         };
         let mut motion = |t: Nanos| -> Result<[f64; 3], Reason> {
             let [mut position] = self.position.mean(t, period)?;
-            let is_given = !self.acceleration.t.is_empty();
             let (velocity, mut acceleration) = if let Some(smoother) = &of_position {
                 let orders = if is_given || of_velocity.is_some() {
                     0..=1
@@ -83,21 +79,15 @@ impl JointTrack {
             Ok([position, velocity, acceleration])
         };
         let mut at = |&t: &Nanos| {
-            let torque = self
-                .torque
-                .mean(t, period)
-                .map_or(f64::NAN, |[torque]| torque);
-            match motion(t) {
-                Ok(motion) => JointAt {
-                    motion,
-                    torque,
-                    fault: Reason::None,
-                },
-                Err(fault) => JointAt {
-                    motion: [self.position.nearest(t)[0], 0.0, 0.0],
-                    torque,
-                    fault,
-                },
+            let torque = self.torque.mean(t, period);
+            let (motion, fault) = match motion(t) {
+                Ok(motion) => (motion, Reason::None),
+                Err(fault) => ([self.position.nearest(t)[0], 0.0, 0.0], fault),
+            };
+            JointAt {
+                motion,
+                torque: torque.map_or(f64::NAN, |[torque]| torque),
+                fault,
             }
         };
         times.iter().map(&mut at).collect()
@@ -137,8 +127,10 @@ impl<const D: usize> SampleStream<D> {
             max_silence.min(Nanos(self.spacing.0.saturating_mul(5)).max(Nanos::from_millis(30)));
     }
 
-    pub(crate) fn retain(&mut self, mut keep: impl FnMut(usize) -> bool) {
-        let kept: Vec<bool> = (0..self.t.len()).map(&mut keep).collect();
+    /// Keeps some samples, by number and stamp.
+    pub(crate) fn retain(&mut self, keep: impl Fn(usize, Nanos) -> bool) {
+        let samples = self.t.iter().enumerate();
+        let kept: Vec<bool> = samples.map(|(i, t)| keep(i, *t)).collect();
         let mut flags = kept.iter();
         self.t.retain(|_| *flags.next().unwrap_or(&true));
         let mut flags = kept.iter();
@@ -154,10 +146,8 @@ impl<const D: usize> SampleStream<D> {
     }
 
     pub(crate) fn nearest(&self, t: Nanos) -> Values<D> {
-        let after = self
-            .t
-            .partition_point(|s| *s <= t)
-            .min(self.t.len().saturating_sub(1));
+        let after = self.t.partition_point(|s| *s <= t);
+        let after = after.min(self.t.len().saturating_sub(1));
         let before = after.saturating_sub(1);
         match (self.t.get(before), self.t.get(after)) {
             (Some(a), Some(b)) => self.value[if t - *a < *b - t { before } else { after }],
@@ -165,23 +155,26 @@ impl<const D: usize> SampleStream<D> {
         }
     }
 
+    /// The values from one stamp to the other.
+    pub(crate) fn within(&self, from: Nanos, to: Nanos) -> &[Values<D>] {
+        let begin = self.t.partition_point(|t| *t < from);
+        let end = self.t.partition_point(|t| *t <= to);
+        &self.value[begin..end.max(begin)]
+    }
+
     /// The first fault between `from` and `to`.
     pub(crate) fn faulty(&self, from: Nanos, to: Nanos) -> Option<Reason> {
         let at = self.faulty.partition_point(|(t, _)| *t < from);
-        self.faulty
-            .get(at)
-            .filter(|(t, _)| *t <= to)
-            .map(|(_, reason)| *reason)
+        let next = self.faulty.get(at).filter(|(t, _)| *t <= to);
+        next.map(|(_, reason)| *reason)
     }
 
     /// The value at `t`: the mean over `period` for a faster channel, else a sample or an
     /// interpolation.
     pub(crate) fn mean(&self, t: Nanos, period: Nanos) -> Result<Values<D>, Reason> {
         let (Some(first), Some(last)) = (self.t.first(), self.t.last()) else {
-            return Err(self
-                .faulty
-                .first()
-                .map_or(Reason::NeverSeen, |(_, reason)| *reason));
+            let first = self.faulty.first();
+            return Err(first.map_or(Reason::NeverSeen, |(_, reason)| *reason));
         };
         let after = self.t.partition_point(|s| *s <= t);
         let fault = || self.faulty(t - self.max_gap, t + self.max_gap);
@@ -198,9 +191,8 @@ impl<const D: usize> SampleStream<D> {
         let (low, high) = (t - half, t + half);
         let begin = self.t.partition_point(|s| *s <= low) - 1;
         let end = self.t.partition_point(|s| *s < high).min(self.t.len() - 1);
-        let apart = self.t[begin..=end]
-            .windows(2)
-            .any(|w| w[1] - w[0] > self.max_gap);
+        let mut pairs = self.t[begin..=end].windows(2);
+        let apart = pairs.any(|w| w[1] - w[0] > self.max_gap);
         if let Some(reason) = self.faulty(self.t[begin], self.t[end]) {
             return Err(reason);
         }
@@ -323,11 +315,6 @@ impl JointTrack {
 
     /// The range of positions from `from` to `to`.
     pub(crate) fn range(&self, from: Nanos, to: Nanos) -> f64 {
-        let stream = &self.position;
-        let (begin, end) = (
-            stream.t.partition_point(|t| *t < from),
-            stream.t.partition_point(|t| *t <= to),
-        );
-        range(stream.value[begin..end.max(begin)].iter().map(|[v]| *v))
+        range(self.position.within(from, to).iter().map(|[v]| *v))
     }
 }

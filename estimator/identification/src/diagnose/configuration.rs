@@ -48,6 +48,7 @@ use crate::measurement::channels::{attribute_to, sensor_name};
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::nuisance_prior;
 use crate::measurement::rows::MeasurementRows;
+use crate::measurement::unknowns::Unknowns;
 use crate::online::bank::hypothesis::{GRAVITY, MotionReading};
 use crate::parallel;
 use crate::robot::{BaseMotion, IdentificationInput, Robot};
@@ -165,9 +166,9 @@ impl GramMatrix {
         nuisance.update(&g, &mut line);
         let there: Vec<usize> = (0..line.len()).filter(|&i| line[i] != 0.0).collect();
         for &i in &there {
-            there
-                .iter()
-                .for_each(|&j| self.gram[(j, i)] += line[i] * line[j]);
+            for &j in &there {
+                self.gram[(j, i)] += line[i] * line[j];
+            }
         }
         self.rows += 1.0;
     }
@@ -231,12 +232,12 @@ impl ConfigurationEvidence {
         // Joint torques are a reference even if nothing is identified from them.
         let inputs = [inputs, &[IdentificationInput::Torque]].concat();
         let measurement = MeasurementModel::for_observations(robot, &inputs, some.iter().copied())?;
-        let of = |own: &Observation| (own.base_link, own.base);
+        let base = |instant: &Observation| (instant.base_link, instant.base);
         let Some(first) = some.first() else {
             return Ok(());
         };
         let stands = matches!(robot.base, BaseMotion::Standing(_))
-            && some.iter().all(|own| of(own) == of(first));
+            && some.iter().all(|instant| base(instant) == base(first));
         self.base = stands.then(|| (first.base_link, first.base.proper_acceleration));
         let stretches: Vec<&[&Annotated]> = some.chunks(STRETCH).collect();
         let parts = parallel::map_with(
@@ -280,35 +281,9 @@ impl ConfigurationEvidence {
             self.instants += 1;
             let mut lines = DMatrix::zeros(rows.count, last + 1);
             if self.base.is_some() {
-                let mut right = |axis: Vec3| {
-                    let other = (*instant)
-                        .clone()
-                        .map(|own| own.seen(MotionReading::Upright(axis)));
-                    let is_made = measurement.make(&other, &mut moved).is_ok();
-                    (is_made && moved.count == rows.count)
-                        .then(|| DVector::from_column_slice(&moved.r))
-                };
-                let without = right(Vec3::zeros());
-                for axis in 0..3 {
-                    if let (Some(own), Some(without)) = (right(Vec3::ith(axis, 1.0)), &without) {
-                        lines.set_column(axis, &(own - without));
-                    }
-                }
+                gravity_columns(measurement, instant, &mut moved, &mut lines);
             }
-            for row in 0..rows.count {
-                for (place, &sensor) in unknowns.sensors.iter().enumerate() {
-                    let reading = instant.readings[sensor].torque_first();
-                    for (i, g) in rows.g(row)[6 * place..][..6].iter().enumerate() {
-                        for (j, y) in reading.iter().enumerate().filter(|_| *g != 0.0) {
-                            lines[(row, entry(sensor, i, j))] = g * y;
-                        }
-                    }
-                }
-                if let Some(joint) = rows.joint(row, 6 * unknowns.sensors.len()) {
-                    lines[(row, last - 1)] = instant.torque[unknowns.joints[joint]];
-                }
-                lines[(row, last)] = rows.r(row);
-            }
+            reading_columns(&unknowns, instant, &rows, &mut lines);
             let g = |rows: &MeasurementRows| {
                 DMatrix::from_fn(rows.count, prior.len(), |row, column| {
                     match column.checked_sub(offsets) {
@@ -513,6 +488,52 @@ impl ConfigurationEvidence {
                 100.0 * share.sqrt()
             ),
         ))
+    }
+}
+
+/// Writes what 1 g along each axis adds to the rows of an observation.
+fn gravity_columns(
+    measurement: &mut MeasurementModel<'_>,
+    instant: &Annotated,
+    rows: &mut MeasurementRows,
+    lines: &mut DMatrix<f64>,
+) {
+    let mut right = |axis: Vec3| {
+        let upright = MotionReading::Upright(axis);
+        let other = instant.clone().map(|own| own.seen(upright));
+        let is_made = measurement.make(&other, rows).is_ok() && rows.count == lines.nrows();
+        is_made.then(|| DVector::from_column_slice(&rows.r))
+    };
+    let without = right(Vec3::zeros());
+    let with = [0, 1, 2].map(|axis| right(Vec3::ith(axis, 1.0)));
+    for (axis, with) in with.into_iter().enumerate() {
+        if let (Some(with), Some(without)) = (with, &without) {
+            lines.set_column(axis, &(with - without));
+        }
+    }
+}
+
+/// Writes the columns of the readings in the rows of an observation, and the right side.
+fn reading_columns(
+    unknowns: &Unknowns,
+    instant: &Annotated,
+    rows: &MeasurementRows,
+    lines: &mut DMatrix<f64>,
+) {
+    let last = lines.ncols() - 1;
+    for row in 0..rows.count {
+        for (place, &sensor) in unknowns.sensors.iter().enumerate() {
+            let reading = instant.readings[sensor].torque_first();
+            for (i, g) in rows.g(row)[6 * place..][..6].iter().enumerate() {
+                for (j, y) in reading.iter().enumerate().filter(|_| *g != 0.0) {
+                    lines[(row, entry(sensor, i, j))] = g * y;
+                }
+            }
+        }
+        if let Some(joint) = rows.joint(row, 6 * unknowns.sensors.len()) {
+            lines[(row, last - 1)] = instant.torque[unknowns.joints[joint]];
+        }
+        lines[(row, last)] = rows.r(row);
     }
 }
 

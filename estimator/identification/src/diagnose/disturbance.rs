@@ -15,11 +15,11 @@
 //! instead predicted another log with an error of .32, against .06, where a jump of 10 N was
 //! simulated.
 
-use crate::dataset::observation::{Observation, UnitSet};
+use crate::dataset::observation::{Annotated, Observation, UnitSet};
 use crate::diagnose::load::LoadChange;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
-use crate::measurement::reduction::{LogSegment, blocks, residuals};
+use crate::measurement::reduction::{LogSegment, residuals};
 use crate::measurement::rows::MeasurementRows;
 use crate::statistics::chi_square;
 use crate::statistics::quantile;
@@ -73,18 +73,12 @@ pub(crate) fn contacts(
     let (mut segments, mut logs) = (Vec::new(), Vec::new());
     for (number, log) in all.iter().enumerate() {
         let minutes = ((log.span.1 - log.span.0).seconds() / 60.0) as usize;
-        let count = log
-            .instants
-            .len()
-            .div_ceil(SEGMENT_INSTANTS)
-            .min(minutes)
-            .max(1);
+        let count = log.instants.len().div_ceil(SEGMENT_INSTANTS);
+        let count = count.min(minutes).max(1);
         let at = |part: usize| log.instants.len() * part / count;
         for part in 0..count {
-            segments.push(LogSegment {
-                instants: &log.instants[at(part)..at(part + 1)],
-                log: None,
-            });
+            let instants = &log.instants[at(part)..at(part + 1)];
+            segments.push(LogSegment::alone(instants));
             logs.push(number);
         }
     }
@@ -109,92 +103,110 @@ fn of_segment(
     noise: &NoiseModel,
     d: &DVector<f64>,
 ) -> Vec<UnitSet> {
-    let unknowns = measurement.unknowns().clone();
-    let channels = unknowns.channels();
-    let variances = noise.offset_tracking_variances();
+    let unknowns = measurement.unknowns();
     let residuals = residuals(measurement, segment, noise, std::slice::from_ref(d));
-    // The median of each offset: the offset itself may have followed a contact, and would hide it.
-    let ranges = blocks(segment.instants);
-    let nuisance = DVector::from_fn(unknowns.nuisance(), |unknown, _| {
-        let own = residuals.nuisance.iter();
-        quantile(own.map(|block| block.x[(unknown, 0)]).collect(), 0.5)
-    });
-    // Per unit, channel and block: the mean of the channel's most likely noise, offset drift
-    // included, from the unit's rows alone.
-    let units: Vec<usize> = (0..measurement.robot().structure.subtrees().len())
-        .chain([Observation::TORQUES])
-        .collect();
-    let mut series = vec![vec![vec![f64::NAN; ranges.len()]; channels]; units.len()];
-    let mut motion = vec![0.0; ranges.len()];
-    let (mut rows, mut own) = (
-        MeasurementRows::new(&unknowns),
-        MeasurementRows::new(&unknowns),
-    );
-    let (mut white, mut e) = (Vec::new(), vec![0.0; channels]);
+    let subtrees = 0..measurement.robot().structure.subtrees().len();
+    let pass = UnitPass {
+        units: subtrees.chain([Observation::TORQUES]).collect(),
+        loads,
+        variances: noise.offset_tracking_variances(),
+        d,
+        // The median of each offset: the offset itself may have followed a contact, and would hide
+        // it.
+        nuisance: DVector::from_fn(unknowns.nuisance(), |unknown, _| {
+            let blocks = residuals.nuisance.iter();
+            quantile(blocks.map(|block| block.x[(unknown, 0)]).collect(), 0.5)
+        }),
+    };
     measurement.include_disturbed(true);
-    for (block, range) in ranges.iter().enumerate() {
-        let mut sums = vec![(vec![0.0; channels], vec![0.0_f64; channels]); units.len()];
-        for instant in &segment.instants[range.clone()] {
-            motion[block] +=
-                instant.velocity.iter().map(|v| v * v).sum::<f64>() / range.len() as f64;
+    let (mut means, mut motion) = (Vec::new(), Vec::new());
+    for range in &residuals.ranges {
+        let instants = &segment.instants[range.clone()];
+        let square = |instant: &Annotated| instant.velocity.iter().map(|v| v * v).sum::<f64>();
+        let all = instants.iter().map(square);
+        motion.push(all.fold(0.0, |sum, own| sum + own / instants.len() as f64));
+        means.push(pass.means(measurement, instants));
+    }
+    measurement.include_disturbed(false);
+    let mut out = vec![UnitSet::default(); segment.instants.len()];
+    for (number, &unit) in pass.units.iter().enumerate() {
+        let (mut series, mut least) = (Vec::new(), Vec::new());
+        for (channel, channel_least) in noise.least.iter().enumerate() {
+            let own: Vec<f64> = means.iter().map(|units| units[number][channel]).collect();
+            if own.iter().any(|x| x.is_finite()) {
+                series.push(own);
+                least.push(*channel_least);
+            }
+        }
+        let outlier = outlying(&series, &motion, &least);
+        let count = outlier.iter().filter(|outlier| **outlier).count();
+        if count as f64 / outlier.len().max(1) as f64 > MAX_OUTLYING_FRACTION {
+            continue;
+        }
+        let blocks = residuals.ranges.iter().zip(&outlier);
+        for (range, _) in blocks.filter(|(_, outlier)| **outlier) {
+            (out[range.clone()].iter_mut()).for_each(|set| set.insert(unit));
+        }
+    }
+    out
+}
+
+/// The pass over a segment for the residuals of each unit.
+struct UnitPass<'a> {
+    units: Vec<usize>,
+    loads: &'a [&'a LoadChange],
+    variances: Vec<f64>,
+    d: &'a DVector<f64>,
+    nuisance: DVector<f64>,
+}
+
+impl UnitPass<'_> {
+    /// Per unit and channel, the mean over a block of the channel's most likely noise, offset drift
+    /// included, from the unit's rows alone; NaN where it has none.
+    fn means(
+        &self,
+        measurement: &mut MeasurementModel<'_>,
+        instants: &[Annotated],
+    ) -> Vec<Vec<f64>> {
+        let channels = self.variances.len();
+        let mut rows = MeasurementRows::new(measurement.unknowns());
+        let mut own = rows.clone();
+        let (mut white, mut noise) = (Vec::new(), vec![0.0; channels]);
+        let mut sums = vec![vec![(0.0, 0.0); channels]; self.units.len()];
+        for instant in instants {
             if measurement.make(instant, &mut rows).is_err() {
                 continue;
             }
-            for (&unit, (sums, counts)) in units.iter().zip(&mut sums) {
-                if loads
-                    .iter()
-                    .any(|load| load.units.contains(unit) && load.has(instant.t))
-                {
+            for (&unit, sums) in self.units.iter().zip(&mut sums) {
+                let carries = |load: &&LoadChange| load.units.contains(unit) && load.has(instant.t);
+                if self.loads.iter().any(carries) {
                     continue;
                 }
                 rows.copy_unit(unit, &mut own);
                 if own.count == 0 {
                     continue;
                 }
+                let (d, nuisance) = (self.d.as_slice(), self.nuisance.as_slice());
                 white.clear();
-                white.extend(
-                    (0..own.count).map(|row| own.residual(row, d.as_slice(), nuisance.as_slice())),
-                );
-                own.whiten_with(&variances, &mut white, 1);
-                own.channel_noise(&variances, &mut white, &mut e);
+                white.extend((0..own.count).map(|row| own.residual(row, d, nuisance)));
+                own.whiten_with(&self.variances, &mut white, 1);
+                own.channel_noise(&self.variances, &mut white, &mut noise);
                 for channel in (0..channels).filter(|&channel| own.has(channel)) {
-                    sums[channel] += e[channel];
-                    counts[channel] += 1.0;
+                    sums[channel].0 += noise[channel];
+                    sums[channel].1 += 1.0;
                 }
             }
         }
-        for ((sums, counts), series) in sums.iter().zip(&mut series) {
-            for channel in (0..channels).filter(|&channel| counts[channel] > 0.0) {
-                series[channel][block] = sums[channel] / counts[channel];
-            }
-        }
+        let mean = |(sum, count): &(f64, f64)| sum / count;
+        (sums.iter())
+            .map(|channels| channels.iter().map(mean).collect())
+            .collect()
     }
-    measurement.include_disturbed(false);
-    let mut out = vec![UnitSet::default(); segment.instants.len()];
-    for (&unit, series) in units.iter().zip(&series) {
-        let seen: Vec<usize> = (0..channels)
-            .filter(|&c| series[c].iter().any(|x| x.is_finite()))
-            .collect();
-        let own: Vec<&[f64]> = seen.iter().map(|&c| series[c].as_slice()).collect();
-        let least: Vec<f64> = seen.iter().map(|&c| noise.least[c]).collect();
-        let outlier = outlying(&own, &motion, &least);
-        let share =
-            outlier.iter().filter(|outlier| **outlier).count() as f64 / outlier.len().max(1) as f64;
-        if share > MAX_OUTLYING_FRACTION {
-            continue;
-        }
-        for (range, _) in ranges.iter().zip(&outlier).filter(|(_, outlier)| **outlier) {
-            out[range.clone()]
-                .iter_mut()
-                .for_each(|set| set.insert(unit));
-        }
-    }
-    out
 }
 
 /// Whether each block of some channels' means is outlying from a slowly drifting level.
 /// `motion`: mean square velocity in each block. `least`: lower bounds of the channels' variances.
-fn outlying(series: &[&[f64]], motion: &[f64], least: &[f64]) -> Vec<bool> {
+fn outlying(series: &[Vec<f64>], motion: &[f64], least: &[f64]) -> Vec<bool> {
     let count = motion.len();
     let mut outlier = vec![false; count];
     if series.is_empty() || count == 0 {
@@ -262,8 +274,8 @@ fn usual(squares: &[f64], seen: &[bool], motion: &[f64]) -> Vec<f64> {
     const STATIONS: usize = 40;
     let mut order: Vec<usize> = (0..squares.len()).filter(|&k| seen[k]).collect();
     order.sort_by(|&a, &b| motion[a].total_cmp(&motion[b]).then(a.cmp(&b)));
-    let of = |some: &[usize]| quantile(some.iter().map(|&k| squares[k]).collect(), USUAL);
-    let all = of(&order);
+    let usual = |some: &[usize]| quantile(some.iter().map(|&k| squares[k]).collect(), USUAL);
+    let all = usual(&order);
     let mut out = vec![all; squares.len()];
     // A third of the blocks at a time, so that a contact is not most of any. Among all thirds that
     // contain a block the largest value counts: the residual may change at once where motion
@@ -273,7 +285,7 @@ fn usual(squares: &[f64], seen: &[bool], motion: &[f64]) -> Vec<f64> {
     let last = order.len() - width;
     for start in (0..last).step_by(stride).chain([last]) {
         let own = &order[start..start + width];
-        let near = of(own);
+        let near = usual(own);
         own.iter().for_each(|&k| out[k] = out[k].max(near));
     }
     out
@@ -316,8 +328,7 @@ mod tests {
     }
 
     fn found(series: &[Vec<f64>], motion: &[f64]) -> Vec<bool> {
-        let series: Vec<&[f64]> = series.iter().map(Vec::as_slice).collect();
-        outlying(&series, motion, &vec![1e-6; series.len()])
+        outlying(series, motion, &vec![1e-6; series.len()])
     }
 
     #[test]

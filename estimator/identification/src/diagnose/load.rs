@@ -4,16 +4,16 @@
 //! .7 % to several times that, and nothing names the cause.
 
 use crate::dataset::observation::{Annotated, Observation, UnitSet};
+use crate::fit::NoiseAndMap;
 use crate::hypothesis::needed;
 use crate::linear::information::Information;
 use crate::measurement::model::MeasurementModel;
-use crate::measurement::noise_model::NoiseModel;
-use crate::measurement::reduction::{LogSegment, reduce};
+use crate::measurement::reduction::{LogSegment, ReducedLog, blocks, reduce};
 use crate::measurement::unknowns::Unknowns;
 use crate::parallel;
 use crate::prior::Prior;
-use crate::training::{TrainingLog, map_segments};
-use nalgebra::{DMatrix, DVector, SMatrix, SVector};
+use crate::training::{TrainingLog, reduced_segments};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SMatrix, SVector};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_topics::Nanos;
 use std::ops::Range;
@@ -68,6 +68,7 @@ pub(crate) struct AddedBody {
 
 /// Normal equations `[R^T R, R^T z]` of some information. They are used to search for a load, not
 /// for the final estimate.
+#[derive(Clone)]
 pub(crate) struct Normal {
     pub(crate) matrix: DMatrix<f64>,
     pub(crate) right: DVector<f64>,
@@ -79,6 +80,13 @@ impl Normal {
             matrix: DMatrix::zeros(unknowns, unknowns),
             right: DVector::zeros(unknowns),
         }
+    }
+
+    /// Of these segments together.
+    fn of(unknowns: &Unknowns, reduced: &[ReducedLog]) -> Self {
+        let mut sum = Self::new(unknowns.parameters());
+        reduced.iter().for_each(|own| sum.add(&own.information));
+        sum
     }
 
     pub(crate) fn add(&mut self, information: &Information) {
@@ -105,12 +113,7 @@ impl Normal {
                 );
             own += prior.metric(link) / (2.0 * tau * tau);
         }
-        for (precision, column) in unknowns
-            .precision
-            .iter()
-            .copied()
-            .zip(unknowns.inertial()..)
-        {
+        for (precision, column) in unknowns.precision.iter().zip(unknowns.inertial()..) {
             self.matrix[(column, column)] += precision;
         }
     }
@@ -129,7 +132,7 @@ pub(crate) fn body(
     weak: &SMatrix<f64, LINK_PARAMETERS, LINK_PARAMETERS>,
     place: usize,
     some: &Normal,
-    factor: &nalgebra::Cholesky<f64, nalgebra::Dyn>,
+    factor: &Cholesky<f64, Dyn>,
     x: &DVector<f64>,
 ) -> Option<(AddedBody, f64)> {
     let cross = some
@@ -167,8 +170,19 @@ impl AddedBody {
     }
 }
 
-/// Looks for a load that changes within one of the logs, given the noise and the prior's scale
-/// `tau` of a fit to all of them.
+/// The best change of a load that was found.
+struct LoadCandidate {
+    log: usize,
+    /// The number of the segment before which the load changes.
+    at: usize,
+    /// Place of the link in the layout.
+    place: usize,
+    /// Reduction of the squared residuals by a body on the link after the change, and before it.
+    later: f64,
+    earlier: f64,
+}
+
+/// Looks for a load that changes within one of the logs, given a fit to all of them.
 ///
 /// A log is divided into segments. For each boundary between two segments and each link: the gain
 /// is the reduction of the squared residuals by a body on that link in the segments after the
@@ -176,98 +190,35 @@ impl AddedBody {
 /// with the larger gain; with a single log, the shorter one.
 pub(crate) fn find(
     measurement: &MeasurementModel<'_>,
-    prior: &Prior,
     training: &[&TrainingLog],
-    noise: &NoiseModel,
-    tau: f64,
+    estimate: &NoiseAndMap,
 ) -> Option<LoadChange> {
-    let unknowns = measurement.unknowns();
     let mut segments = Vec::new();
-    let mut of_log: Vec<Range<usize>> = Vec::new();
-    let segment_seconds = |log: &TrainingLog| {
-        ((log.span.1 - log.span.0).seconds() / SEGMENTS as f64).max(SEGMENT_SECONDS)
-    };
+    let mut of_logs: Vec<Range<usize>> = Vec::new();
     for (number, log) in training.iter().enumerate() {
         let first = segments.len();
-        let seconds = segment_seconds(log);
-        let mut start = 0;
-        for i in 1..=log.instants.len() {
-            let ends = log
-                .instants
-                .get(i)
-                .is_none_or(|instant| (instant.t - log.instants[start].t).seconds() >= seconds);
-            if ends {
-                segments.push(LogSegment {
-                    instants: &log.instants[start..i],
-                    log: Some(number),
-                });
-                start = i;
-            }
-        }
-        of_log.push(first..segments.len());
+        let ranges = blocks(&log.instants, segment_seconds(log)).into_iter();
+        segments.extend(ranges.map(|range| LogSegment {
+            instants: &log.instants[range],
+            log: Some(number),
+        }));
+        of_logs.push(first..segments.len());
     }
-    let reduced = map_segments(measurement, &segments, |measurement, _, segment| {
-        reduce(measurement, segment, noise).information
-    });
-    let mut all = Normal::new(unknowns.parameters());
-    reduced.iter().for_each(|reduced| all.add(reduced));
-    all.add_prior(prior, unknowns, tau, &|_| false);
-    let factor = all.matrix.clone().cholesky()?;
-    let x = factor.solve(&all.right);
-    // The threshold is that of a single test, because the noise still includes the load. The noise
-    // of the fit without it decides.
-    let least = needed(LINK_PARAMETERS, 1);
-    let mut best: Option<(f64, f64, usize, usize, usize)> = None;
-    for (log, range) in of_log.iter().enumerate() {
-        if range.len() < 2 * LEAST_SEGMENTS {
-            continue;
-        }
-        let mut whole = Normal::new(unknowns.parameters());
-        reduced[range.clone()]
-            .iter()
-            .for_each(|reduced| whole.add(reduced));
-        let mut test = |at: usize, before: &Normal, after: &Normal| {
-            // What one log has throughout more than the others is a load in it, not one that is
-            // missing.
-            let may_be = |added: &AddedBody| at > range.start || added.parameters[0] > 0.0;
-            let gains = parallel::map(unknowns.links.len(), |place| {
-                [after, before].map(|some| {
-                    body(
-                        &weak(prior, unknowns.links[place]),
-                        place,
-                        some,
-                        &factor,
-                        &x,
-                    )
-                    .filter(|(added, _)| added.is_a_body() && may_be(added))
-                    .map_or(0.0, |(_, gain)| gain)
-                })
-            });
-            for (place, [later, earlier]) in gains.into_iter().enumerate() {
-                let gain = later.max(earlier);
-                if gain > least && best.is_none_or(|best| gain > best.0.max(best.1)) {
-                    best = Some((later, earlier, log, at, place));
-                }
-            }
-        };
-        let mut before = Normal::new(unknowns.parameters());
-        // With several logs, one of them may have the load throughout.
-        if training.len() > 1 {
-            test(range.start, &before, &whole);
-        }
-        for at in range.start + 1..range.end + 1 - LEAST_SEGMENTS {
-            before.add(&reduced[at - 1]);
-            if at >= range.start + LEAST_SEGMENTS {
-                let after = Normal {
-                    matrix: &whole.matrix - &before.matrix,
-                    right: &whole.right - &before.right,
-                };
-                test(at, &before, &after);
-            }
+    let search = LoadSearch::new(measurement, &segments, estimate)?;
+    let mut best = None;
+    for (log, range) in of_logs.iter().enumerate() {
+        if range.len() >= 2 * LEAST_SEGMENTS {
+            search.search_log(log, range, training.len() > 1, &mut best);
         }
     }
-    let (later, earlier, log, at, place) = best?;
-    let range = &of_log[log];
+    let LoadCandidate {
+        log,
+        at,
+        place,
+        later,
+        earlier,
+    } = best?;
+    let range = &of_logs[log];
     let is_after = if training.len() > 1 {
         later >= earlier
     } else {
@@ -278,11 +229,38 @@ pub(crate) fn find(
     } else {
         range.start..at
     };
-    let first = segments[excluded.start].instants.first()?.t;
-    let last = segments[excluded.end - 1].instants.last()?.t;
-    // All units whose rows share links or channels with those of that link.
+    // The change may be anywhere in the adjacent segment.
+    let clear = if excluded == *range {
+        excluded.clone()
+    } else if is_after {
+        excluded.start + 1..excluded.end
+    } else {
+        excluded.start..excluded.end - 1
+    };
+    let stamps = |range: Range<usize>| {
+        let first = segments[range.start].instants.first()?.t;
+        Some((first, segments[range.end - 1].instants.last()?.t))
+    };
+    Some(LoadChange {
+        log,
+        place,
+        span: stamps(excluded)?,
+        clear: stamps(clear)?,
+        within: segment_seconds(training[log]),
+        is_after,
+        units: linked_units(measurement, place),
+    })
+}
+
+/// Length of the segments of a log \[s\].
+fn segment_seconds(log: &TrainingLog) -> f64 {
+    ((log.span.1 - log.span.0).seconds() / SEGMENTS as f64).max(SEGMENT_SECONDS)
+}
+
+/// All units whose rows share links or channels with those of the link at this place.
+fn linked_units(measurement: &MeasurementModel<'_>, place: usize) -> UnitSet {
     let structure = &measurement.robot().structure;
-    let groups = &measurement.groups().links;
+    let (unknowns, groups) = (measurement.unknowns(), &measurement.groups().links);
     let mut units = UnitSet::default();
     for (other, group) in unknowns.links.iter().zip(groups) {
         if *group == groups[place] {
@@ -292,27 +270,104 @@ pub(crate) fn find(
             }
         }
     }
-    // The change may be anywhere in the adjacent segment.
-    let (from, to) = if excluded == *range {
-        (excluded.start, excluded.end)
-    } else if is_after {
-        (excluded.start + 1, excluded.end)
-    } else {
-        (excluded.start, excluded.end - 1)
-    };
-    let clear = (
-        segments[from].instants.first()?.t,
-        segments[to - 1].instants.last()?.t,
-    );
-    Some(LoadChange {
-        log,
-        place,
-        span: (first, last),
-        clear,
-        within: segment_seconds(training[log]),
-        is_after,
-        units,
-    })
+    units
+}
+
+/// The search for a load that changes: what each segment tells, and all of them together.
+struct LoadSearch<'a> {
+    links: &'a [usize],
+    prior: &'a Prior,
+    reduced: Vec<ReducedLog>,
+    factor: Cholesky<f64, Dyn>,
+    x: DVector<f64>,
+}
+
+impl<'a> LoadSearch<'a> {
+    fn new(
+        measurement: &'a MeasurementModel<'_>,
+        segments: &[LogSegment<'_>],
+        estimate: &'a NoiseAndMap,
+    ) -> Option<Self> {
+        let (unknowns, prior) = (measurement.unknowns(), &estimate.prior);
+        let reduced = reduced_segments(measurement, segments, &estimate.noise);
+        let mut all = Normal::of(unknowns, &reduced);
+        all.add_prior(prior, unknowns, estimate.fit.tau, &|_| false);
+        let factor = all.matrix.cholesky()?;
+        Some(Self {
+            links: &unknowns.links,
+            prior,
+            reduced,
+            x: factor.solve(&all.right),
+            factor,
+        })
+    }
+
+    /// Tests all changes within a log with these segments. With several logs, one of them may have
+    /// the load throughout.
+    fn search_log(
+        &self,
+        log: usize,
+        range: &Range<usize>,
+        is_one_of_several: bool,
+        best: &mut Option<LoadCandidate>,
+    ) {
+        let reduced = &self.reduced[range.clone()];
+        let mut before = Normal::new(self.x.len());
+        let mut whole = Normal::new(self.x.len());
+        reduced.iter().for_each(|own| whole.add(&own.information));
+        if is_one_of_several {
+            self.test((log, range.start), &before, &whole, true, best);
+        }
+        for (number, own) in reduced[..reduced.len() - LEAST_SEGMENTS].iter().enumerate() {
+            before.add(&own.information);
+            if number + 1 >= LEAST_SEGMENTS {
+                let after = Normal {
+                    matrix: &whole.matrix - &before.matrix,
+                    right: &whole.right - &before.right,
+                };
+                let at = range.start + number + 1;
+                self.test((log, at), &before, &after, false, best);
+            }
+        }
+    }
+
+    /// Tests a change at this segment of a log, on every link.
+    fn test(
+        &self,
+        (log, at): (usize, usize),
+        before: &Normal,
+        after: &Normal,
+        is_throughout: bool,
+        best: &mut Option<LoadCandidate>,
+    ) {
+        // The threshold is that of a single test, because the noise still includes the load. The
+        // noise of the fit without it decides.
+        let least = needed(LINK_PARAMETERS, 1);
+        // What one log has throughout more than the others is a load in it, not one that is
+        // missing.
+        let may_be = |added: &AddedBody| !is_throughout || added.parameters[0] > 0.0;
+        let gains = parallel::map(self.links.len(), |place| {
+            let weak = weak(self.prior, self.links[place]);
+            [after, before].map(|some| {
+                body(&weak, place, some, &self.factor, &self.x)
+                    .filter(|(added, _)| added.is_a_body() && may_be(added))
+                    .map_or(0.0, |(_, gain)| gain)
+            })
+        });
+        for (place, [later, earlier]) in gains.into_iter().enumerate() {
+            let gain = later.max(earlier);
+            let is_better = |best: &LoadCandidate| gain > best.later.max(best.earlier);
+            if gain > least && best.as_ref().is_none_or(is_better) {
+                *best = Some(LoadCandidate {
+                    log,
+                    at,
+                    place,
+                    later,
+                    earlier,
+                });
+            }
+        }
+    }
 }
 
 /// The inertial parameters of a load, from the part of the log that was excluded for it and from
@@ -320,12 +375,9 @@ pub(crate) fn find(
 /// found, since the noise no longer contains it.
 pub(crate) fn added_body(
     measurement: &MeasurementModel<'_>,
-    prior: &Prior,
     training: &[&TrainingLog],
     load: &LoadChange,
-    noise: &NoiseModel,
-    used: &Information,
-    tau: f64,
+    estimate: &NoiseAndMap,
 ) -> Option<(usize, AddedBody)> {
     let log = training.get(load.log)?;
     let is_clear = |instant: &&Annotated| load.clear.0 <= instant.t && instant.t <= load.clear.1;
@@ -337,26 +389,17 @@ pub(crate) fn added_body(
         instants: &log.instants[first..first + count],
         log: Some(load.log),
     };
-    let reduced = reduce(&mut measurement, segment, noise);
-    let unknowns = measurement.unknowns();
-    let mut some = Normal::new(unknowns.parameters());
-    some.add(&reduced.information);
-    let mut all = Normal {
-        matrix: some.matrix.clone(),
-        right: some.right.clone(),
-    };
-    all.add(used);
-    all.add_prior(prior, unknowns, tau, &|_| false);
-    let factor = all.matrix.clone().cholesky()?;
+    let reduced = reduce(&mut measurement, segment, &estimate.noise);
+    let (unknowns, prior) = (measurement.unknowns(), &estimate.prior);
+    let some = Normal::of(unknowns, std::slice::from_ref(&reduced));
+    let mut all = some.clone();
+    all.add(&estimate.information);
+    all.add_prior(prior, unknowns, estimate.fit.tau, &|_| false);
+    let factor = all.matrix.cholesky()?;
     let x = factor.solve(&all.right);
-    let each = (0..unknowns.links.len()).filter_map(|place| {
-        let (added, gain) = body(
-            &weak(prior, unknowns.links[place]),
-            place,
-            &some,
-            &factor,
-            &x,
-        )?;
+    let each = unknowns.links.iter().enumerate();
+    let each = each.filter_map(|(place, &link)| {
+        let (added, gain) = body(&weak(prior, link), place, &some, &factor, &x)?;
         added.is_a_body().then_some((gain, place, added))
     });
     let (_, place, added) = each.max_by(|a, b| a.0.total_cmp(&b.0))?;

@@ -21,29 +21,19 @@ const WRONG: [FindingCode; 5] = [
 #[must_use]
 pub fn implausible(robot: &Robot, dataset: Dataset) -> Vec<Finding> {
     let no_motion = [FindingCode::WrongUnits, FindingCode::NoMotion];
-    let has_motion = !dataset
-        .findings
-        .iter()
-        .any(|own| no_motion.contains(&own.code));
+    let mut findings = dataset.findings.iter();
+    let has_motion = !findings.any(|own| no_motion.contains(&own.code));
     let apart = stamps_apart(robot, &dataset);
     let mut log = prepare(robot, dataset);
     // A simulated IMU without noise on a base that stands still is constant.
     let is_ideal = |finding: &Finding| {
         finding.code == FindingCode::Frozen && finding.subject.starts_with("imu/")
     };
-    let channel_faults = log
-        .findings
-        .iter()
-        .filter(|finding| WRONG.contains(&finding.code));
-    let channel_faults = channel_faults.filter(|finding| !is_ideal(finding));
-    let mut findings: Vec<Finding> = channel_faults.cloned().collect();
+    let mut findings = std::mem::take(&mut log.findings);
+    findings.retain(|finding| WRONG.contains(&finding.code) && !is_ideal(finding));
     // A slow channel does no harm as long as observations exist without it.
-    findings.extend(
-        apart
-            .filter(|_| log.instants.is_empty())
-            .map(|text| Finding::warning(FindingCode::SampleSpacing, "", text)),
-    );
-    log.findings.clear();
+    let apart = apart.filter(|_| log.instants.is_empty());
+    findings.extend(apart.map(|text| Finding::warning(FindingCode::SampleSpacing, "", text)));
     // Without motion, with motion in wrong units, or with too few instants, F/T readings cannot be
     // tested.
     log.refused = !has_motion || folds(log.instants.iter().map(|instant| instant.t)) < 1;

@@ -107,10 +107,7 @@ fn stretches<'a>(training: &[&'a TrainingLog], enough: [usize; 2]) -> Vec<Vec<Lo
         let count = all.len().min(share) / stretches;
         let segment = |stretch: usize| {
             let start = (all.len() - count) * stretch / (stretches - 1).max(1);
-            LogSegment {
-                instants: &all[start..start + count],
-                log: None,
-            }
+            LogSegment::alone(&all[start..start + count])
         };
         (0..stretches).map(segment).collect()
     };
@@ -138,9 +135,7 @@ pub(crate) fn wrong_signs(
     estimate: &NoiseAndMap,
 ) -> Vec<Finding> {
     let (robot, unknowns) = (measurement.robot(), measurement.unknowns());
-    let NoiseAndMap {
-        prior, noise, fit, ..
-    } = estimate;
+    let (prior, fit) = (&estimate.prior, &estimate.fit);
     // A joint's axis can be reversed by links that are nothing like CAD's: CAD is taken to be as
     // good as stated.
     let stated = robot.urdf_relative_std * FRAC_1_SQRT_2;
@@ -152,18 +147,14 @@ pub(crate) fn wrong_signs(
     let segments = stretches(training, ENOUGH_FOR_SIGN).concat();
     let cost_with = |negated: &[usize]| {
         let (mut measurement, mut reduced) = (measurement.clone(), Vec::new());
-        for LogSegment { instants, log } in &segments {
+        for LogSegment { instants, .. } in &segments {
             let other = |own: &Annotated| {
                 let views = negated.iter().map(|&dof| MotionReading::Reversed(dof));
                 own.clone().map(|own| views.fold(own, Observation::seen))
             };
             let instants: Vec<Annotated> = instants.iter().map(other).collect();
-            let (instants, log) = (&instants[..], *log);
-            reduced.push(reduce(
-                &mut measurement,
-                LogSegment { instants, log },
-                noise,
-            ));
+            let segment = LogSegment::alone(&instants);
+            reduced.push(reduce(&mut measurement, segment, &estimate.noise));
         }
         let all = added(&reduced, unknowns.parameters());
         let (r, z) = all.to_triangle();
@@ -217,6 +208,61 @@ impl SetupError {
 /// An error and its standard deviation.
 type Estimate = (f64, f64);
 
+/// The columns of the errors in the rows of a segment: the zeros of these joints, then the delays.
+struct SegmentColumns<'a> {
+    dofs: &'a [usize],
+    instants: &'a [Annotated],
+    /// Per instant, the rate of change of each channel.
+    rates: Vec<Vec<f64>>,
+    d: &'a [f64],
+    /// Buffer for the rows with another zero.
+    moved: MeasurementRows,
+}
+
+impl SegmentColumns<'_> {
+    /// Writes the columns of an instant's rows, row by row.
+    fn write(
+        &mut self,
+        measurement: &mut MeasurementModel<'_>,
+        number: usize,
+        rows: &MeasurementRows,
+        out: &mut [f64],
+    ) {
+        let Self {
+            dofs,
+            instants,
+            rates,
+            d,
+            moved,
+        } = self;
+        let (joints, rates) = (dofs.len(), &rates[number]);
+        let sensors = measurement.unknowns().sensors.len();
+        let width = joints + sensors + measurement.unknowns().joints.len();
+        for (joint, &dof) in dofs.iter().enumerate() {
+            // The row holds at the true position: the measured one minus the error. The small
+            // change of the offset terms is ignored.
+            let step = MotionReading::Encoder(dof, [STEP, 0.0]);
+            let instant = instants[number].clone().map(|own| own.seen(step));
+            if measurement.make(&instant, moved).is_ok() && moved.count == rows.count {
+                for row in 0..rows.count {
+                    let change = moved.without_bodies(row, d) - rows.without_bodies(row, d);
+                    out[row * width + joint] = change / STEP;
+                }
+            }
+        }
+        // A reading enters a row as its offset does.
+        for (row, out) in out.chunks_exact_mut(width.max(1)).enumerate() {
+            for sensor in 0..sensors {
+                let six = 6 * sensor..6 * sensor + 6;
+                out[joints + sensor] = -dot(&rows.g(row)[six.clone()], &rates[six]);
+            }
+            if let Some(joint) = rows.joint(row, 6 * sensors) {
+                out[joints + sensors + joint] = -rates[6 * sensors + joint];
+            }
+        }
+    }
+}
+
 /// The search for errors that are estimated.
 pub(crate) struct Search<'a> {
     measurement: &'a MeasurementModel<'a>,
@@ -248,41 +294,18 @@ impl<'a> Search<'a> {
         let stretches = stretches(training, ENOUGH);
         for (number, segments) in stretches.iter().enumerate() {
             let reduced = map_segments(measurement, segments, |measurement, _, segment| {
-                let rates = rates(measurement, segment, identified);
-                let d = identified.fit.x.as_slice();
-                let mut other = MeasurementRows::new(unknowns);
-                let mut columns = |measurement: &mut MeasurementModel<'_>,
-                                   number: usize,
-                                   rows: &MeasurementRows,
-                                   columns: &mut [f64]| {
-                    let instant = &segment.instants[number];
-                    for (joint, &dof) in dofs.iter().enumerate() {
-                        // The row holds at the true position: the measured one minus the error.
-                        // The small change of the offset terms is ignored.
-                        let moved = MotionReading::Encoder(dof, [STEP, 0.0]);
-                        let moved = instant.clone().map(|own| own.seen(moved));
-                        let is_made = measurement.make(&moved, &mut other).is_ok();
-                        for row in (0..rows.count).filter(|_| is_made && other.count == rows.count)
-                        {
-                            let change = other.without_bodies(row, d) - rows.without_bodies(row, d);
-                            columns[row * width + joint] = change / STEP;
-                        }
-                    }
-                    // A reading enters a row as its offset does.
-                    let sensors = unknowns.sensors.len();
-                    for (row, own) in columns.chunks_exact_mut(width.max(1)).enumerate() {
-                        let of_sensors = rates[number]
-                            .chunks_exact(6)
-                            .zip(rows.g(row).chunks_exact(6));
-                        for (column, (rates, g)) in
-                            own[joints..].iter_mut().zip(of_sensors).take(sensors)
-                        {
-                            *column = -dot(g, rates);
-                        }
-                        if let Some(joint) = rows.joint(row, 6 * sensors) {
-                            own[joints + sensors + joint] = -rates[number][6 * sensors + joint];
-                        }
-                    }
+                let mut columns = SegmentColumns {
+                    dofs: &dofs,
+                    instants: segment.instants,
+                    rates: rates(measurement, segment, identified),
+                    d: identified.fit.x.as_slice(),
+                    moved: MeasurementRows::new(unknowns),
+                };
+                let mut write = |measurement: &mut MeasurementModel<'_>,
+                                 number: usize,
+                                 rows: &MeasurementRows,
+                                 out: &mut [f64]| {
+                    columns.write(measurement, number, rows, out);
                 };
                 reduce_with(
                     measurement,
@@ -290,15 +313,12 @@ impl<'a> Search<'a> {
                     &identified.noise,
                     &[],
                     width,
-                    &mut columns,
+                    &mut write,
                 )
             });
             let own = added(&reduced, parameters + width);
-            let common = (first + streams..first + streams + parameters).collect::<Vec<_>>();
-            let zeros = joints * number..joints * (number + 1);
-            let own_columns = common
-                .into_iter()
-                .chain(zeros)
+            let own_columns = (first + streams..first + streams + parameters)
+                .chain(joints * number..joints * (number + 1))
                 .chain(first..first + streams);
             let _ = sum.merge(&own, &own_columns.collect::<Vec<_>>());
         }
@@ -325,18 +345,11 @@ impl<'a> Search<'a> {
 
     /// The delay of each F/T sensor, and that of all joint torques.
     fn streams(&self) -> Vec<SetupError> {
-        let Unknowns {
-            sensors, joints, ..
-        } = &self.identified.unknowns;
-        let mut all: Vec<SetupError> = (0..sensors.len())
-            .map(|own| SetupError::Delay(own..own + 1))
-            .collect();
-        if !joints.is_empty() {
-            all.push(SetupError::Delay(
-                sensors.len()..sensors.len() + joints.len(),
-            ));
-        }
-        all
+        let unknowns = &self.identified.unknowns;
+        let (sensors, joints) = (unknowns.sensors.len(), unknowns.joints.len());
+        let torques = Some(sensors..sensors + joints).filter(|_| joints > 0);
+        let single = (0..sensors).map(|own| own..own + 1);
+        single.chain(torques).map(SetupError::Delay).collect()
     }
 
     fn column(&self, error: &SetupError) -> DVector<f64> {
@@ -355,11 +368,8 @@ impl<'a> Search<'a> {
     /// are omitted.)
     fn columns(&self, errors: &[SetupError]) -> DMatrix<f64> {
         let parameters = self.identified.unknowns.parameters();
-        let own = self
-            .r
-            .columns(self.r.ncols() - parameters, parameters)
-            .into_owned();
-        let mut own = own.resize_horizontally(parameters + errors.len(), 0.0);
+        let own = self.r.columns(self.r.ncols() - parameters, parameters);
+        let mut own = (own.into_owned()).resize_horizontally(parameters + errors.len(), 0.0);
         for (place, error) in errors.iter().enumerate() {
             own.set_column(parameters + place, &self.column(error));
         }
@@ -368,17 +378,12 @@ impl<'a> Search<'a> {
 
     /// The MAP parameters and these errors, and their cost.
     fn fit(&self, errors: &[SetupError]) -> Option<(f64, MapEstimate)> {
-        let Identified {
-            unknowns,
-            prior,
-            fit,
-            ..
-        } = self.identified;
+        let (unknowns, prior) = (&self.identified.unknowns, &self.identified.prior);
         let mut precision = unknowns.precision.clone();
         precision.extend(errors.iter().map(SetupError::precision));
         let columns = self.columns(errors);
         let posterior = Posterior::new(prior, &unknowns.links, &columns, &self.z, &precision);
-        let fit = posterior.ok()?.fit(fit.tau).ok()?;
+        let fit = posterior.ok()?.fit(self.identified.fit.tau).ok()?;
         Some((cost(unknowns, &fit, &precision), fit))
     }
 
@@ -405,10 +410,7 @@ impl<'a> Search<'a> {
             column.dot(&residuals).powi(2)
                 / (column.norm_squared() - known + precision).max(precision)
         };
-        let rest = self
-            .candidates
-            .iter()
-            .filter(|error| !errors.contains(error));
+        let rest = (self.candidates.iter()).filter(|error| !errors.contains(error));
         let mut ranked: Vec<(f64, &SetupError)> = rest.map(|error| (gain(error), error)).collect();
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
         let mut likely: Vec<SetupError> = ranked
@@ -493,10 +495,8 @@ impl<'a> Search<'a> {
             findings.push(late(channel, &seem, (offset.seconds, offset.deviation)));
         }
         if torques > 2 {
-            let each: Vec<SetupError> = (0..sensors + torques)
-                .map(|own| SetupError::Delay(own..own + 1))
-                .collect();
-            let each = with(&each).unwrap_or_default();
+            let each = (0..sensors + torques).map(|own| SetupError::Delay(own..own + 1));
+            let each = with(&each.collect::<Vec<_>>()).unwrap_or_default();
             let own = each
                 .get(count + sensors..)
                 .and_then(|each| alone(each, is_long));
@@ -601,9 +601,8 @@ fn rates(
     let around = |number: usize| {
         let t = |i: usize| (instants[i].t - instants[number].t).seconds();
         let before = (0..number).rev().take_while(|&i| t(i) >= -REACH).last();
-        let after = (number + 1..instants.len())
-            .take_while(|&i| t(i) <= REACH)
-            .last();
+        let after = number + 1..instants.len();
+        let after = after.take_while(|&i| t(i) <= REACH).last();
         // The adjacent ones if instants are farther apart.
         let low = before.unwrap_or(number.saturating_sub(1));
         let high = after.unwrap_or((number + 1).min(instants.len() - 1));
@@ -642,10 +641,8 @@ fn alone(each: &[Estimate], is_long: impl Fn(Estimate) -> bool) -> Option<(usize
     known.iter().filter(|_| known.len() > 2).find_map(|&place| {
         let others = || known.iter().filter(|&&k| k != place).map(|&k| each[k]);
         let weight: f64 = others().map(|(_, deviation)| deviation.powi(-2)).sum();
-        let sum: f64 = others()
-            .map(|(own, deviation)| own * deviation.powi(-2))
-            .sum();
-        let common = (sum / weight, weight.sqrt().recip());
+        let weighted = others().map(|(own, deviation)| own * deviation.powi(-2));
+        let common = (weighted.sum::<f64>() / weight, weight.sqrt().recip());
         let off = others().map(|(seconds, _)| (seconds - common.0).abs());
         let farthest = off.fold(0.0, f64::max);
         let own = each[place];

@@ -48,11 +48,8 @@ impl Undeclared {
     /// merged with it: that time is known only to a segment of the log.
     pub(crate) fn add_load(&mut self, load: LoadChange) {
         let edge = |load: &LoadChange| {
-            if load.is_after {
-                load.span.0
-            } else {
-                load.span.1
-            }
+            let (first, last) = load.span;
+            if load.is_after { first } else { last }
         };
         let is_same = |other: &&mut LoadChange| {
             let apart = (edge(other) - edge(&load)).seconds().abs();
@@ -112,33 +109,13 @@ impl Undeclared {
         let (loads, contacts) = (&self.loads, &self.contacts);
         let robot = measurement.robot();
         let training = training_logs(logs);
-        let body = |load: &LoadChange| {
-            let NoiseAndMap {
-                prior,
-                noise,
-                information,
-                fit,
-                ..
-            } = estimate;
-            load::added_body(
-                measurement,
-                prior,
-                &training,
-                load,
-                noise,
-                information,
-                fit.tau,
-            )
-        };
+        let body = |load: &LoadChange| load::added_body(measurement, &training, load, estimate);
         let bodies: Vec<Option<(usize, load::AddedBody)>> = loads.iter().map(body).collect();
         let training = training_logs_mut(logs);
         for (number, (log, contacts)) in training.zip(contacts).enumerate() {
-            let own: Vec<(&LoadChange, &Option<(usize, load::AddedBody)>)> = loads
-                .iter()
-                .zip(&bodies)
-                .filter(|(load, _)| load.log == number)
-                .collect();
-            let loads: Vec<&LoadChange> = own.iter().map(|(load, _)| *load).collect();
+            let own = loads.iter().zip(&bodies);
+            let own = own.filter(|(load, _)| load.log == number);
+            let loads: Vec<&LoadChange> = own.clone().map(|(load, _)| load).collect();
             let apparent = apparent_contacts(log, contacts, &loads);
             for (part, excluded, when) in suspected(robot, log, &apparent) {
                 log.excluded.push(excluded);
@@ -149,7 +126,7 @@ impl Undeclared {
                 log.findings
                     .push(Finding::warning(FindingCode::Disturbance, part, text));
             }
-            for (place, (load, body)) in own.into_iter().enumerate() {
+            for (place, (load, body)) in own.enumerate() {
                 let handovers = apparent.iter().filter(|own| own.load == Some(place));
                 report_load(measurement, log, load, body.as_ref(), handovers);
             }
@@ -171,11 +148,8 @@ fn report_load<'a>(
     let place = body.map_or(load.place, |(place, _)| *place);
     let link = robot.model.link_name(unknowns.links[place]);
     let since = |t: Nanos| (t - log.span.0).seconds();
-    let mut out: Vec<bool> = log
-        .instants
-        .iter()
-        .map(|instant| load.has(instant.t))
-        .collect();
+    let stamps = log.instants.iter().map(|instant| instant.t);
+    let mut out: Vec<bool> = stamps.map(|t| load.has(t)).collect();
     for contact_span in handovers {
         out[contact_span.instants.clone()].fill(true);
     }
@@ -331,10 +305,8 @@ fn suspected(
         (part, excluded, when)
     };
     // They are in the order of the units.
-    contacts
-        .chunk_by(|a, b| a.unit == b.unit)
-        .map(of_unit)
-        .collect()
+    let units = contacts.chunk_by(|a, b| a.unit == b.unit);
+    units.map(of_unit).collect()
 }
 
 /// Reports undeclared disturbances of the validation logs, stores them in
@@ -373,9 +345,9 @@ pub(crate) fn report_validation(
                 ),
             ));
         }
-        log.instants
-            .iter_mut()
-            .for_each(|instant| instant.disturbed = UnitSet::default());
+        for instant in &mut log.instants {
+            instant.disturbed = UnitSet::default();
+        }
         log.disturbed = contacts;
     }
 }

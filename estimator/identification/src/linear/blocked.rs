@@ -34,10 +34,8 @@ fn copied(
 /// Writes a block at its place.
 fn put(to: &mut DMatrix<f64>, (row, column): (usize, usize), block: &DMatrix<f64>) {
     let (rows, height) = (block.nrows(), to.nrows());
-    let targets = to
-        .as_mut_slice()
-        .chunks_exact_mut(height.max(1))
-        .skip(column);
+    let targets = to.as_mut_slice().chunks_exact_mut(height.max(1));
+    let targets = targets.skip(column);
     for (from, to) in block.as_slice().chunks_exact(rows.max(1)).zip(targets) {
         to[row..row + rows].copy_from_slice(from);
     }

@@ -60,8 +60,8 @@ mod triangle;
 
 pub use panel::{InformationError, Panel};
 
-use crate::linear::information::panel::check_size;
 use nalgebra::{DMatrix, DVector};
+pub(crate) use panel::check_size;
 use triangle::Triangle;
 
 /// A compensated sum (Neumaier 1974) of a quantity that is not negative.
@@ -142,11 +142,8 @@ impl Information {
     /// # Errors
     /// The other has another number of unknowns. Nothing is changed then.
     pub fn copy_from(&mut self, other: &Self) -> Result<(), InformationError> {
-        check_size(
-            "unknowns of the other information",
-            other.unknowns(),
-            self.unknowns(),
-        )?;
+        let what = "unknowns of the other information";
+        check_size(what, other.unknowns(), self.unknowns())?;
         self.triangle.values.copy_from_slice(&other.triangle.values);
         (self.residual, self.rows) = (other.residual, other.rows);
         Ok(())
@@ -172,20 +169,12 @@ impl Information {
     /// exist here. Nothing is changed then.
     pub fn merge(&mut self, other: &Self, columns: &[usize]) -> Result<(), InformationError> {
         let n = self.unknowns();
-        check_size(
-            "columns of the other information",
-            columns.len(),
-            other.unknowns(),
-        )?;
-        check_columns(columns, n)?;
-        let (mut work, mut row) = (Panel::new(n, MERGED_ROWS), vec![0.0; n]);
-        self.residual.add(
-            self.triangle
-                .add(&other.triangle, columns, &mut work, &mut row),
-        );
-        self.residual.add(other.residual.get());
-        self.rows += other.rows;
-        Ok(())
+        self.add(
+            other,
+            columns,
+            &mut Panel::new(n, MERGED_ROWS),
+            &mut vec![0.0; n],
+        )
     }
 
     /// As [`Information::merge`], and clears `other`. Does not allocate: `work` is any panel about
@@ -200,19 +189,27 @@ impl Information {
         work: &mut Panel,
         row: &mut [f64],
     ) -> Result<(), InformationError> {
-        check_size(
-            "columns of the other information",
-            columns.len(),
-            other.unknowns(),
-        )?;
+        self.add(other, columns, work, row)?;
+        other.clear();
+        Ok(())
+    }
+
+    fn add(
+        &mut self,
+        other: &Self,
+        columns: &[usize],
+        work: &mut Panel,
+        row: &mut [f64],
+    ) -> Result<(), InformationError> {
+        let what = "columns of the other information";
+        check_size(what, columns.len(), other.unknowns())?;
         check_columns(columns, self.unknowns())?;
         check_size("unknowns of the panel", work.unknowns, self.unknowns())?;
         check_size("numbers of a row", row.len(), self.unknowns())?;
-        self.residual
-            .add(self.triangle.add(&other.triangle, columns, work, row));
+        let residual = self.triangle.add(&other.triangle, columns, work, row);
+        self.residual.add(residual);
         self.residual.add(other.residual.get());
         self.rows += other.rows;
-        other.clear();
         Ok(())
     }
 
@@ -231,16 +228,11 @@ impl Information {
     /// The lengths differ, a column does not exist, or a deviation is negative or NaN. Nothing is
     /// changed then.
     pub fn drift(&mut self, columns: &[usize], deviation: &[f64]) -> Result<(), InformationError> {
-        check_size(
-            "standard deviations of a drift",
-            deviation.len(),
-            columns.len(),
-        )?;
+        let what = "standard deviations of a drift";
+        check_size(what, deviation.len(), columns.len())?;
         check_columns(columns, self.unknowns())?;
-        if let Some(&value) = deviation
-            .iter()
-            .find(|value| value.is_nan() || **value < 0.0)
-        {
+        let wrong = |value: &&f64| value.is_nan() || **value < 0.0;
+        if let Some(&value) = deviation.iter().find(wrong) {
             let what = "a drift's standard deviation";
             return Err(InformationError::Range { what, value });
         }
@@ -276,27 +268,6 @@ impl Information {
         trailing.residual = self.residual;
         trailing.rows = self.rows;
         trailing
-    }
-
-    /// The marginal information about these unknowns, in this order. Allocates; for the last
-    /// unknowns [`Information::trailing`] is faster.
-    ///
-    /// # Errors
-    /// A column does not exist, or occurs twice.
-    pub fn marginal(&self, columns: &[usize]) -> Result<Self, InformationError> {
-        let n = self.unknowns();
-        check_columns(columns, n)?;
-        let free: Vec<usize> = (0..n).filter(|column| !columns.contains(column)).collect();
-        check_size("different columns", n - free.len(), columns.len())?;
-        let mut places = vec![0; n];
-        for (place, &column) in free.iter().chain(columns).enumerate() {
-            places[column] = place;
-        }
-        let mut reordered = Self::new(n);
-        reordered.merge(self, &places)?;
-        let mut marginal = reordered.trailing(free.len());
-        marginal.residual = self.residual;
-        Ok(marginal)
     }
 }
 

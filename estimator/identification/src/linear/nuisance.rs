@@ -86,10 +86,8 @@ impl NuisanceFilter {
     pub(crate) fn update(&mut self, g: &[f64], row: &mut [f64]) {
         let n = self.count;
         for (i, weight) in g.iter().enumerate().filter(|(_, weight)| **weight != 0.0) {
-            for (value, x) in row
-                .iter_mut()
-                .zip(&self.x[i * self.columns..][..self.columns])
-            {
+            let estimate = &self.x[i * self.columns..][..self.columns];
+            for (value, x) in row.iter_mut().zip(estimate) {
                 *value -= weight * x;
             }
         }
@@ -115,11 +113,8 @@ impl NuisanceFilter {
             }
             self.gain[j] = v;
         }
-        for (gain, x) in self
-            .gain
-            .iter()
-            .zip(self.x.chunks_exact_mut(self.columns.max(1)))
-        {
+        let estimates = self.x.chunks_exact_mut(self.columns.max(1));
+        for (gain, x) in self.gain.iter().zip(estimates) {
             if *gain != 0.0 {
                 let gain = gain / variance;
                 for (x, value) in x.iter_mut().zip(&*row) {

@@ -12,11 +12,8 @@ pub(crate) fn channel_of(sensor_place: usize, axis: usize) -> usize {
 }
 
 pub(crate) fn sensor_name(robot: &Robot, sensor: usize) -> String {
-    robot
-        .sensor_names()
-        .nth(sensor)
-        .unwrap_or_default()
-        .to_owned()
+    let name = robot.sensor_names().nth(sensor);
+    name.unwrap_or_default().to_owned()
 }
 
 pub(crate) fn channel_name(

@@ -27,8 +27,9 @@
 //! bodies would then make every row zero. Mass and gain scale together, so only the priors would
 //! speak against this solution, and the noise, which grows with the length of the log, for it.
 
-use crate::arithmetic::dot;
+use crate::arithmetic::{dot, mean};
 use crate::dataset::observation::{Annotated, Observation, UnitSet};
+use crate::dataset::stream::range;
 use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::{ExtraParameter, FRICTION, Unknowns, friction_row};
 use crate::robot::{IdentificationInput, Robot, TorqueSide, dofs_between};
@@ -36,16 +37,59 @@ use nalgebra::{DVector, Matrix6, Vector6};
 use proprio_dynamics::calibration::{Kind, Unknown};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::regressor::{Regressor, StackedRegressor, Weighting};
-use proprio_dynamics::spatial::Wrench;
+use proprio_dynamics::spatial::{RigidInertia, Wrench};
 use proprio_dynamics::{DynamicsError, JointState, Kinematics};
+use std::ops::Range;
 
-/// The representative of a node's set (union-find).
-fn root_of(parent: &mut [usize], mut node: usize) -> usize {
-    while parent[node] != node {
-        parent[node] = parent[parent[node]];
-        node = parent[node];
+/// Which links, extra parameters and channels appear in rows, and which of them in the same ones
+/// (union-find). They are numbered in this order.
+struct AppearingNodes {
+    parent: Vec<usize>,
+    seen: Vec<bool>,
+}
+
+impl AppearingNodes {
+    fn new(count: usize) -> Self {
+        Self {
+            parent: (0..count).collect(),
+            seen: vec![false; count],
+        }
     }
-    node
+
+    /// The representative of a node's group.
+    fn group(&mut self, mut node: usize) -> usize {
+        while self.parent[node] != node {
+            self.parent[node] = self.parent[self.parent[node]];
+            node = self.parent[node];
+        }
+        node
+    }
+
+    /// Adds a row over `links` links and the extra parameters, with its noise.
+    fn add(&mut self, links: usize, a: &[f64], noise: &[f64]) {
+        let (of_links, extra) = a.split_at(LINK_PARAMETERS * links);
+        let single = extra.iter().chain(noise).map(std::slice::from_ref);
+        let columns = of_links.chunks_exact(LINK_PARAMETERS).chain(single);
+        let mut first = None;
+        for (node, columns) in columns.enumerate() {
+            if columns.iter().any(|x| *x != 0.0) {
+                self.seen[node] = true;
+                let own = self.group(node);
+                let with = self.group(*first.get_or_insert(own));
+                self.parent[own.max(with)] = own.min(with);
+            }
+        }
+    }
+
+    fn groups(&mut self, nodes: impl Iterator<Item = usize>) -> Vec<usize> {
+        nodes.map(|node| self.group(node)).collect()
+    }
+
+    /// The nodes in this range that appear, counted from its start.
+    fn appearing(&self, range: Range<usize>) -> Vec<usize> {
+        let is_seen = |place: &usize| self.seen[range.start + place];
+        (0..range.len()).filter(is_seen).collect()
+    }
 }
 
 /// The group of each unknown and channel. No row has unknowns or channels of two groups.
@@ -94,17 +138,12 @@ impl<'a> MeasurementModel<'a> {
         observations: impl Iterator<Item = &'b Annotated>,
     ) -> Result<Self, DynamicsError> {
         let (links, sensors) = (robot.model.link_count(), robot.structure.sensors().len());
-        let (wrench, torque) = (
-            inputs.contains(&IdentificationInput::Wrench),
-            inputs.contains(&IdentificationInput::Torque),
-        );
+        let wrench = inputs.contains(&IdentificationInput::Wrench);
+        let torque = inputs.contains(&IdentificationInput::Torque);
         let dofs = 0..robot.model.dof_count();
         let has_rotors = torque && robot.torque_side == TorqueSide::Motor;
-        let extra: Vec<ExtraParameter> = if has_rotors {
-            dofs.clone().map(ExtraParameter::RotorInertia).collect()
-        } else {
-            Vec::new()
-        };
+        let rotors = dofs.clone().filter(|_| has_rotors);
+        let extra: Vec<ExtraParameter> = rotors.map(ExtraParameter::RotorInertia).collect();
         let all = Unknowns {
             links: (0..links).collect(),
             precision: extra.iter().map(|one| one.precision(robot)).collect(),
@@ -115,11 +154,8 @@ impl<'a> MeasurementModel<'a> {
         let mut measurement = Self {
             robot,
             unknowns: all,
-            cad: robot
-                .model
-                .inertias()
-                .iter()
-                .flat_map(proprio_dynamics::spatial::RigidInertia::parameters)
+            cad: (robot.model.inertias().iter())
+                .flat_map(RigidInertia::parameters)
                 .collect(),
             kinematics: Kinematics::new(&robot.model, robot.base_link)?,
             stacked: StackedRegressor::new(&robot.structure),
@@ -133,70 +169,36 @@ impl<'a> MeasurementModel<'a> {
             groups: Groups::default(),
         };
         // Links, extra parameters and channels are joined if a row has both.
-        let (channels, nodes) = (
-            measurement.unknowns.channels(),
-            links + measurement.unknowns.extra.len(),
-        );
-        let mut parent: Vec<usize> = (0..nodes + channels).collect();
+        let extra = measurement.unknowns.extra.len();
+        let (first_channel, channels) = (links + extra, measurement.unknowns.channels());
+        let mut nodes = AppearingNodes::new(first_channel + channels);
         let mut rows = MeasurementRows::new(&measurement.unknowns);
-        let (mut seen, mut appears) = (vec![false; nodes], vec![false; channels]);
         for observation in observations {
             measurement.make(observation, &mut rows)?;
             for row in 0..rows.count {
-                let mut first = None;
-                let mut join = |node: usize| {
-                    let own = root_of(&mut parent, node);
-                    let with = root_of(&mut parent, *first.get_or_insert(own));
-                    parent[own.max(with)] = own.min(with);
-                };
-                let (of_links, of_further) = rows.a(row).split_at(LINK_PARAMETERS * links);
-                let columns = of_links
-                    .chunks_exact(LINK_PARAMETERS)
-                    .chain(of_further.chunks_exact(1));
-                for (node, (seen, columns)) in seen.iter_mut().zip(columns).enumerate() {
-                    if columns.iter().any(|x| *x != 0.0) {
-                        *seen = true;
-                        join(node);
-                    }
-                }
-                for (channel, (appears, entry)) in appears.iter_mut().zip(rows.n(row)).enumerate() {
-                    if *entry != 0.0 {
-                        *appears = true;
-                        join(nodes + channel);
-                    }
-                }
+                nodes.add(links, rows.a(row), rows.n(row));
             }
         }
-        let numbers = |flags: &[bool]| (0..flags.len()).filter(|&i| flags[i]).collect();
-        let (wrenches, torques) = appears.split_at(6 * sensors);
-        let sensing: Vec<bool> = wrenches.chunks(6).map(|six| six.contains(&true)).collect();
-        let (seen, shows) = seen.split_at(links);
-        let shown: Vec<usize> = numbers(shows);
+        let first_torque = first_channel + 6 * sensors;
+        let is_read =
+            |sensor: &usize| nodes.seen[first_channel + 6 * sensor..][..6].contains(&true);
+        let extra = nodes.appearing(links..first_channel);
+        let all = std::mem::take(&mut measurement.unknowns);
         measurement.unknowns = Unknowns {
-            links: numbers(seen),
-            extra: shown
-                .iter()
-                .map(|&place| measurement.unknowns.extra[place])
-                .collect(),
-            precision: shown
-                .iter()
-                .map(|&place| measurement.unknowns.precision[place])
-                .collect(),
-            sensors: numbers(&sensing),
-            joints: numbers(torques),
+            links: nodes.appearing(0..links),
+            extra: extra.iter().map(|&place| all.extra[place]).collect(),
+            precision: extra.iter().map(|&place| all.precision[place]).collect(),
+            sensors: (0..sensors).filter(is_read).collect(),
+            joints: nodes.appearing(first_torque..first_channel + channels),
         };
         let unknowns = &measurement.unknowns;
-        let wrench_channels = unknowns.sensors.iter().flat_map(|s| 6 * s..6 * s + 6);
-        let channels: Vec<usize> = wrench_channels
-            .chain(unknowns.joints.iter().map(|j| 6 * sensors + j))
-            .collect();
-        let mut groups_of = |nodes: &mut dyn Iterator<Item = usize>| {
-            nodes.map(|node| root_of(&mut parent, node)).collect()
-        };
+        let wrenches = unknowns.sensors.iter().flat_map(|s| 6 * s..6 * s + 6);
+        let wrenches = wrenches.map(|channel| first_channel + channel);
+        let torques = unknowns.joints.iter().map(|joint| first_torque + joint);
         measurement.groups = Groups {
-            links: groups_of(&mut unknowns.links.iter().copied()),
-            extra: groups_of(&mut shown.into_iter().map(|place| links + place)),
-            channels: groups_of(&mut channels.into_iter().map(|channel| nodes + channel)),
+            links: nodes.groups(unknowns.links.iter().copied()),
+            extra: nodes.groups(extra.iter().map(|place| links + place)),
+            channels: nodes.groups(wrenches.chain(torques)),
         };
         Ok(measurement)
     }
@@ -218,10 +220,8 @@ impl<'a> MeasurementModel<'a> {
         const MIN_TEMPERATURE_RANGE: f64 = 0.1;
         let robot = self.robot;
         // Calibration parameters come last.
-        let others = self.unknowns.extra.iter();
-        let others = others
-            .filter(|extra| !matches!(extra, ExtraParameter::Calibration(..)))
-            .count();
+        let is_other = |extra: &&ExtraParameter| !matches!(extra, ExtraParameter::Calibration(..));
+        let others = self.unknowns.extra.iter().filter(is_other).count();
         self.unknowns.extra.truncate(others);
         self.unknowns.precision.truncate(others);
         self.groups.extra.truncate(others);
@@ -234,14 +234,12 @@ impl<'a> MeasurementModel<'a> {
             }
         }
         for (place, &sensor) in self.unknowns.sensors.iter().enumerate() {
-            let own = &temperatures[sensor];
-            let (low, high) = own.iter().fold((f64::MAX, f64::MIN), |(low, high), x| {
-                (low.min(*x), high.max(*x))
-            });
-            let mean = own.iter().sum::<f64>() / own.len() as f64;
-            self.references[sensor] = robot.calibrations[sensor].reference().unwrap_or(mean);
+            let own: &Vec<f64> = &temperatures[sensor];
+            let configured = robot.calibrations[sensor].reference();
+            self.references[sensor] = configured.unwrap_or(mean(own));
+            let varies = range(own.iter().copied()) > MIN_TEMPERATURE_RANGE;
             let kind = Kind {
-                temperature: wanted.temperature && high - low > MIN_TEMPERATURE_RANGE,
+                temperature: wanted.temperature && varies,
                 ..wanted
             };
             for unknown in kind.unknowns() {
@@ -260,10 +258,8 @@ impl<'a> MeasurementModel<'a> {
     /// The reference temperature of a sensor's change per kelvin \[degrees Celsius\], if one was
     /// recorded or configured.
     pub(crate) fn reference(&self, sensor: usize) -> Option<f64> {
-        self.references
-            .get(sensor)
-            .copied()
-            .filter(|celsius| celsius.is_finite())
+        let reference = self.references.get(sensor).copied();
+        reference.filter(|celsius| celsius.is_finite())
     }
 
     /// Columns and entries of a sensor's calibration in a row, where its offset has the entries
@@ -274,23 +270,17 @@ impl<'a> MeasurementModel<'a> {
         sensor: usize,
         values: &'b [f64],
     ) -> impl Iterator<Item = (usize, f64)> + 'b {
-        let celsius = observation
-            .temperatures
-            .get(sensor)
-            .copied()
-            .unwrap_or(f64::NAN);
-        let kelvin = Some(celsius - self.references[sensor]).filter(|kelvin| kelvin.is_finite());
-        let fitted = observation
-            .fitted
-            .get(sensor)
-            .filter(|fitted| fitted.is_finite());
+        let celsius = observation.temperatures.get(sensor);
+        let kelvin = celsius.map(|celsius| celsius - self.references[sensor]);
+        let kelvin = kelvin.filter(|kelvin| kelvin.is_finite()).unwrap_or(0.0);
+        let fitted = observation.fitted.get(sensor);
+        let fitted = fitted.filter(|fitted| fitted.is_finite());
         let corrected = fitted.unwrap_or(&self.readings[sensor]).torque_first();
-        self.calibrations[sensor]
-            .iter()
-            .map(move |&(column, unknown)| {
-                let as_offset = unknown.as_offset(&corrected, kelvin.unwrap_or(0.0));
-                (column, values[unknown.channel()] * as_offset)
-            })
+        let unknowns = self.calibrations[sensor].iter();
+        unknowns.map(move |&(column, unknown)| {
+            let as_offset = unknown.as_offset(&corrected, kelvin);
+            (column, values[unknown.channel()] * as_offset)
+        })
     }
 
     pub(crate) fn unknowns(&self) -> &Unknowns {
@@ -310,14 +300,10 @@ impl<'a> MeasurementModel<'a> {
     /// CAD's parameters in the columns of the rows; zero for extra parameters.
     pub(crate) fn cad_of_unknowns(&self) -> Vec<f64> {
         let links = self.unknowns.links.iter();
-        let of_links = links.flat_map(|link| {
-            self.cad[LINK_PARAMETERS * link..][..LINK_PARAMETERS]
-                .iter()
-                .copied()
-        });
-        of_links
-            .chain(self.unknowns.extra.iter().map(|_| 0.0))
-            .collect()
+        let of_links = links.map(|link| &self.cad[LINK_PARAMETERS * link..][..LINK_PARAMETERS]);
+        let mut all: Vec<f64> = of_links.flatten().copied().collect();
+        all.resize(self.unknowns.parameters(), 0.0);
+        all
     }
 
     /// Measured minus predicted torque of every joint, for parameters `d` relative to CAD; NaN
@@ -339,12 +325,9 @@ impl<'a> MeasurementModel<'a> {
             let Some(row) = self.tree.joint_row(dof).filter(|_| !blocked[dof]) else {
                 return f64::NAN;
             };
-            let own = self.unknowns.links.iter().enumerate().map(|(place, link)| {
-                dot(
-                    &row[LINK_PARAMETERS * link..][..LINK_PARAMETERS],
-                    &d[LINK_PARAMETERS * place..][..LINK_PARAMETERS],
-                )
-            });
+            let links = self.unknowns.links.iter();
+            let own = (links.zip(d.chunks_exact(LINK_PARAMETERS)))
+                .map(|(link, d)| dot(&row[LINK_PARAMETERS * link..][..LINK_PARAMETERS], d));
             observation.torque[dof] - dot(row, &self.cad) - own.sum::<f64>()
         };
         Ok((0..self.robot.model.dof_count()).map(error).collect())
@@ -390,9 +373,8 @@ impl<'a> MeasurementModel<'a> {
         let robot = self.robot;
         let mut routes = Vec::new();
         for (number, subtree) in self.stacked.subtrees().iter().enumerate() {
-            let own: Vec<usize> = (0..rows.count)
-                .filter(|&row| rows.units[row] == number)
-                .collect();
+            let is_own = |row: &usize| rows.units[*row] == number;
+            let own: Vec<usize> = (0..rows.count).filter(is_own).collect();
             if subtree.sensors().len() < 2 || !subtree.contacts().is_empty() || own.len() < 6 {
                 continue;
             }
@@ -410,13 +392,11 @@ impl<'a> MeasurementModel<'a> {
                     // The axis is given in the base; the equations are about the top link's origin
                     // in its axes.
                     let along = self.kinematics.pose(subtree.top()).inverse().twist(&axis);
-                    let along =
-                        Vector6::from_iterator(along.angular.iter().chain(&along.linear).copied());
-                    let along = equations.tr_mul(&along);
+                    let along = along.angular.iter().chain(&along.linear).copied();
+                    let along = equations.tr_mul(&Vector6::from_iterator(along));
                     let mut all = DVector::zeros(rows.count);
-                    own.iter()
-                        .zip(along.iter())
-                        .for_each(|(row, weight)| all[*row] = *weight);
+                    let weights = own.iter().zip(along.iter());
+                    weights.for_each(|(row, weight)| all[*row] = *weight);
                     routes.push((dof, all));
                 }
             }
@@ -458,12 +438,8 @@ impl<'a> MeasurementModel<'a> {
             .update(&self.kinematics, &self.readings, &observation.active, &[])?;
         self.stacked.eliminate_contacts(Weighting::Noise);
         for (unit, subtree) in self.stacked.subtrees().iter().enumerate() {
-            let unread = |sensor: usize| {
-                observation
-                    .readings
-                    .get(sensor)
-                    .is_none_or(|r| !r.is_finite())
-            };
+            let readings = &observation.readings;
+            let unread = |sensor: usize| readings.get(sensor).is_none_or(|r| !r.is_finite());
             let is_disturbed = !self.includes_disturbed && observation.disturbed.contains(unit);
             if is_disturbed || subtree.sensors().len() == 0 || subtree.sensors().any(unread) {
                 continue;
@@ -515,10 +491,8 @@ impl<'a> MeasurementModel<'a> {
             }
             let (a, r, g, n) = rows.push(Observation::TORQUES);
             *r = torque - row.iter().zip(&self.cad).map(|(x, y)| x * y).sum::<f64>();
-            for (to, link) in a
-                .chunks_exact_mut(LINK_PARAMETERS)
-                .zip(&self.unknowns.links)
-            {
+            let places = a.chunks_exact_mut(LINK_PARAMETERS);
+            for (to, link) in places.zip(&self.unknowns.links) {
                 to.copy_from_slice(&row[LINK_PARAMETERS * link..][..LINK_PARAMETERS]);
             }
             if let Some(column) = self.unknowns.column(ExtraParameter::RotorInertia(dof)) {

@@ -1,5 +1,6 @@
 //! Estimates the noise of every channel from the residuals of all segments.
 
+use crate::arithmetic::mean;
 use crate::linear::noise;
 use crate::measurement::noise_model::{DriftLimits, NoiseModel};
 use crate::measurement::reduction::{BLOCK, Residuals};
@@ -7,22 +8,12 @@ use crate::measurement::unknowns::Unknowns;
 use std::ops::Range;
 
 /// Means over this many autocorrelation times count as independent.
-pub(crate) const INDEPENDENT: f64 = 8.0;
+const INDEPENDENT: f64 = 8.0;
 /// Greatest number of blocks that are merged into one.
-pub(crate) const LONGEST: usize = 10;
+const LONGEST: usize = 10;
 
 /// Lower limit of a channel's share of noise, for channels mixed with others.
-pub(crate) const LEAST_SHARE: f64 = 1e-3;
-
-/// Means of `count` consecutive blocks each.
-pub(crate) fn merge(means: &[f64], count: usize) -> Vec<f64> {
-    let mean = |values: &[f64]| {
-        let finite = values.iter().filter(|x| x.is_finite());
-        let (sum, count) = finite.fold((0.0, 0.0), |(sum, count), x| (sum + x, count + 1.0));
-        sum / count
-    };
-    means.chunks(count).map(mean).collect()
-}
+const LEAST_SHARE: f64 = 1e-3;
 
 /// The noise of every channel, from the residuals of all segments for one set of parameters.
 ///
@@ -44,75 +35,20 @@ pub(crate) fn estimate_noise(
         ..NoiseModel::default()
     };
     for channel in 0..unknowns.channels() {
-        let is_wrench = channel < 6 * unknowns.sensors.len();
-        let (mut step, mut variance) = (0.0, 0.0);
         let mut left: Vec<Vec<f64>> = segments
             .iter()
             .map(|segment| segment.noise[set][channel].clone())
             .collect();
-        let mut per_block = 1.0;
-        if is_wrench {
-            // The sum of offset and noise: a random walk, and the noise beside it.
-            let mut means: Vec<noise::BlockMeans> = Vec::new();
-            let (mut used, mut filled) = (0usize, 0usize);
+        let walk = (channel < 6 * unknowns.sensors.len()).then(|| {
             for (segment, left) in segments.iter().zip(&mut left) {
-                for (range, offset) in segment
-                    .ranges
-                    .iter()
-                    .zip(segment.offset_drift(unknowns, set, channel))
-                {
+                let drift = segment.offset_drift(unknowns, set, channel);
+                for (range, offset) in segment.ranges.iter().zip(drift) {
                     left[range.clone()].iter_mut().for_each(|x| *x += offset);
                 }
-                let mean = |range: &Range<usize>| {
-                    let values = left[range.clone()].iter().filter(|x| x.is_finite());
-                    let (sum, count) =
-                        values.fold((0.0, 0usize), |(sum, count), x| (sum + x, count + 1));
-                    (sum / count as f64, count)
-                };
-                let blocks: Vec<(f64, usize)> = segment.ranges.iter().map(mean).collect();
-                used += blocks.iter().map(|b| b.1).sum::<usize>();
-                filled += blocks.iter().filter(|b| b.1 > 0).count();
-                means.push(blocks.iter().map(|block| block.0).collect());
             }
-            per_block = used as f64 / filled.max(1) as f64;
-            // Noise that is correlated over more than a block looks like a random walk there. Once
-            // its correlation time is known, longer blocks separate the two.
-            let totals = left.clone();
-            let mut merged = 1;
-            for _ in 0..2 {
-                let longer: Vec<noise::BlockMeans> =
-                    means.iter().map(|means| merge(means, merged)).collect();
-                let count = merged as f64;
-                let fastest = drift_limits.rates[channel] * BLOCK * count;
-                let mut bound = (drift_limits.relative * count * count).min(1.0);
-                for _ in 0..4 {
-                    (step, variance) = noise::random_walk(&longer, bound);
-                    if step <= fastest {
-                        break;
-                    }
-                    bound = fastest / (variance + step - fastest);
-                }
-                step = step.min(fastest);
-                (step, variance) = (step / count, variance * count);
-                let mut levels = means
-                    .iter()
-                    .flat_map(|means| noise::levels(means, step, variance));
-                for ((segment, left), total) in segments.iter().zip(&mut left).zip(&totals) {
-                    for range in &segment.ranges {
-                        let level = levels.next().unwrap_or(f64::NAN);
-                        for (x, total) in left[range.clone()].iter_mut().zip(&total[range.clone()])
-                        {
-                            *x = total - level;
-                        }
-                    }
-                }
-                let slices: Vec<&[f64]> = left.iter().map(Vec::as_slice).collect();
-                let (_, time) = noise::autocorrelation_time(&slices);
-                merged = ((INDEPENDENT * time / per_block).round() as usize).clamp(1, LONGEST);
-            }
-        }
-        let slices: Vec<&[f64]> = left.iter().map(Vec::as_slice).collect();
-        let (square, time) = noise::autocorrelation_time(&slices);
+            remove_random_walk(segments, &mut left, drift_limits, channel)
+        });
+        let (square, time) = autocorrelation_time(&left);
         let seen: f64 = segments.iter().map(|segment| segment.seen[channel]).sum();
         let shown: f64 = segments
             .iter()
@@ -123,25 +59,86 @@ pub(crate) fn estimate_noise(
         } else {
             1.0
         };
+        let (step, block) = walk.unwrap_or((0.0, square * time));
         model.square.push(square / share);
         model.time.push(time);
         model.drift.push(step / BLOCK / share);
-        let block = if is_wrench {
-            variance * per_block
-        } else {
-            square * time
-        };
         model.block.push(block / share);
     }
     model.least = alike(unknowns, segments, &model);
     model
 }
 
+fn autocorrelation_time(segments: &[Vec<f64>]) -> (f64, f64) {
+    let slices: Vec<&[f64]> = segments.iter().map(Vec::as_slice).collect();
+    noise::autocorrelation_time(&slices)
+}
+
+/// Removes the random walk of a channel's offset from the sums of offset and noise. Returns the
+/// variances of its step between blocks, and of a row for which block means have the variance that
+/// was found for them beside it.
+fn remove_random_walk(
+    segments: &[Residuals],
+    left: &mut [Vec<f64>],
+    drift_limits: &DriftLimits,
+    channel: usize,
+) -> (f64, f64) {
+    let mut means: Vec<noise::BlockMeans> = Vec::new();
+    let (mut used, mut filled) = (0usize, 0usize);
+    for (segment, left) in segments.iter().zip(&*left) {
+        let block_mean = |range: &Range<usize>| {
+            let values = left[range.clone()].iter().filter(|x| x.is_finite());
+            let (sum, count) = values.fold((0.0, 0usize), |(sum, count), x| (sum + x, count + 1));
+            used += count;
+            filled += usize::from(count > 0);
+            sum / count as f64
+        };
+        means.push(segment.ranges.iter().map(block_mean).collect());
+    }
+    let per_block = used as f64 / filled.max(1) as f64;
+    // Noise that is correlated over more than a block looks like a random walk there. Once its
+    // correlation time is known, longer blocks separate the two.
+    let totals = left.to_vec();
+    let (mut step, mut variance) = (0.0, 0.0);
+    let mut merged = 1;
+    for _ in 0..2 {
+        let merge = |means: &noise::BlockMeans| means.chunks(merged).map(mean).collect();
+        let longer: Vec<noise::BlockMeans> = means.iter().map(merge).collect();
+        let count = merged as f64;
+        let fastest = drift_limits.rates[channel] * BLOCK * count;
+        let mut bound = (drift_limits.relative * count * count).min(1.0);
+        for _ in 0..4 {
+            (step, variance) = noise::random_walk(&longer, bound);
+            if step <= fastest {
+                break;
+            }
+            bound = fastest / (variance + step - fastest);
+        }
+        step = step.min(fastest);
+        (step, variance) = (step / count, variance * count);
+        for ((segment, means), (left, total)) in segments
+            .iter()
+            .zip(&means)
+            .zip(left.iter_mut().zip(&totals))
+        {
+            let levels = noise::levels(means, step, variance);
+            for (range, level) in segment.ranges.iter().zip(levels) {
+                for (x, total) in left[range.clone()].iter_mut().zip(&total[range.clone()]) {
+                    *x = total - level;
+                }
+            }
+        }
+        let (_, time) = autocorrelation_time(left);
+        merged = ((INDEPENDENT * time / per_block).round() as usize).clamp(1, LONGEST);
+    }
+    (step, variance * per_block)
+}
+
 /// Lower limits of the variances of channels that rows show only together with others. How their
 /// sum is shared among them is poorly determined, and the likelihood is greatest where some have no
 /// noise at all. Combinations of rows that show only these channels would then count as exact. So
 /// each channel has at least half the mean noise of these channels, relative to the stated noise.
-pub(crate) fn alike(unknowns: &Unknowns, segments: &[Residuals], model: &NoiseModel) -> Vec<f64> {
+fn alike(unknowns: &Unknowns, segments: &[Residuals], model: &NoiseModel) -> Vec<f64> {
     const MIN_SHARE: f64 = 0.5;
     let wrenches = 6 * unknowns.sensors.len();
     let relative =

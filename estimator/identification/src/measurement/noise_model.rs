@@ -49,23 +49,16 @@ impl NoiseModel {
     /// Variances with which correlated rows may count as independent. They are used for estimating
     /// parameters.
     pub(crate) fn inflated(&self) -> Vec<f64> {
-        let each = self
-            .square
-            .iter()
-            .zip(&self.time)
-            .zip(&self.block)
-            .zip(&self.least);
-        each.map(|(((square, time), block), least)| (square * time).max(*block).max(*least))
+        let correlated = |c: usize| self.square[c] * self.time[c];
+        (0..self.square.len())
+            .map(|c| correlated(c).max(self.block[c]).max(self.least[c]))
             .collect()
     }
 
     /// Variances for tracking the offsets.
     pub(crate) fn offset_tracking_variances(&self) -> Vec<f64> {
-        self.block
-            .iter()
-            .zip(&self.least)
-            .map(|(x, y)| x.max(*y))
-            .collect()
+        let pairs = self.block.iter().zip(&self.least);
+        pairs.map(|(block, least)| block.max(*least)).collect()
     }
 
     /// The mean of this model, from the data that the parameters were fitted to, and one from
@@ -96,9 +89,8 @@ impl NoiseModel {
     /// small. None if there is no cycle.
     pub(crate) fn end_limit_cycle(rounds: &[Self], within: f64) -> Option<Self> {
         let (newest, before) = rounds.split_last()?;
-        let back = before
-            .iter()
-            .rposition(|other| newest.change(other) < within)?;
+        let is_alike = |other: &Self| newest.change(other) < within;
+        let back = before.iter().rposition(is_alike)?;
         let mut greatest = newest.clone();
         for other in &before[back + 1..] {
             let (own, others) = (greatest.inflated(), other.inflated());

@@ -1,7 +1,7 @@
 //! Passes over a log's observations: the information about the parameters, and the residuals for
 //! given parameters.
 
-use crate::arithmetic::dot;
+use crate::arithmetic::{add_multiple, dot};
 use crate::dataset::observation::Annotated;
 use crate::linear::information::{Information, Panel};
 use crate::linear::nuisance::{NuisanceEstimate, NuisanceFilter, smooth};
@@ -39,6 +39,14 @@ pub(crate) struct LogSegment<'a> {
     pub log: Option<usize>,
 }
 
+impl<'a> LogSegment<'a> {
+    /// Its seconds are not weighted.
+    pub(crate) fn alone(instants: &'a [Annotated]) -> Self {
+        let log = None;
+        Self { instants, log }
+    }
+}
+
 /// Prior variances of the nuisance parameters.
 pub(crate) fn nuisance_prior(unknowns: &Unknowns) -> Vec<f64> {
     let mut prior = vec![OFFSET_VARIANCE; 6 * unknowns.sensors.len()];
@@ -46,11 +54,11 @@ pub(crate) fn nuisance_prior(unknowns: &Unknowns) -> Vec<f64> {
     prior
 }
 
-/// The blocks of consecutive observations.
-pub(crate) fn blocks(instants: &[Annotated]) -> Vec<Range<usize>> {
+/// The blocks of consecutive observations, each of this duration.
+pub(crate) fn blocks(instants: &[Annotated], seconds: f64) -> Vec<Range<usize>> {
     let (mut blocks, mut start) = (Vec::new(), 0);
     for end in 1..=instants.len() {
-        let is_long = |next: &Annotated| (next.t - instants[start].t).seconds() >= BLOCK;
+        let is_long = |next: &Annotated| (next.t - instants[start].t).seconds() >= seconds;
         if instants.get(end).is_none_or(is_long) {
             blocks.push(start..end);
             start = end;
@@ -103,7 +111,7 @@ pub(crate) fn reduce_with(
     let mut line = vec![0.0; p + 1];
     let (mut slopes, mut own) = (Vec::new(), Vec::new());
     let mut last = None;
-    for range in blocks(segment.instants) {
+    for range in blocks(segment.instants, BLOCK) {
         let t = segment.instants[range.start].t;
         if let Some(last) = last.replace(t) {
             nuisance.drift(&noise.steps(&unknowns, (t - last).seconds()));
@@ -205,7 +213,7 @@ pub(crate) fn filter_nuisance(
     let mut nuisance = NuisanceFilter::new(&nuisance_prior(&unknowns), k);
     let make = || (measurement.clone(), MeasurementRows::new(&unknowns));
     let (mut states, mut last) = (Vec::new(), None);
-    let blocks = blocks(segment.instants);
+    let blocks = blocks(segment.instants, BLOCK);
     for some in blocks.chunks(AT_ONCE * BLOCKS_PER_TASK) {
         // Per row: the residual of every set, and the coefficients of the nuisance parameters.
         let width = k + unknowns.nuisance();
@@ -267,79 +275,53 @@ pub(crate) fn residuals(
     noise: &NoiseModel,
     sets: &[DVector<f64>],
 ) -> Residuals {
-    let unknowns = measurement.unknowns().clone();
+    let unknowns = measurement.unknowns();
     let (k, channels, count) = (sets.len(), unknowns.channels(), segment.instants.len());
-    let variances = noise.offset_tracking_variances();
-    let make = || (measurement.clone(), MeasurementRows::new(&unknowns));
     let (ranges, mut states) = filter_nuisance(measurement, segment, noise, sets);
     smooth(&mut states);
-    let mut first = measurement.cad_of_unknowns();
-    if let Some(set) = sets.first() {
-        first
-            .iter_mut()
-            .zip(set)
-            .for_each(|(value, change)| *value += change);
-    }
     let cad = measurement.cad_of_unknowns();
-    let number = |at: usize| at * BLOCKS_PER_TASK..ranges.len().min((at + 1) * BLOCKS_PER_TASK);
-    // For some blocks, per observation and channel: the residual of each set, the prediction of the
-    // first set, the measurement; then sums of shares, and counts of observations.
+    let mut first = cad.clone();
+    if let Some(set) = sets.first() {
+        add_multiple(&mut first, 1.0, set.as_slice());
+    }
+    let pass = ResidualPass {
+        sets,
+        first,
+        cad,
+        variances: noise.offset_tracking_variances(),
+    };
     let parts = parallel::map_with(
         ranges.len().div_ceil(BLOCKS_PER_TASK),
-        make,
+        || (measurement.clone(), MeasurementRows::new(unknowns)),
         |(measurement, rows), at| {
-            let (mut white, mut e) = (Vec::new(), vec![0.0; channels]);
-            let (mut shares, mut seen) = (vec![0.0; channels * channels], vec![0.0_f64; channels]);
-            let mut values = Vec::new();
-            for (range, state) in ranges[number(at)].iter().zip(&states[number(at)]) {
-                for observation in &segment.instants[range.clone()] {
-                    let start = values.len();
-                    values.resize(start + (k + 2) * channels, f64::NAN);
+            let mut sums = ResidualSums::new(channels);
+            for block in at * BLOCKS_PER_TASK..ranges.len().min((at + 1) * BLOCKS_PER_TASK) {
+                for observation in &segment.instants[ranges[block].clone()] {
                     if measurement.make(observation, rows).is_err() {
-                        continue;
+                        rows.clear();
                     }
-                    rows.whiten(&variances);
-                    rows.add_shares(&variances, &mut shares);
-                    let there: Vec<usize> =
-                        (0..channels).filter(|&channel| rows.has(channel)).collect();
-                    there.iter().for_each(|&channel| seen[channel] += 1.0);
-                    let mut give = |value: &dyn Fn(usize) -> f64, out: usize| {
-                        white.clear();
-                        white.extend((0..rows.count).map(value));
-                        rows.channel_noise(&variances, &mut white, &mut e);
-                        for &channel in &there {
-                            values[start + out * channels + channel] = e[channel];
-                        }
-                    };
-                    for (set, d) in sets.iter().enumerate() {
-                        let s = state.x.column(set);
-                        give(&|row| rows.residual(row, d.as_slice(), s.as_slice()), set);
-                    }
-                    give(&|row| dot(rows.a(row), &first), k);
-                    give(&|row| rows.r(row) + dot(rows.a(row), &cad), k + 1);
+                    pass.add(rows, &states[block], &mut sums);
                 }
             }
-            (values, shares, seen)
+            sums
         },
     );
     let mut left = vec![vec![vec![f64::NAN; count]; channels]; k + 2];
-    let (mut shares, mut seen) = (vec![0.0; channels * channels], vec![0.0_f64; channels]);
+    let ResidualSums {
+        mut shares,
+        mut seen,
+        ..
+    } = ResidualSums::new(channels);
     let mut i = 0;
-    for (values, of_part, seen_there) in parts {
-        for values in values.chunks_exact((k + 2) * channels) {
-            let columns = left.iter_mut().flatten();
-            columns
-                .zip(values)
-                .for_each(|(column, value)| column[i] = *value);
+    for part in parts {
+        for values in part.values.chunks_exact((k + 2) * channels) {
+            for (column, value) in left.iter_mut().flatten().zip(values) {
+                column[i] = *value;
+            }
             i += 1;
         }
-        shares
-            .iter_mut()
-            .zip(of_part)
-            .for_each(|(sum, share)| *sum += share);
-        seen.iter_mut()
-            .zip(seen_there)
-            .for_each(|(sum, seen)| *sum += seen);
+        add_multiple(&mut shares, 1.0, &part.shares);
+        add_multiple(&mut seen, 1.0, &part.seen);
     }
     let measured = left.pop().unwrap_or_default();
     let predicted = left.pop().unwrap_or_default();
@@ -353,6 +335,73 @@ pub(crate) fn residuals(
             shares[i * channels + j] / seen[i].max(1.0)
         }),
         seen,
+    }
+}
+
+/// What the pass over some observations gives, and its buffers.
+struct ResidualSums {
+    /// Per observation and channel: the residual of each set, the prediction of the first set, the
+    /// measurement.
+    values: Vec<f64>,
+    /// Sum of the shares ([`Residuals::shares`]).
+    shares: Vec<f64>,
+    /// Number of observations in which any row has a channel.
+    seen: Vec<f64>,
+    white: Vec<f64>,
+    noise: Vec<f64>,
+}
+
+impl ResidualSums {
+    fn new(channels: usize) -> Self {
+        Self {
+            values: Vec::new(),
+            shares: vec![0.0; channels * channels],
+            seen: vec![0.0; channels],
+            white: Vec::new(),
+            noise: vec![0.0; channels],
+        }
+    }
+}
+
+/// The pass over observations for their residuals.
+struct ResidualPass<'a> {
+    sets: &'a [DVector<f64>],
+    /// The parameters of the first set, and CAD's.
+    first: Vec<f64>,
+    cad: Vec<f64>,
+    variances: Vec<f64>,
+}
+
+impl ResidualPass<'_> {
+    /// Adds an observation with these rows, given the nuisance parameters of all sets.
+    fn add(&self, rows: &mut MeasurementRows, state: &NuisanceEstimate, sums: &mut ResidualSums) {
+        let ResidualSums {
+            values,
+            shares,
+            seen,
+            white,
+            noise,
+        } = sums;
+        let (k, channels, start) = (self.sets.len(), seen.len(), values.len());
+        values.resize(start + (k + 2) * channels, f64::NAN);
+        rows.whiten(&self.variances);
+        rows.add_shares(&self.variances, shares);
+        let there: Vec<usize> = (0..channels).filter(|&channel| rows.has(channel)).collect();
+        there.iter().for_each(|&channel| seen[channel] += 1.0);
+        let mut write = |column: usize, of_row: &dyn Fn(usize) -> f64| {
+            white.clear();
+            white.extend((0..rows.count).map(of_row));
+            rows.channel_noise(&self.variances, white, noise);
+            for &channel in &there {
+                values[start + column * channels + channel] = noise[channel];
+            }
+        };
+        for (set, d) in self.sets.iter().enumerate() {
+            let s = state.x.column(set);
+            write(set, &|row| rows.residual(row, d.as_slice(), s.as_slice()));
+        }
+        write(k, &|row| dot(rows.a(row), &self.first));
+        write(k + 1, &|row| rows.r(row) + dot(rows.a(row), &self.cad));
     }
 }
 
@@ -551,10 +600,7 @@ pub(crate) mod tests {
             .map(|channel| if channel % 6 < 3 { 1e-10 } else { 1e-8 })
             .collect();
         let mut noise = NoiseModel::unknown(least.clone());
-        let segment = LogSegment {
-            instants,
-            log: None,
-        };
+        let segment = LogSegment::alone(instants);
         let zero = DVector::zeros(unknowns.parameters());
         let walks = DriftLimits {
             relative: 0.01,

@@ -1,6 +1,6 @@
 //! Rows of one observation, whitened by the noise of its channels.
 
-use crate::arithmetic::{dot, factorise, forward};
+use crate::arithmetic::{add_multiple, dot, factorise, forward};
 use crate::measurement::unknowns::Unknowns;
 
 /// The rows of one observation; reusable buffers.
@@ -137,10 +137,8 @@ impl MeasurementRows {
     pub(crate) fn channel_noise(&self, variances: &[f64], whitened: &mut [f64], out: &mut [f64]) {
         let m = self.count;
         for i in (0..m).rev() {
-            let below: f64 = (i + 1..m)
-                .map(|k| self.factor[k * m + i] * whitened[k])
-                .sum();
-            whitened[i] = (whitened[i] - below) / self.factor[i * m + i];
+            let below = (i + 1..m).map(|k| self.factor[k * m + i] * whitened[k]);
+            whitened[i] = (whitened[i] - below.sum::<f64>()) / self.factor[i * m + i];
         }
         out.fill(0.0);
         for (row, weight) in whitened.iter().enumerate() {
@@ -170,9 +168,7 @@ impl MeasurementRows {
             {
                 if *own != 0.0 {
                     let weight = own * variance;
-                    sums.iter_mut()
-                        .zip(row)
-                        .for_each(|(sum, other)| *sum += weight * other);
+                    add_multiple(sums, weight, row);
                 }
             }
         }
@@ -181,9 +177,8 @@ impl MeasurementRows {
     /// The joint of a torque row; None for other rows. `offsets`: number of channels before those
     /// of joints.
     pub(crate) fn joint(&self, row: usize, offsets: usize) -> Option<usize> {
-        self.n(row)[offsets..]
-            .iter()
-            .position(|entry| *entry != 0.0)
+        let torques = &self.n(row)[offsets..];
+        torques.iter().position(|entry| *entry != 0.0)
     }
 
     /// Whether any row has this channel's noise.

@@ -72,9 +72,9 @@ impl Seconds {
             for (i, instant) in segment.instants.iter().enumerate() {
                 let root = self.factor(segment.log, instant.t).sqrt();
                 for set in &mut residuals.noise {
-                    set[..channels]
-                        .iter_mut()
-                        .for_each(|noise| noise[i] /= root);
+                    for noise in &mut set[..channels] {
+                        noise[i] /= root;
+                    }
                 }
             }
         }

@@ -1,6 +1,6 @@
 //! The unknowns: the meaning of the columns of all rows.
 
-use crate::robot::Robot;
+use crate::robot::{Robot, stated_noise};
 use proprio_dynamics::Structure;
 use proprio_dynamics::calibration::Unknown;
 use proprio_dynamics::regressor::LINK_PARAMETERS;
@@ -125,10 +125,8 @@ impl Unknowns {
 
     /// Noise deviations of the channels of F/T sensors, as stated in the configuration.
     pub(crate) fn stated<'a>(&'a self, robot: &'a Robot) -> impl Iterator<Item = f64> + 'a {
-        self.sensors.iter().flat_map(|&sensor| {
-            let noise = robot.structure.sensors()[sensor].noise();
-            noise.torque.into_iter().chain(noise.force)
-        })
+        let cuts = robot.structure.sensors();
+        (self.sensors.iter()).flat_map(|&sensor| stated_noise(&cuts[sensor]))
     }
 
     /// The nuisance parameter that is the offset of a channel.

@@ -38,7 +38,7 @@ pub use hypothesis::{Hypothesis, MotionReading, WrenchReading};
 
 use crate::online::component::ComponentLayout;
 use crate::online::solution::{DetectedChange, Doubt, OnlineError, Solution};
-use crate::robot::Robot;
+use crate::robot::{Robot, stated_noise};
 use evidence::{HypothesisFit, HypothesisPosterior, SMALL, SubtreeUnknowns, TickRows, dot};
 use hypothesis::SeenMotion;
 use nalgebra::Vector6;
@@ -171,10 +171,8 @@ impl Bank {
                 ));
             }
         }
-        let stated = structure.sensors().iter().map(|cut| {
-            let noise = Wrench::from_parts(cut.noise().force, cut.noise().torque);
-            noise.torque_first().map(|sigma| sigma * sigma)
-        });
+        let sensors = structure.sensors().iter();
+        let stated = sensors.map(|cut| stated_noise(cut).map(|sigma| sigma * sigma));
         Ok(Self {
             units,
             variances: stated.collect(),
@@ -199,11 +197,8 @@ impl Bank {
         self.latest.extend_from_slice(ticks);
         let old = self.latest.len().saturating_sub(LATEST);
         self.latest.drain(..old);
-        let newest = decided
-            .iter()
-            .map(|(newest, _)| *newest)
-            .max()
-            .unwrap_or(i64::MIN);
+        let newest = decided.iter().map(|(newest, _)| *newest).max();
+        let newest = newest.unwrap_or(i64::MIN);
         let waiting = std::mem::take(&mut self.waiting).into_iter();
         let (now, later): (Vec<Tick>, Vec<Tick>) = waiting
             .chain(ticks.iter().cloned())
@@ -211,14 +206,6 @@ impl Bank {
         // If nothing is learnt, no tick is decided.
         let old = later.len().saturating_sub(MOST_WAITING);
         self.waiting = later.into_iter().skip(old).collect();
-        let Self {
-            equations,
-            units,
-            variances,
-            recent,
-            since_last,
-            ..
-        } = self;
         for mut tick in now {
             for (component, (_, slots)) in decided.iter().enumerate() {
                 if slots.binary_search(&tick.slot).is_ok() {
@@ -227,36 +214,32 @@ impl Bank {
             }
             let is_learnt = |component: usize| tick.learnt & tick.moving & bit(component) != 0;
             let mut views: Vec<MotionReading> = Vec::new();
-            for unit in units.iter().filter(|unit| is_learnt(unit.component)) {
+            for unit in self.units.iter().filter(|unit| is_learnt(unit.component)) {
                 views.extend(unit.fits.iter().map(|fit| fit.view));
             }
             while let Some(view) = views.pop() {
                 views.retain(|other| *other != view);
-                let Some(shifted) = equations.shifted(&tick, view, units) else {
+                let Some(shifted) = self.equations.shifted(&tick, view, &self.units) else {
                     continue;
                 };
-                if !equations.update(&tick, view) {
+                if !self.equations.update(&tick, view) {
                     continue;
                 }
-                for (number, unit) in units.iter_mut().enumerate() {
-                    if !is_learnt(unit.component) {
-                        continue;
-                    }
-                    let rows = equations.rows(unit, &tick, &shifted[number], variances);
+                let units = self.units.iter_mut().zip(&shifted);
+                for (unit, shifted) in units.filter(|(unit, _)| is_learnt(unit.component)) {
+                    let rows = self.equations.rows(unit, &tick, shifted, &self.variances);
                     for fit in unit.fits.iter_mut().filter(|fit| fit.view == view) {
                         fit.add(&unit.columns, &rows);
                     }
                 }
             }
-            if tick.learnt != 0 {
-                *since_last += 1;
-            }
-            if tick.learnt != 0 && *since_last >= APART {
-                *since_last = 0;
-                if recent.len() == POSTURES {
-                    recent.pop_front();
+            self.since_last += usize::from(tick.learnt != 0);
+            if tick.learnt != 0 && self.since_last >= APART {
+                self.since_last = 0;
+                if self.recent.len() == POSTURES {
+                    self.recent.pop_front();
                 }
-                recent.push_back(tick);
+                self.recent.push_back(tick);
             }
         }
         self.weigh();
@@ -273,23 +256,17 @@ impl Bank {
         slots: &[i64],
         ticks: &[Tick],
     ) -> bool {
-        let Self {
-            equations,
-            units,
-            variances,
-            latest,
-            ..
-        } = self;
-        let all = latest.iter().chain(ticks);
+        let all = self.latest.iter().chain(ticks);
         let rejected: Vec<&Tick> = all.filter(|tick| slots.contains(&tick.slot)).collect();
         let (mut jump, mut contact) = (0.0, f64::NEG_INFINITY);
-        for unit in units.iter().filter(|unit| unit.component == component) {
+        for unit in (self.units.iter()).filter(|unit| unit.component == component) {
             let mut fits = unit.changes();
             for tick in &rejected {
-                if equations.update(tick, MotionReading::AsStated) {
-                    let rows = equations.rows(unit, tick, &[], variances);
-                    fits.iter_mut()
-                        .for_each(|fit| fit.add(&unit.columns, &rows));
+                if self.equations.update(tick, MotionReading::AsStated) {
+                    let rows = self.equations.rows(unit, tick, &[], &self.variances);
+                    for fit in &mut fits {
+                        fit.add(&unit.columns, &rows);
+                    }
                 }
             }
             let evidence = |fit: &mut HypothesisFit| {
@@ -328,18 +305,12 @@ impl Bank {
     /// what was learnt does not explain their readings. Of those that begin `anew` nothing is
     /// known.
     pub(crate) fn doubt(&mut self, solution: &mut Solution, disturbed: u64, anew: u64) {
-        let Self {
-            equations,
-            units,
-            recent,
-            ..
-        } = self;
+        let (equations, units, recent) = (&mut self.equations, &self.units, &self.recent);
         let in_use = equations.in_use(solution);
         let mut doubts: Vec<Option<Doubt>> = vec![None; solution.doubts.len()];
-        solution
-            .components
-            .iter_mut()
-            .for_each(|own| own.leading = None);
+        for component in &mut solution.components {
+            component.leading = None;
+        }
         for unit in units.iter() {
             let dofs = equations.dofs(&unit.columns.sensors, Some(unit.subtree));
             let leading = unit.leading();
@@ -393,10 +364,8 @@ impl Bank {
     /// Forgets what a change of a component concerns.
     pub(crate) fn forget(&mut self, component: usize, change: DetectedChange) {
         let model = &self.equations.model;
-        let own = self
-            .units
-            .iter_mut()
-            .filter(|unit| unit.component == component);
+        let units = self.units.iter_mut();
+        let own = units.filter(|unit| unit.component == component);
         own.for_each(|unit| match change {
             DetectedChange::Anew => unit.begin_anew(),
             DetectedChange::Offset => unit.forget(&unit.offsets()),
@@ -471,12 +440,10 @@ impl TickEquations {
         self.motion
             .copy_from(tick.motion.state(), &tick.motion.base);
         self.motion.see(view);
-        self.kinematics
-            .set_base(&self.model, tick.base_link)
+        let (kinematics, motion) = (&mut self.kinematics, &self.motion);
+        let set = kinematics.set_base(&self.model, tick.base_link);
+        set.and_then(|()| kinematics.update(&self.model, motion.state(), &motion.base))
             .is_ok()
-            && (self.kinematics)
-                .update(&self.model, self.motion.state(), &self.motion.base)
-                .is_ok()
     }
 
     /// The torques of `dofs` at a tick, with these parameters, and their sensitivities to them;
@@ -490,30 +457,19 @@ impl TickEquations {
     ) -> Vec<Option<(f64, Vec<f64>)>> {
         let nothing = vec![None; dofs.len()];
         let mut active = tick.active;
-        hypothesis
-            .contact
-            .iter()
-            .for_each(|&contact| active.insert(contact));
+        if let Some(contact) = hypothesis.contact {
+            active.insert(contact);
+        }
         let readings: Vec<Wrench> = (0..tick.readings.len())
             .map(|sensor| hypothesis.sight.reading(sensor, &tick.readings))
             .collect();
         if !self.set_kinematics(tick, hypothesis.view) {
             return nothing;
         }
-        let Self {
-            model,
-            structure,
-            kinematics,
-            solver,
-            ..
-        } = self;
-        if solver
-            .solve(model, structure, kinematics, &readings, &active, &[])
-            .is_err()
-        {
-            return nothing;
-        }
-        let Ok(rows) = EstimateRows::new(structure, solver, kinematics) else {
+        let (model, structure, kinematics) = (&self.model, &self.structure, &self.kinematics);
+        let solved = (self.solver).solve(model, structure, kinematics, &readings, &active, &[]);
+        let rows = solved.and_then(|()| EstimateRows::new(structure, &self.solver, kinematics));
+        let Ok(rows) = rows else {
             return nothing;
         };
         let torque = |&dof: &usize| {
@@ -534,11 +490,8 @@ impl TickEquations {
         dofs: &[usize],
     ) -> Vec<Option<(f64, f64)>> {
         // A contact that is known to be there makes the hypothesis the stated one.
-        if other
-            .hypothesis
-            .contact
-            .is_some_and(|contact| tick.active.contains(contact))
-        {
+        let contact = other.hypothesis.contact;
+        if contact.is_some_and(|contact| tick.active.contains(contact)) {
             return vec![None; dofs.len()];
         }
         let places = self.columns(columns);
@@ -559,18 +512,14 @@ impl TickEquations {
             let (torque, row) = own?;
             let sensitivity: Vec<f64> = places.iter().map(|&place| row[place]).collect();
             let to_view = |all: &Vec<Option<(f64, Vec<f64>)>>| {
-                all[number]
-                    .as_ref()
-                    .map(|(other, _)| (other - torque) / SMALL)
+                let other = all[number].as_ref();
+                other.map(|(other, _)| (other - torque) / SMALL)
             };
             let of_view = shifted.iter().map(to_view).collect::<Option<Vec<f64>>>()?;
             Some((torque, other.deviation(columns, &sensitivity, &of_view)))
         };
-        torques
-            .into_iter()
-            .enumerate()
-            .map(with_deviation)
-            .collect()
+        let torques = torques.into_iter().enumerate();
+        torques.map(with_deviation).collect()
     }
 
     /// The degrees of freedom whose torques depend on one of these sensors, or on this sub-tree.

@@ -8,7 +8,7 @@ use crate::online::rows::{ComponentColumns, RowBuffer, WhitenedRows, spread};
 use crate::online::solution::{
     BLOCK, ComponentSolution, DetectedChange, ObservationCounts, OnlineObservation, Paused,
 };
-use crate::robot::{ChannelRole, Robot, dofs_between};
+use crate::robot::{ChannelRole, Robot, dofs_between, stated_noise};
 use crate::statistics::chi_square;
 use nalgebra::DMatrix;
 use proprio_dynamics::regressor::LINK_PARAMETERS;
@@ -168,10 +168,8 @@ impl ComponentLayout {
         .flat_map(|(_, first)| first..first + LINK_PARAMETERS);
         let of_sensors = sensors.iter().flat_map(|&s| offsets[s].torque_first());
         let of_links = (links.iter()).flat_map(|&link| model.inertias()[link].parameters());
-        let deviations = sensors.iter().flat_map(|&s| {
-            let noise = structure.sensors()[s].noise();
-            Wrench::from_parts(noise.force, noise.torque).torque_first()
-        });
+        let cuts = structure.sensors();
+        let deviations = sensors.iter().flat_map(|&s| stated_noise(&cuts[s]));
         let contacts = subtrees.iter().map(|&k| &structure.subtrees()[k].contacts);
         Self {
             dofs: (0..model.link_count()).map(dofs).collect(),
@@ -181,10 +179,7 @@ impl ComponentLayout {
             reference: of_sensors.chain(of_links).collect(),
             columns: ComponentColumns::new(stacked, &subtrees, &sensors, &links),
             outermost: outermost.collect(),
-            carriers: sensors
-                .iter()
-                .map(|&s| structure.sensors()[s].joint() + 1)
-                .collect(),
+            carriers: sensors.iter().map(|&s| cuts[s].joint() + 1).collect(),
             deviations: deviations.collect(),
             subtrees,
             links,
@@ -280,13 +275,9 @@ impl Component {
 
     /// The initial solution: CAD, and these offsets.
     pub(crate) fn unknown(&self, cad: &[RigidInertia], offsets: &[Wrench]) -> ComponentSolution {
-        let ComponentLayout {
-            links,
-            sensors,
-            deviations,
-            ..
-        } = &*self.layout;
-        let noise = deviations.chunks_exact(6);
+        let (links, sensors) = (&self.layout.links, &self.layout.sensors);
+        let noise = self.layout.deviations.chunks_exact(6);
+        let square = |six: &[f64]| std::array::from_fn(|i| six[i] * six[i]);
         let drift = self.drift_rates.chunks_exact(6);
         ComponentSolution {
             links: links.clone(),
@@ -295,9 +286,7 @@ impl Component {
             offsets: sensors.iter().map(|&sensor| offsets[sensor]).collect(),
             root: DMatrix::zeros(0, self.layout.reference.len()),
             drift: drift.map(|six| std::array::from_fn(|i| six[i])).collect(),
-            noise: noise
-                .map(|six| std::array::from_fn(|i| six[i] * six[i]))
-                .collect(),
+            noise: noise.map(square).collect(),
             worst: vec![[0.0; 6]; sensors.len()],
             tau: f64::NAN,
             ..ComponentSolution::default()
@@ -350,15 +339,7 @@ impl Component {
             self.close(t, known);
             self.block_from = t;
         }
-        let of_sensors = (self.layout.sensors.iter())
-            .filter_map(|&s| Some((*seen.sensors.get(s)?, ChannelRole::Sensor(s))));
-        let base = seen.kinematics.base();
-        let of_joints = (self.layout.dofs[base].iter())
-            .filter_map(|dof| Some((*seen.joints.get(dof)?, ChannelRole::Joint(dof))));
-        let mut faults = std::iter::once((seen.base, ChannelRole::Base))
-            .chain(of_sensors)
-            .chain(of_joints);
-        if let Some((reason, channel)) = faults.find(|(reason, _)| *reason != Reason::None) {
+        if let Some((reason, channel)) = self.fault(seen) {
             // A doubtful reading, or a few, are no pause.
             if reason != Reason::Implausible || t - self.seen >= BLOCK {
                 self.paused = Paused::Fault(reason, channel);
@@ -382,29 +363,39 @@ impl Component {
             self.counts.contact += 1;
             return;
         }
-        self.paused = if self.is_disturbed {
-            Paused::Suspected
-        } else {
-            Paused::No
-        };
+        self.paused = Paused::No;
         if self.is_disturbed {
-            let tilts = self
-                .layout
-                .carriers
-                .iter()
-                .zip(&mut self.directions)
-                .zip(&mut self.cosines);
-            for ((&link, began), cosine) in tilts {
-                let acceleration = seen.kinematics.motion(link).proper_acceleration;
-                let direction = acceleration / acceleration.norm().max(1e-3);
-                if *began == Vec3::zeros() {
-                    *began = direction;
-                }
-                *cosine = cosine.min(direction.dot(began));
-            }
+            self.paused = Paused::Suspected;
+            self.follow_tilt(seen);
         }
         self.gathered.push(slot, &self.current_rows);
         self.gathered.has_moved |= self.is_moved(seen);
+    }
+
+    /// The first fault of a channel that it needs.
+    fn fault(&self, seen: &OnlineObservation<'_>) -> Option<(Reason, ChannelRole)> {
+        let of_sensors = (self.layout.sensors.iter())
+            .filter_map(|&s| Some((*seen.sensors.get(s)?, ChannelRole::Sensor(s))));
+        let base = seen.kinematics.base();
+        let of_joints = (self.layout.dofs[base].iter())
+            .filter_map(|dof| Some((*seen.joints.get(dof)?, ChannelRole::Joint(dof))));
+        let mut faults = std::iter::once((seen.base, ChannelRole::Base))
+            .chain(of_sensors)
+            .chain(of_joints);
+        faults.find(|(reason, _)| *reason != Reason::None)
+    }
+
+    /// Notes how far each sensor has tilted since the present disturbance began.
+    fn follow_tilt(&mut self, seen: &OnlineObservation<'_>) {
+        let directions = self.directions.iter_mut().zip(&mut self.cosines);
+        for (&link, (began, cosine)) in self.layout.carriers.iter().zip(directions) {
+            let acceleration = seen.kinematics.motion(link).proper_acceleration;
+            let direction = acceleration / acceleration.norm().max(1e-3);
+            if *began == Vec3::zeros() {
+                *began = direction;
+            }
+            *cosine = cosine.min(direction.dot(began));
+        }
     }
 
     /// Whether something moves that its rows depend on.
@@ -522,10 +513,8 @@ impl Component {
     /// solution in use, and the drift of the offsets up to `t` since its data explain.
     pub(crate) fn exceeds_gate(&mut self, known: &ComponentSolution, t: Nanos) -> bool {
         let unknowns = self.layout.columns.unknowns();
-        let (offset_count, root_time) = (
-            self.offsets.len(),
-            (t - known.data).seconds().max(0.0).sqrt(),
-        );
+        let offset_count = self.offsets.len();
+        let root_time = (t - known.data).seconds().max(0.0).sqrt();
         let projected_width = unknowns + offset_count;
         if known.estimate.len() != unknowns || known.spread.shape() != (unknowns, unknowns) {
             return false;
@@ -543,24 +532,16 @@ impl Component {
             let Some(first) = rows.slots().first() else {
                 continue;
             };
-            let own = rows
-                .slots()
-                .iter()
-                .take_while(|slot| *slot == first)
-                .count();
+            let slots = rows.slots().iter();
+            let own = slots.take_while(|slot| *slot == first).count();
             let observations = rows.slots().len() / own;
             let scale = 1.0 / (observations as f64).sqrt();
-            let width = kind.columns.len() + 1;
+            let width = kind.width();
             let mean = &mut mean[..width];
             for index in 0..own {
                 mean.fill(0.0);
-                for row in rows
-                    .values()
-                    .chunks_exact(width)
-                    .skip(index)
-                    .step_by(own)
-                    .take(observations)
-                {
+                let all = rows.values().chunks_exact(width);
+                for row in all.skip(index).step_by(own).take(observations) {
                     add_multiple(mean, scale, row);
                 }
                 let (row, right) = mean.split_at(kind.columns.len());
@@ -584,11 +565,7 @@ impl Component {
         }
         for i in 0..m {
             for j in 0..=i {
-                let (a, b) = (
-                    &projected[i * projected_width..],
-                    &projected[j * projected_width..],
-                );
-                let (a, b) = (&a[..projected_width], &b[..projected_width]);
+                let [a, b] = [i, j].map(|k| &projected[k * projected_width..][..projected_width]);
                 covariance[i * m + j] = dot(a, b) + f64::from(u8::from(i == j));
             }
         }

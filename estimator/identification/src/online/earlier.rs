@@ -1,7 +1,7 @@
 //! The start from an earlier identification: its parameters are in use from the beginning, and its
 //! covariance is information beside the prior.
 
-use crate::linear::information::{InformationError, Panel};
+use crate::linear::information::{InformationError, Panel, check_size};
 use crate::online::component::ComponentLayout;
 use crate::online::parameters::ParameterEstimate;
 use crate::online::{Online, OnlineError};
@@ -112,15 +112,7 @@ impl Online {
         root: &DMatrix<f64>,
     ) -> Result<(), OnlineError> {
         let width = LINK_PARAMETERS * links.len();
-        if root.ncols() != width {
-            let (what, got, expected) = ("columns of the covariance's root", root.ncols(), width);
-            return Err(InformationError::Size {
-                what,
-                got,
-                expected,
-            }
-            .into());
-        }
+        check_size("columns of the covariance's root", root.ncols(), width)?;
         let known = &mut self.solution.components;
         for (number, (component, known)) in self.components.iter_mut().zip(known).enumerate() {
             let layout = &component.layout;
@@ -133,11 +125,8 @@ impl Online {
                 known.bodies[*place] = *body;
             }
             // In use from the beginning.
-            let Some(part) = self
-                .job
-                .as_mut()
-                .and_then(|job| job.components.get_mut(number))
-            else {
+            let job = self.job.as_mut();
+            let Some(part) = job.and_then(|job| job.components.get_mut(number)) else {
                 continue;
             };
             let before = part.selection.in_use().clone();

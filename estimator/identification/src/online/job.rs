@@ -1,6 +1,7 @@
 //! A component's part of a job: noise, the most probable bodies, changes, and the parameters in
 //! use.
 
+use crate::arithmetic::mean;
 use crate::linear::information::{Information, Panel};
 use crate::online::bank::{self, Bank, LATEST, Tick};
 use crate::online::channel::{NoiseTracker, SecondMean, SecondResiduals, take_scatters};
@@ -90,7 +91,7 @@ pub(crate) struct ComponentJob {
 }
 
 /// Per block of a tenth of a second: its time and the mean of each channel.
-pub(crate) type BlockMeans = Vec<(f64, Vec<f64>)>;
+pub(crate) type TimedMeans = Vec<(f64, Vec<f64>)>;
 
 /// The range of observations of some rows.
 pub(crate) struct SlotRange {
@@ -245,7 +246,7 @@ impl ComponentJob {
         let Some(span) = SlotRange::of([&self.learnt].into_iter()).filter(|_| is_any) else {
             return;
         };
-        let residuals: Vec<BlockMeans> = self
+        let residuals: Vec<TimedMeans> = self
             .selection
             .all()
             .map(|own| self.blocks(&span, &own.change))
@@ -263,7 +264,7 @@ impl ComponentJob {
 
     /// The mean residual of each channel in each block of this second's rows, for these parameters:
     /// time, and per channel.
-    pub(crate) fn blocks(&self, span: &SlotRange, change: &[f64]) -> BlockMeans {
+    pub(crate) fn blocks(&self, span: &SlotRange, change: &[f64]) -> TimedMeans {
         let offset_count = self.variances.len();
         let unknowns: Vec<f64> = self
             .estimate
@@ -274,17 +275,11 @@ impl ComponentJob {
             .collect();
         let (series, _) = self.series(&[&self.learnt], span, &unknowns);
         let per_block = (selection::BLOCK / self.period).round().max(1.0) as usize;
-        let mean = |channel: usize, from: usize| {
-            let own = series[channel * span.count..][..span.count].iter();
-            let (sum, count) = (own.skip(from).take(per_block).filter(|x| x.is_finite()))
-                .fold((0.0, 0.0), |(sum, count), x| (sum + x, count + 1.0));
-            sum / count
-        };
         let starts = (0..span.count).step_by(per_block);
         let blocks = starts.map(|from| {
-            let means: Vec<f64> = (0..offset_count)
-                .map(|channel| mean(channel, from))
-                .collect();
+            let channels = series.chunks_exact(span.count);
+            let block = channels.map(|own| own.iter().skip(from).take(per_block));
+            let means: Vec<f64> = block.map(mean).collect();
             ((span.first as f64 + from as f64) * self.period, means)
         });
         blocks
@@ -295,13 +290,8 @@ impl ComponentJob {
     /// Writes the solution in use: the parameters, the offsets that fit them best, and the
     /// uncertainty of both.
     pub(crate) fn write_solution(&self, solution: &mut ComponentSolution) {
-        let ParameterEstimate {
-            change,
-            root,
-            bodies,
-            tau,
-            effective,
-        } = self.selection.in_use();
+        let in_use = self.selection.in_use();
+        let (change, root) = (&in_use.change, &in_use.root);
         let (offset_count, parameters) = (self.variances.len(), change.len());
         let (r, z) = self.information.to_triangle();
         // R_ss s = z - R_sd d, and the prior of the offsets.
@@ -338,13 +328,10 @@ impl ComponentJob {
             .view_mut((own, parameters), (offset_count, offset_count))
             .copy_from(&inverse.transpose());
         solution.root = joint;
-        (solution.tau, solution.effective) = (*tau, *effective);
-        solution.bodies.clone_from(bodies);
-        for (to, rates) in solution
-            .drift
-            .iter_mut()
-            .zip(self.drift_rates.chunks_exact(6))
-        {
+        (solution.tau, solution.effective) = (in_use.tau, in_use.effective);
+        solution.bodies.clone_from(&in_use.bodies);
+        let rates = self.drift_rates.chunks_exact(6);
+        for (to, rates) in solution.drift.iter_mut().zip(rates) {
             to.copy_from_slice(rates);
         }
         let noise = solution.noise.iter_mut().zip(&mut solution.worst);
@@ -454,10 +441,8 @@ impl ComponentJob {
         unknowns: &[f64],
     ) -> (Vec<f64>, Vec<f64>) {
         let offset_count = self.variances.len();
-        let (mut series, mut shown) = (
-            vec![f64::NAN; offset_count * span.count],
-            vec![0.0; offset_count],
-        );
+        let mut series = vec![f64::NAN; offset_count * span.count];
+        let mut shown = vec![0.0; offset_count];
         for rows in rows {
             for (kind, rows) in self.layout.columns.iter().zip(rows.iter()) {
                 for (row, right, slot) in rows.iter() {
@@ -486,7 +471,7 @@ impl ComponentJob {
         let mut sensitivities = DMatrix::zeros(unknowns - offset_count, offset_count);
         for rows in rows {
             for (kind, rows) in self.layout.columns.iter().zip(rows.iter()) {
-                let (width, count) = (kind.columns.len() + 1, rows.slots().len());
+                let (width, count) = (kind.width(), rows.slots().len());
                 let all = DMatrixView::from_slice(rows.values(), width, count);
                 let weights = DMatrix::from_fn(count, kind.offsets, |row, place| {
                     self.whitened[kind.columns[place]] * all[(place, row)]
@@ -524,10 +509,8 @@ impl ComponentJob {
             return Ok(());
         }
         let unknowns = self.information.unknowns();
-        let (mut panel, mut dense) = (
-            Panel::new(unknowns, self.rejected_rows.len()),
-            vec![0.0; unknowns],
-        );
+        let mut panel = Panel::new(unknowns, self.rejected_rows.len());
+        let mut dense = vec![0.0; unknowns];
         for (kind, rows) in self.layout.columns.iter().zip(self.rejected_rows.iter()) {
             for (row, right, _) in rows.iter() {
                 spread(kind, row, &mut dense);
@@ -538,12 +521,7 @@ impl ComponentJob {
         }
         // The bank has no older ticks.
         let kept = (LATEST as f64 * bank::TICK.seconds() / self.period) as i64;
-        let newest = self
-            .rejected_slots
-            .iter()
-            .copied()
-            .max()
-            .unwrap_or_default();
+        let newest = self.rejected_slots.iter().max().copied().unwrap_or(0);
         self.rejected_slots.retain(|slot| slot + kept > newest);
         let _ = self.rejected_information.absorb(&mut panel);
         self.rejected_time += SOLVE.seconds();

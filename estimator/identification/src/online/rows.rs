@@ -6,6 +6,7 @@
 
 use crate::arithmetic::{dot, factorise};
 use proprio_dynamics::regressor::{LINK_PARAMETERS, StackedRegressor};
+use std::collections::BTreeSet;
 
 /// The rows of one sub-tree.
 #[derive(Clone, Debug)]
@@ -23,6 +24,11 @@ pub(crate) struct SubtreeColumns {
 }
 
 impl SubtreeColumns {
+    /// Numbers of a row, the right side included.
+    pub(crate) fn width(&self) -> usize {
+        self.columns.len() + 1
+    }
+
     /// The residual of a row for these unknowns, `[s | d]`.
     pub(crate) fn residual(&self, row: &[f64], right: f64, unknowns: &[f64]) -> f64 {
         let own = self.columns.iter().map(|&column| unknowns[column]);
@@ -48,7 +54,7 @@ impl ComponentColumns {
         links: &[usize],
     ) -> Self {
         let offset_count = 6 * sensors.len();
-        let place = |list: &[usize], of: usize| list.binary_search(&of).unwrap_or(0);
+        let place = |list: &[usize], own: usize| list.binary_search(&own).unwrap_or(0);
         // The columns of a sub-tree's regressor.
         let columns = subtrees.iter().map(|&subtree| {
             let subtree = &stacked.subtrees()[subtree];
@@ -70,45 +76,31 @@ impl ComponentColumns {
             for earlier in 0..number {
                 let mut others = stacked.subtrees()[all[earlier].subtree].sensors();
                 let (shares, of) = (others.any(|s| sensors.contains(&s)), group[earlier]);
-                if shares && of != number {
-                    group
-                        .iter_mut()
-                        .filter(|g| **g == of)
-                        .for_each(|g| *g = number);
+                if shares {
+                    let linked = group.iter_mut().filter(|g| **g == of);
+                    linked.for_each(|g| *g = number);
                 }
             }
             group.push(number);
-            let joined: Vec<bool> = (0..number)
-                .map(|earlier| group[earlier] == number)
-                .collect();
-            let of_joined = all.iter().zip(&joined).filter(|(_, is_joined)| **is_joined);
-            let mut joined_columns: Vec<usize> = of_joined
-                .flat_map(|(kind, _)| kind.columns.iter().copied())
-                .collect();
-            joined_columns.extend(&own);
-            joined_columns.sort_unstable();
-            joined_columns.dedup();
-            let places = |of: &[usize]| {
-                of.iter()
-                    .filter_map(|column| joined_columns.binary_search(column).ok())
-                    .collect()
+            let is_joined = |earlier: &usize| group[*earlier] == number;
+            let joined = (0..number).filter(is_joined);
+            let of_joined = joined.flat_map(|earlier| &all[earlier].columns);
+            let columns: BTreeSet<usize> = of_joined.chain(&own).copied().collect();
+            let columns: Vec<usize> = columns.into_iter().collect();
+            let places = |of: &[usize]| -> Vec<usize> {
+                let places = of.iter().map(|column| columns.binary_search(column));
+                places.filter_map(Result::ok).collect()
             };
-            let within = all
-                .iter()
-                .zip(&joined)
-                .map(|(kind, is_joined)| match is_joined {
-                    true => places(&kind.columns),
-                    false => Vec::new(),
-                });
+            let within = (0..number).map(|earlier| match is_joined(&earlier) {
+                true => places(&all[earlier].columns),
+                false => Vec::new(),
+            });
             let kind = SubtreeColumns {
-                offsets: joined_columns
-                    .iter()
-                    .filter(|column| **column < offset_count)
-                    .count(),
+                offsets: columns.partition_point(|column| *column < offset_count),
                 subtree,
                 own: places(&own),
                 within: within.collect(),
-                columns: joined_columns,
+                columns,
             };
             all.push(kind);
         }
@@ -157,13 +149,7 @@ impl WhitenedRows {
     pub(crate) fn new(kinds: &ComponentColumns) -> Self {
         let most = kinds.most();
         Self {
-            values: Vec::with_capacity(
-                kinds
-                    .all
-                    .iter()
-                    .map(|kind| 6 * (kind.columns.len() + 1))
-                    .sum(),
-            ),
+            values: Vec::with_capacity(kinds.all.iter().map(|kind| 6 * kind.width()).sum()),
             places: Vec::with_capacity(most),
             deviations: vec![0.0; kinds.offset_count],
             noise: vec![0.0; most * kinds.offset_count],
@@ -186,7 +172,7 @@ impl WhitenedRows {
             let subtree = &stacked.subtrees()[kind.subtree];
             for (index, measured) in subtree.projected_measured().iter().enumerate() {
                 let start = self.values.len();
-                self.values.resize(start + kind.columns.len() + 1, 0.0);
+                self.values.resize(start + kind.width(), 0.0);
                 let (row, right) = self.values[start..].split_at_mut(kind.columns.len());
                 right[0] = *measured;
                 for (&place, value) in kind.own.iter().zip(subtree.projected_row(index)) {
@@ -202,6 +188,14 @@ impl WhitenedRows {
             self.places.clear();
             return 0;
         }
+        self.factorise_noise(kinds, variances);
+        self.whiten(kinds);
+        count
+    }
+
+    /// Computes the factor of the rows' covariance by the noise of these variances.
+    fn factorise_noise(&mut self, kinds: &ComponentColumns, variances: &[f64]) {
+        let count = self.places.len();
         for (deviation, variance) in self.deviations.iter_mut().zip(variances) {
             *deviation = variance.sqrt();
         }
@@ -221,46 +215,46 @@ impl WhitenedRows {
                 noise[column] = value * self.deviations[column];
             }
         }
+        let noise = |row: usize| &noise[row * offset_count..][..offset_count];
         for (i, (number, _)) in self.places.iter().enumerate() {
             for (j, (other, _)) in self.places[..=i].iter().enumerate() {
                 let is_joined = number == other || !kinds.all[*number].within[*other].is_empty();
                 self.covariance[i * count + j] = if is_joined {
-                    dot(
-                        &noise[i * offset_count..][..offset_count],
-                        &noise[j * offset_count..][..offset_count],
-                    )
+                    dot(noise(i), noise(j))
                 } else {
                     0.0
                 };
             }
         }
         factorise(&mut self.covariance, count);
-        // L^-1 from the left.
+    }
+
+    /// Applies the inverse of the factor from the left.
+    fn whiten(&mut self, kinds: &ComponentColumns) {
+        let count = self.places.len();
         for (i, &(number, start)) in self.places.iter().enumerate() {
             let (above, own) = self.values.split_at_mut(start);
             let kind = &kinds.all[number];
-            let own = &mut own[..kind.columns.len() + 1];
+            let own = &mut own[..kind.width()];
             for (j, &(other, from)) in self.places[..i].iter().enumerate() {
                 let weight = self.covariance[i * count + j];
                 if weight == 0.0 {
                     continue;
                 }
-                let row = &above[from..][..kinds.all[other].columns.len() + 1];
+                let row = &above[from..][..kinds.all[other].width()];
                 if number == other {
                     own.iter_mut().zip(row).for_each(|(x, y)| *x -= weight * y);
                 } else {
                     let within = &kind.within[other];
-                    within
-                        .iter()
-                        .zip(row)
-                        .for_each(|(&place, y)| own[place] -= weight * y);
+                    for (&place, y) in within.iter().zip(row) {
+                        own[place] -= weight * y;
+                    }
                     own[kind.columns.len()] -= weight * row[row.len() - 1];
                 }
             }
             let scale = 1.0 / self.covariance[i * count + i];
             own.iter_mut().for_each(|x| *x *= scale);
         }
-        count
     }
 }
 
@@ -315,7 +309,7 @@ impl RowBuffer {
     /// With room for this number of observations.
     pub(crate) fn new(kinds: &ComponentColumns, observations: usize) -> Self {
         let of_kind = |kind: &SubtreeColumns| {
-            let (width, room) = (kind.columns.len() + 1, 6 * observations);
+            let (width, room) = (kind.width(), 6 * observations);
             SubtreeRows {
                 width,
                 room,
@@ -380,11 +374,7 @@ impl RowBuffer {
 
     pub(crate) fn take_from(&mut self, other: &Self) {
         self.observations += other.observations;
-        self.moving += if other.is_moving() {
-            other.observations
-        } else {
-            0
-        };
+        self.moving += other.observations * u64::from(other.is_moving());
         for (to, from) in self.kinds.iter_mut().zip(&other.kinds) {
             for (row, slot) in from.values.chunks_exact(from.width).zip(&from.slots) {
                 to.push(*slot, row);

@@ -22,6 +22,7 @@
 //! Initially the URDF's parameters are in use.
 
 use crate::linear::noise::autocorrelation_time;
+use crate::statistics::median;
 
 /// Length of a block \[s\].
 pub(crate) const BLOCK: f64 = 0.1;
@@ -100,10 +101,8 @@ impl<P> ModelSelection<P> {
     pub(crate) fn enter(&mut self, parameters: impl FnOnce() -> P) {
         let age =
             |candidate: &TrialParameters<P>| BLOCK * (self.times.len() - candidate.first) as f64;
-        if self.candidates[1..]
-            .last()
-            .is_some_and(|last| age(last) < CANDIDATE_INTERVAL)
-        {
+        let last = self.candidates[1..].last();
+        if last.is_some_and(|last| age(last) < CANDIDATE_INTERVAL) {
             return;
         }
         if self.candidates.len() > MAX_CANDIDATES {
@@ -112,9 +111,9 @@ impl<P> ModelSelection<P> {
             let apart =
                 |i: usize| ages[i - 1] / ages.get(i + 1).copied().unwrap_or(CANDIDATE_INTERVAL);
             let nearest = (2..ages.len()).min_by(|&a, &b| apart(a).total_cmp(&apart(b)));
-            nearest
-                .into_iter()
-                .for_each(|place| drop(self.candidates.remove(place)));
+            if let Some(place) = nearest {
+                self.candidates.remove(place);
+            }
         }
         let first = self.times.len();
         self.candidates.push(TrialParameters {
@@ -158,10 +157,8 @@ impl<P> ModelSelection<P> {
             place == 1 || !is_old(candidate, end)
         });
         // Blocks before the oldest candidate are dropped.
-        let oldest = self
-            .candidates
-            .get(1)
-            .map_or(end, |candidate| candidate.first);
+        let oldest = self.candidates.get(1);
+        let oldest = oldest.map_or(end, |candidate| candidate.first);
         self.times.drain(..oldest);
         for candidate in &mut self.candidates {
             let gone = oldest.saturating_sub(candidate.first);
@@ -235,12 +232,11 @@ impl<P> ModelSelection<P> {
 fn scale<'a>(values: impl Iterator<Item = &'a f64>) -> f64 {
     /// Half of the deviations of a normal distribution are less.
     const MEDIAN: f64 = 0.6745;
-    let mut sizes: Vec<f64> = values.filter(|x| x.is_finite()).map(|x| x.abs()).collect();
-    if sizes.is_empty() {
-        return f64::NAN;
+    let sizes: Vec<f64> = values.filter(|x| x.is_finite()).map(|x| x.abs()).collect();
+    match sizes.is_empty() {
+        true => f64::NAN,
+        false => median(sizes) / MEDIAN,
     }
-    let middle = sizes.len() / 2;
-    *sizes.select_nth_unstable_by(middle, f64::total_cmp).1 / MEDIAN
 }
 
 /// Values minus the line through them. Distant values get less weight, down to zero (Tukey's

@@ -96,34 +96,26 @@ struct PausedOf<'r> {
 
 impl std::fmt::Display for PausedOf<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Paused::Fault(reason, role) = self.paused else {
-            return self.paused.fmt(f);
-        };
-        let channel = self.robot.channels.iter().find(|c| c.role == role);
-        match channel {
-            Some(Channel { kind, name, .. }) => write!(
-                f,
-                "identification pauses: the {kind} channel {name} is faulty ({reason})"
-            ),
-            // A base without an IMU has no channel.
-            None => self.paused.fmt(f),
-        }
-    }
-}
-
-impl std::fmt::Display for Paused {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::No => write!(f, "identification is running"),
-            Self::Contact => write!(f, "identification pauses: a contact is declared"),
-            Self::Suspected => write!(
-                f,
-                "identification pauses: the readings do not fit the solution; an undeclared \
-                 contact, or a change"
-            ),
-            Self::Fault(reason, _) => {
-                write!(f, "identification pauses: a channel is faulty ({reason})")
+        let (reason, role) = match self.paused {
+            Paused::No => return f.write_str("identification is running"),
+            Paused::Contact => {
+                return f.write_str("identification pauses: a contact is declared");
             }
+            Paused::Suspected => {
+                return f.write_str(
+                    "identification pauses: the readings do not fit the solution; an undeclared \
+                     contact, or a change",
+                );
+            }
+            Paused::Fault(reason, role) => (reason, role),
+        };
+        f.write_str("identification pauses: ")?;
+        match self.robot.channels.iter().find(|c| c.role == role) {
+            Some(Channel { kind, name, .. }) => {
+                write!(f, "the {kind} channel {name} is faulty ({reason})")
+            }
+            // A base without an IMU has no channel.
+            None => write!(f, "a channel is faulty ({reason})"),
         }
     }
 }

@@ -95,18 +95,16 @@ fn hash(bytes: impl Iterator<Item = u8>) -> u64 {
 }
 
 fn model(parts: &[ComponentJob]) -> String {
-    let of = |part: &ComponentJob| {
+    let bytes = |part: &ComponentJob| -> Vec<u8> {
         let layout = &part.layout;
         let numbers = layout.links.iter().chain(&layout.sensors);
         let numbers = numbers.map(|number| *number as u64);
         let cad = layout.reference.iter().skip(layout.offset_count());
         let cad = cad.map(|x| x.to_bits());
-        numbers
-            .chain(cad)
-            .flat_map(u64::to_le_bytes)
-            .collect::<Vec<_>>()
+        let numbers = numbers.chain(cad);
+        numbers.flat_map(u64::to_le_bytes).collect()
     };
-    format!("{:016x}", hash(parts.iter().flat_map(of)))
+    format!("{:016x}", hash(parts.iter().flat_map(bytes)))
 }
 
 fn put(text: &mut String, word: &str, numbers: impl Iterator<Item = f64>) {
@@ -120,9 +118,8 @@ fn put(text: &mut String, word: &str, numbers: impl Iterator<Item = f64>) {
 
 fn numbers(line: Option<&str>, word: &str, count: usize) -> Result<Vec<f64>, StateError> {
     const DAMAGED: StateError = StateError::Damaged("a line is missing or too short");
-    let rest = line
-        .and_then(|line| line.strip_prefix(word))
-        .ok_or(DAMAGED)?;
+    let rest = line.and_then(|line| line.strip_prefix(word));
+    let rest = rest.ok_or(DAMAGED)?;
     let numbers: Option<Vec<f64>> = rest
         .split_whitespace()
         .map(|digits| u64::from_str_radix(digits, 16).ok().map(f64::from_bits))
@@ -245,13 +242,9 @@ impl Online {
             ("model", "model", model(&job.components)),
             ("sensors", SENSORS, sensors.0.clone()),
         ] {
-            let found = lines
-                .next()
-                .and_then(|line| line.strip_prefix(word))
-                .map(str::trim);
-            let found = found
-                .ok_or(StateError::Damaged("a line is missing"))?
-                .to_owned();
+            let found = lines.next().and_then(|line| line.strip_prefix(word));
+            let found = found.ok_or(StateError::Damaged("a line is missing"))?;
+            let found = found.trim().to_owned();
             if found != expected {
                 return Err(StateError::Foreign {
                     what,

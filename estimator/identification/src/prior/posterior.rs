@@ -31,7 +31,6 @@ const CENTRED: f64 = 0.1;
 /// Data and the prior of their links, for fits with any weight.
 #[derive(Clone, Debug)]
 pub struct Posterior {
-    links: Vec<usize>,
     centres: Vec<Centre>,
     expected: Expected,
     /// By `u` about CAD: the number of rows is the data's rank.
@@ -61,46 +60,12 @@ impl Posterior {
         right: &DVector<f64>,
         precision: &[f64],
     ) -> Result<Self, PriorError> {
-        let expected = 10 * links.len() + precision.len();
-        if data.ncols() != expected {
-            return Err(PriorError::Size {
-                what: "columns",
-                found: data.ncols(),
-                expected,
-            });
-        }
-        if right.len() != data.nrows() {
-            return Err(PriorError::Size {
-                what: "right sides",
-                found: right.len(),
-                expected: data.nrows(),
-            });
-        }
-        for (position, &link) in links.iter().enumerate() {
-            if link >= prior.link_count() {
-                return Err(PriorError::NoLink {
-                    link,
-                    count: prior.link_count(),
-                });
-            }
-            if links[..position].contains(&link) {
-                return Err(PriorError::Twice(link));
-            }
-        }
-        check_finite("an entry of the data", data.as_slice())?;
-        check_finite("a right side of the data", right.as_slice())?;
-        if let Some(&value) = precision.iter().find(|&&p| !(p.is_finite() && p >= 0.0)) {
-            return Err(PriorError::Number {
-                what: "a precision",
-                value,
-            });
-        }
-        let centres: Vec<_> = links
-            .iter()
-            .map(|&link| prior.centres[link].clone())
-            .collect();
+        check_data(prior, links, data, right, precision)?;
+        let count = data.ncols();
+        let centre = |&link: &usize| prior.centres[link].clone();
+        let centres: Vec<Centre> = links.iter().map(centre).collect();
         let mut local = data.clone();
-        let mut shift = DVector::zeros(expected);
+        let mut shift = DVector::zeros(count);
         for (position, centre) in centres.iter().enumerate() {
             let columns = data.fixed_columns::<10>(10 * position).into_owned() * centre.parameters;
             local
@@ -124,21 +89,15 @@ impl Posterior {
             extra.push((unit, precision > 0.0));
         }
         // Directions below rounding of the largest count as not determined.
-        let least = f64::EPSILON * expected as f64;
+        let least = f64::EPSILON * count as f64;
         let stretch = vec![Matrix4::identity(); links.len()];
-        let mut chart = Chart::new(
-            local,
-            right - data * shift,
-            stretch,
-            DVector::zeros(extra.len()),
-            least,
-        );
+        let (right, zero) = (right - data * shift, DVector::zeros(extra.len()));
+        let mut chart = Chart::new(local, right, stretch, zero, least);
         let rank = chart.scale.iter().filter(|&&scale| scale > 0.0).count();
-        let scaled = DMatrix::from_fn(rank, expected, |row, column| {
+        let scaled = DMatrix::from_fn(rank, count, |row, column| {
             chart.scale[row] * chart.t[(row, column)]
         });
         Ok(Self {
-            links: links.to_vec(),
             data: scaled,
             right: chart.right.rows(0, rank).into_owned(),
             residual_square: std::mem::take(&mut chart.residual_square),
@@ -147,16 +106,6 @@ impl Posterior {
             extra,
             chart,
         })
-    }
-
-    /// The links, in the order of the columns.
-    pub fn links(&self) -> &[usize] {
-        &self.links
-    }
-
-    /// Number of combinations of the unknowns that the data determine, to rounding.
-    pub fn rank(&self) -> usize {
-        self.data.nrows()
     }
 
     /// The most probable bodies and extra parameters for this weight.
@@ -442,11 +391,8 @@ impl Posterior {
         let of_data: f64 = of_data
             .map(|(column, scale)| scale * scale * column.norm_squared())
             .sum();
-        let extra = descent
-            .prior_rows
-            .rows(10 * links, self.extra.len())
-            .transpose();
-        let of_further = self.extra.len() as f64 - (&inverse * extra).norm_squared();
+        let extra = descent.prior_rows.rows(10 * links, self.extra.len());
+        let of_further = self.extra.len() as f64 - (&inverse * extra.transpose()).norm_squared();
         let effective = (of_data - of_further).max(0.0);
         let residual_square = self.residual_square + chart.excess(&y);
         let centres = self.centres.iter().zip(&chart.stretch);
@@ -467,6 +413,46 @@ impl Posterior {
             chart,
             inverse,
         }
+    }
+}
+
+/// Checks what a posterior is made from.
+fn check_data(
+    prior: &Prior,
+    links: &[usize],
+    data: &DMatrix<f64>,
+    right: &DVector<f64>,
+    precision: &[f64],
+) -> Result<(), PriorError> {
+    for (what, found, expected) in [
+        ("columns", data.ncols(), 10 * links.len() + precision.len()),
+        ("right sides", right.len(), data.nrows()),
+    ] {
+        if found != expected {
+            return Err(PriorError::Size {
+                what,
+                found,
+                expected,
+            });
+        }
+    }
+    let count = prior.link_count();
+    for (position, &link) in links.iter().enumerate() {
+        if link >= count {
+            return Err(PriorError::NoLink { link, count });
+        }
+        if links[..position].contains(&link) {
+            return Err(PriorError::Twice(link));
+        }
+    }
+    check_finite("an entry of the data", data.as_slice())?;
+    check_finite("a right side of the data", right.as_slice())?;
+    match precision.iter().find(|p| !(p.is_finite() && **p >= 0.0)) {
+        Some(&value) => Err(PriorError::Number {
+            what: "a precision",
+            value,
+        }),
+        None => Ok(()),
     }
 }
 

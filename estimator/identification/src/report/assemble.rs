@@ -9,18 +9,14 @@ use crate::report::calibration::{calibrations, channels};
 use crate::report::comparison::Judged;
 use crate::report::log::log_outcome;
 use crate::report::outcome::both;
-use crate::report::outcome::{
-    CovarianceRoot, LogOutcome, Outcome, Predicted, TimeOffset, Verdict, WeakDirection,
-};
-use crate::report::prediction::{self, JudgedParameters};
+use crate::report::outcome::{LogOutcome, Outcome, Predicted, TimeOffset, Verdict, WeakDirection};
 use crate::report::uncertainty::{
     base_parameters, cad_root, covariance, expression, links, rotors, rotors_not_separable,
     scaled_information, shrunk, subspace, unseen,
 };
 use crate::robot::Robot;
-use crate::training::TrainingLog;
+use crate::training::{TrainingLog, training_logs};
 use nalgebra::DMatrix;
-use proprio_topics::Nanos;
 
 /// The outcome without identified parameters: CAD's, and the reason.
 pub(crate) fn nothing(robot: &Robot, logs: &[TrainingLog], reason: String) -> Outcome {
@@ -28,73 +24,39 @@ pub(crate) fn nothing(robot: &Robot, logs: &[TrainingLog], reason: String) -> Ou
         file: log.file.clone(),
         role: log.role,
         span: log.span,
-        used: 0,
         excluded: log.excluded.clone(),
-        onset: None,
         predicted: Predicted {
             relative_error: both([f64::NAN; 2]),
             relative_error_with_drift: both([f64::NAN; 2]),
             ..Predicted::default()
         },
-        joints: Vec::new(),
-        sensors: Vec::new(),
-        two_route: Vec::new(),
-        offsets: Vec::new(),
-        friction: Vec::new(),
         findings: log.findings.clone(),
-        curves: Vec::new(),
+        ..LogOutcome::default()
     });
+    let links = robot.model.inertias().iter().enumerate();
+    let finding = Finding::refusal(FindingCode::NotIdentified, "", reason.clone());
     Outcome {
         robot: robot.name.clone(),
-        links: robot
-            .model
-            .inertias()
-            .iter()
-            .enumerate()
-            .map(|(link, cad)| unseen(robot, link, cad))
-            .collect(),
-        covariance: CovarianceRoot {
-            columns: Vec::new(),
-            calibrations: Vec::new(),
-            root: DMatrix::zeros(0, 0),
-        },
-        rotors: Vec::new(),
-        calibrations: Vec::new(),
+        links: links.map(|(link, cad)| unseen(robot, link, cad)).collect(),
         tau: f64::NAN,
-        least_retained_fraction: 0.0,
-        unknowns: 0,
-        rank: 0,
-        structural_rank: 0,
-        effective: 0.0,
         condition: f64::NAN,
-        singular_values: Vec::new(),
-        weakest: Vec::new(),
-        not_separable: Vec::new(),
-        base_parameters: Vec::new(),
-        channels: Vec::new(),
-        time_offsets: Vec::new(),
         logs: logs.collect(),
-        findings: vec![Finding::refusal(
-            FindingCode::NotIdentified,
-            "",
-            reason.clone(),
-        )],
+        findings: vec![finding],
         verdict: Verdict::Nothing(reason),
+        ..Outcome::default()
     }
 }
 
 /// The whole outcome; with what the search for errors of the set-up `found`, and the time offset of
 /// every stream.
 pub(crate) fn outcome(
-    robot: &Robot,
     measurement: &MeasurementModel<'_>,
     logs: &[TrainingLog],
-    training: &[&TrainingLog],
     identified: &Identified,
     (found, time_offsets): (Vec<Finding>, Vec<TimeOffset>),
 ) -> Outcome {
-    let unknowns = &identified.unknowns;
-    let p = unknowns.inertial();
+    let (robot, unknowns) = (measurement.robot(), &identified.unknowns);
+    let training = training_logs(logs);
     let narrow = identified.fit.covariance_root();
     let (scaled, spread) = scaled_information(identified);
     let root = if identified.retained.iter().all(|kept| *kept >= 1.0) {
@@ -105,47 +67,22 @@ pub(crate) fn outcome(
         shrunk(&narrow, &cad_root(unknowns, &r, &spread), &kept)
     };
     let spectrum = Spectrum::new(robot, unknowns, scaled, &spread);
-    let subspace = subspace(robot, training, identified);
+    let subspace = subspace(robot, &training, identified);
     let (base_parameters, mut not_separable, structural_rank) =
         base_parameters(robot, identified, &root, subspace.as_ref());
     let sums = rotors_not_separable(robot, identified, &spread);
     let structural_rank = structural_rank.saturating_sub(sums.len());
     not_separable.extend(sums);
-    let mut findings: Vec<Finding> = identified
-        .prior
-        .floors()
-        .iter()
-        .filter(|floor| unknowns.links.contains(&floor.link))
-        .map(|floor| {
-            Finding::note(
-                FindingCode::InertiaRegularised,
-                robot.model.link_name(floor.link),
-                floor.describe(robot.model.link_name(floor.link)),
-            )
-        })
-        .collect();
+    let mut findings = inertia_findings(robot, identified);
     findings.extend(found);
     findings.extend(identified.findings.iter().cloned());
     let (calibrations, calibration_findings) = calibrations(robot, measurement, identified, &root);
     findings.extend(calibration_findings);
+    let judged = Judged::new(measurement, logs, identified, &root);
     let mut measurement = measurement.clone();
-    let sets = [identified.cad.clone(), identified.d.clone()];
-    let instants = training.iter().flat_map(|log| &log.instants);
-    let friction = prediction::friction(&measurement, instants, &sets);
-    let candidates = [0, 1].map(|set| JudgedParameters {
-        course: vec![(Nanos::ZERO, sets[set].clone())],
-        friction: friction[set].clone(),
-    });
-    let judged = Judged {
-        identified,
-        sets,
-        candidates,
-        root: &root,
-    };
-    let logs = logs
+    let outcomes = logs
         .iter()
-        .map(|log| log_outcome(&mut measurement, log, &judged))
-        .collect();
+        .map(|log| log_outcome(&mut measurement, log, &judged));
     Outcome {
         robot: robot.name.clone(),
         verdict: verdict(identified),
@@ -158,7 +95,7 @@ pub(crate) fn outcome(
             .fold(1.0, f64::min),
         rotors: rotors(robot, identified, &root),
         calibrations,
-        unknowns: p,
+        unknowns: unknowns.inertial(),
         rank: spectrum.rank,
         structural_rank,
         effective: identified.fit.effective,
@@ -167,11 +104,23 @@ pub(crate) fn outcome(
         weakest: spectrum.weakest,
         not_separable,
         base_parameters,
-        channels: channels(robot, identified, training),
+        channels: channels(robot, identified, &training),
         time_offsets,
-        logs,
+        logs: outcomes.collect(),
         findings,
     }
+}
+
+/// Notes of the seen links whose inertia in CAD is that of no body.
+fn inertia_findings(robot: &Robot, identified: &Identified) -> Vec<Finding> {
+    let floors = identified.prior.floors().iter();
+    let seen = floors.filter(|floor| identified.unknowns.links.contains(&floor.link));
+    seen.map(|floor| {
+        let name = robot.model.link_name(floor.link);
+        let text = floor.describe(name);
+        Finding::note(FindingCode::InertiaRegularised, name, text)
+    })
+    .collect()
 }
 
 /// What the logs tell of the links' parameters in units of the prior's spread.

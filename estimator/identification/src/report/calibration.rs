@@ -213,12 +213,11 @@ pub(crate) fn channels(
     training: &[&TrainingLog],
 ) -> Vec<ChannelNoise> {
     let noise = &identified.noise;
-    let seconds: f64 = training
+    let seconds = training
         .iter()
-        .map(|log| (log.span.1 - log.span.0).seconds())
-        .sum();
+        .map(|log| (log.span.1 - log.span.0).seconds());
     let instants: usize = training.iter().map(|log| log.instants.len()).sum();
-    let period = seconds / instants.max(1) as f64;
+    let period = seconds.sum::<f64>() / instants.max(1) as f64;
     (0..identified.unknowns.channels())
         .map(|channel| {
             let (name, unit) = channel_name(robot, &identified.unknowns, channel);

@@ -11,8 +11,9 @@ use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::Unknowns;
 use crate::parallel;
 use crate::report::outcome::ModelComparison;
-use crate::report::prediction::JudgedParameters;
+use crate::report::prediction::{self, JudgedParameters};
 use crate::robot::Robot;
+use crate::training::{TrainingLog, training_instants};
 use nalgebra::{DMatrix, DVector};
 
 /// A joint that moves by less is still \[rad\].
@@ -27,6 +28,26 @@ pub(crate) struct Judged<'a> {
     pub candidates: [JudgedParameters; 2],
     /// A root of the identified parameters' covariance.
     pub root: &'a DMatrix<f64>,
+}
+
+impl<'a> Judged<'a> {
+    pub(crate) fn new(
+        measurement: &MeasurementModel<'_>,
+        logs: &[TrainingLog],
+        identified: &'a Identified,
+        root: &'a DMatrix<f64>,
+    ) -> Self {
+        let sets = [identified.cad.clone(), identified.d.clone()];
+        let friction = prediction::friction(measurement, training_instants(logs), &sets);
+        let candidates =
+            [0, 1].map(|set| JudgedParameters::constant(&sets[set], friction[set].clone()));
+        Self {
+            identified,
+            sets,
+            candidates,
+            root,
+        }
+    }
 }
 
 /// A measured torque and its residuals.
@@ -54,13 +75,16 @@ pub(crate) fn three<T: Copy>(values: [T; 3]) -> ModelComparison<T> {
     }
 }
 
+/// Parameters and nuisance parameters, for each comparison.
+type ComparedCases<'a> = [(&'a DVector<f64>, &'a [f64]); 3];
+
 /// Parameters and nuisance parameters that are compared in a block: CAD with the configured
 /// offsets, CAD with the fitted ones, the identified parameters with the fitted ones.
 pub(crate) fn cases<'a>(
     sets: &'a [DVector<f64>; 2],
     configured: &'a [f64],
     block: &'a NuisanceEstimate,
-) -> [(&'a DVector<f64>, &'a [f64]); 3] {
+) -> ComparedCases<'a> {
     let (fitted, own) = block.x.as_slice().split_at(block.x.nrows());
     [(&sets[0], configured), (&sets[0], fitted), (&sets[1], own)]
 }
@@ -84,8 +108,25 @@ pub(crate) struct SensorComparison {
     pub rows: Vec<Vec<usize>>,
 }
 
+/// What is compared of a channel at an instant: its load, its errors, and the number of rows.
+#[derive(Clone, Copy)]
+struct ComparedReading {
+    load: f64,
+    errors: [f64; 3],
+    rows: usize,
+}
+
+impl ComparedReading {
+    /// Where there is no prediction.
+    const NONE: Self = Self {
+        load: f64::NAN,
+        errors: [f64::NAN; 3],
+        rows: 0,
+    };
+}
+
 impl SensorComparison {
-    /// `sets`: CAD, the identified parameters; `left`: of these two.
+    /// `sets`: CAD, the identified parameters; `residuals`: of these two.
     pub(crate) fn new(
         measurement: &MeasurementModel<'_>,
         instants: &[Annotated],
@@ -95,88 +136,88 @@ impl SensorComparison {
     ) -> Self {
         let unknowns = measurement.unknowns().clone();
         let configured = configured_nuisance(measurement.robot(), &unknowns);
-        let empty = || vec![vec![f64::NAN; instants.len()]; 6 * unknowns.sensors.len()];
-        let (mut load, mut errors) = (empty(), [empty(), empty(), empty()]);
         let variances = identified.noise.offset_tracking_variances();
-        let channels = 6 * unknowns.sensors.len();
-        let mut held = vec![vec![0; instants.len()]; unknowns.sensors.len()];
+        let (sensors, ranges) = (unknowns.sensors.len(), &residuals.ranges);
         let parts = parallel::map_with(
-            residuals.ranges.len().div_ceil(BLOCKS_PER_TASK),
+            ranges.len().div_ceil(BLOCKS_PER_TASK),
             || (measurement.clone(), MeasurementRows::new(&unknowns)),
             |(measurement, rows), part| {
-                let blocks = part * BLOCKS_PER_TASK
-                    ..residuals.ranges.len().min((part + 1) * BLOCKS_PER_TASK);
+                let end = ranges.len().min((part + 1) * BLOCKS_PER_TASK);
                 let mut out = Vec::new();
-                for (range, block) in residuals.ranges[blocks.clone()]
-                    .iter()
-                    .zip(&residuals.nuisance[blocks])
-                {
-                    let cases = cases(sets, &configured, block);
-                    let (_, own) = cases[2];
-                    for instant in &instants[range.clone()] {
+                for block in part * BLOCKS_PER_TASK..end {
+                    let cases = cases(sets, &configured, &residuals.nuisance[block]);
+                    for instant in &instants[ranges[block].clone()] {
                         let start = out.len();
-                        out.resize(start + channels, ([f64::NAN; 4], 0));
-                        if channels == 0 || measurement.make(instant, rows).is_err() {
-                            continue;
-                        }
-                        let residuals = cases.map(|(d, s)| {
-                            DVector::from_fn(rows.count, |row, _| {
-                                rows.residual(row, d.as_slice(), s)
-                            })
-                        });
-                        for (place, &sensor) in unknowns.sensors.iter().enumerate() {
-                            let Some(map) =
-                                attribute_to(rows, &variances, 6 * place..6 * place + 6)
-                            else {
-                                continue;
-                            };
-                            let has = |row: &usize| {
-                                rows.g(*row)[6 * place..6 * place + 6]
-                                    .iter()
-                                    .any(|g| *g != 0.0)
-                            };
-                            let count = (0..rows.count).filter(has).count();
-                            let reading = instant.readings[sensor];
-                            let [cad, cad_fitted, identified] =
-                                residuals.each_ref().map(|residual| &map * residual);
-                            for (k, value) in
-                                reading.torque.iter().chain(&reading.force).enumerate()
-                            {
-                                let channel = 6 * place + k;
-                                if rows.has(channel) {
-                                    let values = [
-                                        value - own[channel],
-                                        cad[k],
-                                        cad_fitted[k],
-                                        identified[k],
-                                    ];
-                                    out[start + channel] = (values, count);
-                                }
-                            }
+                        out.resize(start + 6 * sensors, ComparedReading::NONE);
+                        if sensors > 0 && measurement.make(instant, rows).is_ok() {
+                            let sensors = &unknowns.sensors;
+                            compare(
+                                instant,
+                                sensors,
+                                rows,
+                                &variances,
+                                &cases,
+                                &mut out[start..],
+                            );
                         }
                     }
                 }
                 out
             },
         );
-        let places = residuals.ranges.iter().cloned().flatten();
+        let empty = || vec![vec![f64::NAN; instants.len()]; 6 * sensors];
+        let mut comparison = Self {
+            load: empty(),
+            errors: [empty(), empty(), empty()],
+            rows: vec![vec![0; instants.len()]; sensors],
+        };
         let each = parts
             .iter()
-            .flat_map(|part| part.chunks_exact(channels.max(1)));
-        for (i, values) in places.zip(each) {
-            for (channel, ([own, off @ ..], count)) in values.iter().enumerate() {
-                load[channel][i] = *own;
-                held[channel / 6][i] = held[channel / 6][i].max(*count);
-                errors
-                    .iter_mut()
-                    .zip(off)
-                    .for_each(|(errors, off)| errors[channel][i] = *off);
+            .flat_map(|part| part.chunks_exact((6 * sensors).max(1)));
+        for (i, values) in ranges.iter().cloned().flatten().zip(each) {
+            for (channel, value) in values.iter().enumerate() {
+                comparison.load[channel][i] = value.load;
+                let rows = &mut comparison.rows[channel / 6][i];
+                *rows = value.rows.max(*rows);
+                for (errors, error) in comparison.errors.iter_mut().zip(value.errors) {
+                    errors[channel][i] = error;
+                }
             }
         }
-        Self {
-            load,
-            errors,
-            rows: held,
+        comparison
+    }
+}
+
+/// Compares the readings of these sensors at an instant, given the variances of the channels and
+/// [`cases`].
+fn compare(
+    instant: &Annotated,
+    sensors: &[usize],
+    rows: &MeasurementRows,
+    variances: &[f64],
+    cases: &ComparedCases<'_>,
+    out: &mut [ComparedReading],
+) {
+    let residuals = cases
+        .map(|(d, s)| DVector::from_fn(rows.count, |row, _| rows.residual(row, d.as_slice(), s)));
+    let (_, offsets) = cases[2];
+    for (place, &sensor) in sensors.iter().enumerate() {
+        let channels = 6 * place..6 * place + 6;
+        let Some(map) = attribute_to(rows, variances, channels.clone()) else {
+            continue;
+        };
+        let has = |row: &usize| rows.g(*row)[channels.clone()].iter().any(|g| *g != 0.0);
+        let count = (0..rows.count).filter(has).count();
+        let errors = residuals.each_ref().map(|residual| &map * residual);
+        let reading = instant.readings[sensor].torque_first();
+        for (k, channel) in channels.clone().enumerate() {
+            if rows.has(channel) {
+                out[channel] = ComparedReading {
+                    load: reading[k] - offsets[channel],
+                    errors: errors.each_ref().map(|error| error[k]),
+                    rows: count,
+                };
+            }
         }
     }
 }
@@ -185,12 +226,8 @@ impl SensorComparison {
 pub(crate) fn configured_nuisance(robot: &Robot, unknowns: &Unknowns) -> Vec<f64> {
     let mut configured = vec![0.0; unknowns.nuisance()];
     for (place, &sensor) in unknowns.sensors.iter().enumerate() {
-        for (axis, value) in robot.offsets[sensor]
-            .0
-            .force_first()
-            .into_iter()
-            .enumerate()
-        {
+        let (offset, _) = robot.offsets[sensor];
+        for (axis, value) in offset.force_first().into_iter().enumerate() {
             configured[channel_of(place, axis)] = value;
         }
     }
@@ -259,8 +296,6 @@ pub(crate) fn covered(
             }
         }
     }
-    counts
-        .into_iter()
-        .map(|(inside, count)| inside / count)
-        .collect()
+    let counts = counts.into_iter();
+    counts.map(|(inside, count)| inside / count).collect()
 }

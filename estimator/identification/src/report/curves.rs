@@ -10,12 +10,6 @@ use crate::robot::AXES;
 /// Most points of a curve.
 pub(crate) const POINTS: usize = 2000;
 
-pub(crate) fn mean(values: &[f64]) -> f64 {
-    let finite = values.iter().filter(|x| x.is_finite());
-    let (sum, count) = finite.fold((0.0, 0.0), |(s, n), x| (s + x, n + 1.0));
-    sum / count
-}
-
 pub(crate) fn curves(
     measurement: &mut MeasurementModel<'_>,
     instants: &[Annotated],

@@ -1,6 +1,6 @@
 //! The figures of one log: residuals, prediction errors, coverage, offsets, friction, findings.
 
-use crate::arithmetic::{dot, rms};
+use crate::arithmetic::{dot, mean, rms};
 use crate::dataset::observation::{Annotated, UnitSet};
 use crate::finding::{Finding, FindingCode};
 use crate::fit::Identified;
@@ -12,14 +12,14 @@ use crate::measurement::unknowns::{FRICTION, Unknowns, friction_row};
 use crate::report::comparison::{
     Judged, STILL, SensorComparison, TorqueSeries, cases, configured_nuisance, covered, three,
 };
-use crate::report::curves::{curves, mean};
+use crate::report::curves::curves;
 use crate::report::outcome::{
     FrictionOutcome, JointOutcome, LogOutcome, OffsetOutcome, Predicted, SensorOutcome,
     TwoRouteOutcome, both,
 };
 use crate::report::prediction::PredictionError;
 use crate::robot::{AXES, Robot};
-use crate::training::{MIN_FOLD, TrainingLog};
+use crate::training::{MIN_FOLD, SEGMENT_INSTANTS, TrainingLog};
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::Structure;
 use proprio_topics::Nanos;
@@ -75,25 +75,15 @@ pub(crate) fn log_outcome(
     log: &TrainingLog,
     judged: &Judged<'_>,
 ) -> LogOutcome {
-    let Judged {
-        identified,
-        sets,
-        root,
-        ..
-    } = judged;
+    let (identified, sets, root) = (judged.identified, &judged.sets, judged.root);
     let robot = measurement.robot();
     let unknowns = &identified.unknowns;
     let usable = !log.instants.is_empty() && !log.refused;
     let instants = if usable { log.instants.as_slice() } else { &[] };
-    let segment = LogSegment {
-        instants,
-        log: None,
-    };
+    let segment = LogSegment::alone(instants);
     let residuals = residuals(measurement, segment, &identified.noise, sets);
-    let times: Vec<f64> = instants
-        .iter()
-        .map(|i| (i.t - log.span.0).seconds())
-        .collect();
+    let times = instants.iter().map(|i| (i.t - log.span.0).seconds());
+    let times: Vec<f64> = times.collect();
     let wrenches = 6 * unknowns.sensors.len();
     let compared = SensorComparison::new(measurement, instants, &residuals, identified, sets);
     let torques = residuals.noise[1].iter().skip(wrenches);
@@ -111,18 +101,9 @@ pub(crate) fn log_outcome(
     };
     let inner: Vec<TorqueSeries> = torques.iter().map(|own| own.inner(&times)).collect();
     let undisturbed = undisturbed(measurement, log, identified, sets);
-    let findings = unknowns
-        .sensors
-        .iter()
-        .enumerate()
-        .filter_map(|(place, &sensor)| {
-            unexplained(
-                robot,
-                sensor,
-                undisturbed.as_ref().unwrap_or(&compared),
-                place,
-            )
-        });
+    let tested = undisturbed.as_ref().unwrap_or(&compared);
+    let sensors = unknowns.sensors.iter().enumerate();
+    let findings = sensors.filter_map(|(place, &sensor)| unexplained(robot, sensor, tested, place));
     let deviations = nuisance_deviations(measurement, instants, identified, root);
     LogOutcome {
         file: log.file.clone(),
@@ -298,10 +279,7 @@ pub(crate) fn undisturbed(
     for (instant, units) in instants.iter_mut().zip(&log.disturbed) {
         instant.disturbed = *units;
     }
-    let segment = LogSegment {
-        instants: &instants,
-        log: None,
-    };
+    let segment = LogSegment::alone(&instants);
     let residuals = residuals(measurement, segment, &identified.noise, sets);
     Some(SensorComparison::new(
         measurement,
@@ -339,14 +317,14 @@ pub(crate) fn unexplained(
     let (mut axes, mut opposite) = (Vec::new(), Vec::new());
     for (axis, word) in AXES.into_iter().enumerate() {
         let channel = channel_of(place, axis);
-        let pairs = compared.load[channel]
-            .iter()
-            .zip(&compared.errors[2][channel]);
-        let is_compared = |((l, e), rows): &((&f64, &f64), &usize)| {
-            l.is_finite() && e.is_finite() && **rows == all_rows
+        let (load, error) = (&compared.load[channel], &compared.errors[2][channel]);
+        let is_compared = |&i: &usize| {
+            load[i].is_finite() && error[i].is_finite() && compared.rows[place][i] == all_rows
         };
-        let pairs = pairs.zip(&compared.rows[place]).filter(is_compared);
-        let (load, error): (Vec<f64>, Vec<f64>) = pairs.map(|(pair, _)| pair).unzip();
+        let (load, error): (Vec<f64>, Vec<f64>) = (0..load.len())
+            .filter(is_compared)
+            .map(|i| (load[i], error[i]))
+            .unzip();
         if load.len() < MIN_FOLD {
             continue;
         }
@@ -358,13 +336,8 @@ pub(crate) fn unexplained(
         } else {
             1.0
         };
-        let [ll, ee, pp, lp] = [
-            (&load, &load),
-            (&error, &error),
-            (&predicted, &predicted),
-            (&load, &predicted),
-        ]
-        .map(|(a, b)| dot(a, b));
+        let (ll, ee) = (dot(&load, &load), dot(&error, &error));
+        let (pp, lp) = (dot(&predicted, &predicted), dot(&load, &predicted));
         (residual, all) = (residual + scale * scale * ee, all + scale * scale * ll);
         let times = (ee / load.len() as f64).sqrt() / noise[axis];
         if times > TIMES && ee > FRACTION * FRACTION * ll {
@@ -465,12 +438,8 @@ pub(crate) fn nuisance_deviations(
 ) -> Vec<f64> {
     // From the last instants only: an offset drifts, and a filter that starts there without prior
     // knowledge overestimates the uncertainty.
-    let segment = LogSegment {
-        instants: &instants[instants
-            .len()
-            .saturating_sub(crate::training::SEGMENT_INSTANTS)..],
-        log: None,
-    };
+    let first = instants.len().saturating_sub(SEGMENT_INSTANTS);
+    let segment = LogSegment::alone(&instants[first..]);
     let reduced = reduce(measurement, segment, &identified.noise);
     let moved = &reduced.slope * root;
     (0..reduced.covariance.nrows())
@@ -489,20 +458,19 @@ pub(crate) fn offsets(
     let (Some(first), Some(last)) = (residuals.nuisance.first(), residuals.nuisance.last()) else {
         return Vec::new();
     };
-    let of = |place: usize, value: &dyn Fn(usize) -> f64| {
+    let axes = |place: usize, value: &dyn Fn(usize) -> f64| {
         std::array::from_fn(|axis| value(channel_of(place, axis)))
     };
-    unknowns
-        .sensors
-        .iter()
-        .enumerate()
-        .filter(|(place, _)| (0..6).any(|axis| residuals.has_channel(6 * place + axis)))
+    let is_read = |place: usize| (0..6).any(|axis| residuals.has_channel(6 * place + axis));
+    let sensors = unknowns.sensors.iter().enumerate();
+    let offsets = sensors.filter(|(place, _)| is_read(*place));
+    offsets
         .map(|(place, &sensor)| OffsetOutcome {
             sensor: sensor_name(robot, sensor),
-            start: of(place, &|channel| first.x[(channel, 1)]),
-            end: of(place, &|channel| last.x[(channel, 1)]),
-            deviation: of(place, &|channel| deviations[channel]),
-            rate: of(place, &|channel| identified.noise.drift[channel].sqrt()),
+            start: axes(place, &|channel| first.x[(channel, 1)]),
+            end: axes(place, &|channel| last.x[(channel, 1)]),
+            deviation: axes(place, &|channel| deviations[channel]),
+            rate: axes(place, &|channel| identified.noise.drift[channel].sqrt()),
         })
         .collect()
 }

@@ -87,7 +87,7 @@ pub struct InForce {
 }
 
 /// Whether anything was identified.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Verdict {
     /// The parameters of at least one group of links predict data that they were not fitted to
     /// better than CAD, its channels together. Links of other groups keep their CAD parameters:
@@ -95,6 +95,7 @@ pub enum Verdict {
     Identified,
     /// For no link do the parameters predict held-out data better than CAD (or there were too few
     /// data for cross-validation): all links keep their CAD parameters.
+    #[default]
     NoBetterThanCad,
     /// Nothing was identified, and the parameters are CAD's: the reason, in words.
     Nothing(String),
@@ -130,7 +131,7 @@ pub struct LinkOutcome {
 
 /// Covariance of the identified parameters, and of the offsets at the end of the last training log
 /// in which each sensor was read, as `U U^T`: inflated noise and prior included.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct CovarianceRoot {
     /// Quantities of the first rows: ten parameters of each seen link, then six offsets per sensor.
     pub columns: Vec<ParameterColumn>,
@@ -341,7 +342,7 @@ pub struct Curve {
 }
 
 /// The result for one log.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct LogOutcome {
     /// Its file name.
     pub file: String,
@@ -374,7 +375,7 @@ pub struct LogOutcome {
 }
 
 /// The result of identification from recorded logs.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Outcome {
     /// The robot's name.
     pub robot: String,

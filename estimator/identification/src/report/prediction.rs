@@ -33,6 +33,7 @@ use proprio_dynamics::DynamicsError;
 use proprio_dynamics::calibration::{Gain, Kind, Unknown};
 use proprio_dynamics::spatial::RigidInertia;
 use proprio_topics::Nanos;
+use std::ops::Range;
 
 /// Most observations of a log that are used: they give its RMS to 1 %, and the same ones are used
 /// for CAD and for other parameters.
@@ -51,6 +52,14 @@ pub(crate) struct JudgedParameters {
     pub friction: Vec<[f64; FRICTION]>,
 }
 
+impl JudgedParameters {
+    /// The same parameters at all times.
+    pub(crate) fn constant(d: &DVector<f64>, friction: Vec<[f64; FRICTION]>) -> Self {
+        let course = vec![(Nanos::ZERO, d.clone())];
+        Self { course, friction }
+    }
+}
+
 /// Residuals of a candidate in a log, at the used instants; NaN where there is no prediction.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct PredictionErrors {
@@ -60,14 +69,6 @@ pub(crate) struct PredictionErrors {
     pub drifting: Vec<Vec<f64>>,
     /// Per degree of freedom whose torque follows from two sides, their difference.
     pub routes: Vec<Vec<f64>>,
-}
-
-/// Which offsets are fitted.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum FittedOffsets {
-    Constants,
-    /// Once constants only, once with linear drifts.
-    WithDrifts,
 }
 
 /// A log on which parameters are judged, with its measurement model.
@@ -151,14 +152,9 @@ fn beside(cad: &Robot, unknowns: &Unknowns, in_force: &InForce) -> DVector<f64> 
     for (place, &link) in unknowns.links.iter().enumerate() {
         let parameters =
             [&in_force.bodies[link], &cad.model.inertias()[link]].map(RigidInertia::parameters);
-        let change = parameters[0]
-            .iter()
-            .zip(parameters[1])
-            .map(|(own, cad)| own - cad);
-        d.rows_mut(10 * place, 10)
-            .iter_mut()
-            .zip(change)
-            .for_each(|(d, change)| *d = change);
+        for k in 0..10 {
+            d[10 * place + k] = parameters[0][k] - parameters[1][k];
+        }
     }
     let changes: Vec<(Matrix6<f64>, [f64; 6])> = in_force
         .calibrations
@@ -166,11 +162,8 @@ fn beside(cad: &Robot, unknowns: &Unknowns, in_force: &InForce) -> DVector<f64> 
         .zip(&cad.calibrations)
         .map(|(own, configured)| own.after(configured))
         .collect();
-    for (extra, value) in unknowns
-        .extra
-        .iter()
-        .zip(d.iter_mut().skip(unknowns.inertial()))
-    {
+    let values = d.iter_mut().skip(unknowns.inertial());
+    for (extra, value) in unknowns.extra.iter().zip(values) {
         if let ExtraParameter::Calibration(sensor, unknown) = *extra {
             let (gain, per_kelvin) = &changes[sensor];
             *value = match unknown {
@@ -240,7 +233,7 @@ impl<'a> PredictionError<'a> {
         candidates: &[JudgedParameters; 2],
     ) -> Predicted {
         let robot = self.measurement.robot();
-        let errors = self.errors(unknowns, candidates, FittedOffsets::WithDrifts);
+        let errors = self.errors(unknowns, candidates, true);
         let unknowns = self.unknowns();
         let (mut squares, mut all) = ([[0.0; 2]; 2], 0.0);
         for channel in 0..6 * unknowns.sensors.len() {
@@ -290,31 +283,83 @@ impl<'a> PredictionError<'a> {
         load.into_iter().map(|x| x - mean).collect()
     }
 
-    /// Residuals of each of the candidates, given in the columns of `unknowns`.
+    /// Residuals of each of the candidates, given in the columns of `unknowns`; with constant
+    /// offsets only, or once with linear drifts too.
     pub(crate) fn errors(
         &self,
         unknowns: &Unknowns,
         candidates: &[JudgedParameters],
-        free: FittedOffsets,
+        with_drifts: bool,
     ) -> Vec<PredictionErrors> {
         let own = self.unknowns();
         let (offsets, channels) = (6 * own.sensors.len(), own.channels());
-        let drifts = if free == FittedOffsets::WithDrifts {
-            offsets
-        } else {
-            0
-        };
-        let width = offsets + drifts;
-        let dofs = self.measurement.robot().model.dof_count();
+        let drifts = if with_drifts { offsets } else { 0 };
+        let width = channels + drifts + self.measurement.robot().model.dof_count();
         let plan = JudgedSets::new(unknowns, own, candidates);
+        let fitted = self.fitted_offsets(&plan, drifts);
+        let values = self.map_instants(Vec::new, |values: &mut Vec<f64>, made| {
+            let start = values.len();
+            values.resize(start + candidates.len() * width, f64::NAN);
+            let in_force = plan.in_force(made.instant.t);
+            let compared = comparisons(made, &plan, &in_force);
+            let each = values[start..].chunks_exact_mut(width.max(1));
+            for (which, (out, course)) in each.zip(&plan.courses).enumerate() {
+                let ParameterSet { d, gains } = &plan.sets[in_force[which]];
+                let [constant, drifting] = &fitted[in_force[which]];
+                for ComparedRow { of, residuals, h } in &compared {
+                    let (residual, h) = (residuals[which], &h[*gains]);
+                    let remains = residual - dot(h, constant.as_slice());
+                    match *of {
+                        ComparedQuantity::Route(dof) => out[channels + drifts + dof] = remains,
+                        ComparedQuantity::Channel(channel) => {
+                            out[channel] = remains;
+                            if channel < drifts {
+                                let line = line(h, made.late, drifts);
+                                out[channels + channel] =
+                                    residual - dot(&line, drifting.as_slice());
+                            }
+                        }
+                    }
+                }
+                for row in 0..made.rows.count {
+                    if let Some(joint) = made.rows.joint(row, offsets) {
+                        let share = &made.rows.g(row)[offsets + FRICTION * joint..][..FRICTION];
+                        out[offsets + joint] = made.rows.without_bodies(row, d.as_slice())
+                            - dot(share, &course.friction[joint]);
+                    }
+                }
+            }
+        });
+        let values: Vec<f64> = values.concat();
+        let column = |at: usize| -> Vec<f64> {
+            let own = values.iter().skip(at).step_by(candidates.len() * width);
+            own.copied().collect()
+        };
+        let columns = |which: usize, places: Range<usize>| -> Vec<Vec<f64>> {
+            places.map(|place| column(which * width + place)).collect()
+        };
+        (0..candidates.len())
+            .map(|which| PredictionErrors {
+                channels: columns(which, 0..channels),
+                drifting: columns(which, channels..channels + drifts),
+                routes: columns(which, channels + drifts..width),
+            })
+            .collect()
+    }
+
+    /// Per set, the constant offsets that fit the whole log best, and the offsets that do so
+    /// together with this number of linear drifts.
+    fn fitted_offsets(&self, plan: &JudgedSets, drifts: usize) -> Vec<[DVector<f64>; 2]> {
+        let own = self.unknowns();
+        let offsets = 6 * own.sensors.len();
+        let width = offsets + drifts;
         let all: Vec<usize> = (0..plan.sets.len()).collect();
-        // First the offsets of each set in the whole log; then the residuals of the sets in use.
         let zero = || {
             let normals = vec![DMatrix::zeros(width, width); plan.gains.len()];
             (normals, vec![DVector::zeros(width); plan.sets.len()])
         };
-        let sums = self.map_instants(zero, |(normals, rights), made| {
-            for ComparedRow { of, residuals, h } in comparisons(made, &plan, &all) {
+        let parts = self.map_instants(zero, |(normals, rights), made| {
+            for ComparedRow { of, residuals, h } in comparisons(made, plan, &all) {
                 let ComparedQuantity::Channel(channel) = of else {
                     continue;
                 };
@@ -331,86 +376,16 @@ impl<'a> PredictionError<'a> {
                 }
             }
         });
-        let sums = sums
-            .into_iter()
-            .reduce(|(mut normals, mut rights), (more, others)| {
-                normals
-                    .iter_mut()
-                    .zip(more)
-                    .for_each(|(normal, more)| *normal += more);
-                rights
-                    .iter_mut()
-                    .zip(others)
-                    .for_each(|(right, other)| *right += other);
-                (normals, rights)
-            });
-        let (normals, rights) = sums.unwrap_or_else(zero);
-        let fitted: Vec<[DVector<f64>; 2]> = (rights.iter().zip(&plan.sets))
-            .map(|(right, set)| {
-                [offsets, width].map(|count| solved(&normals[set.gains], right, count))
-            })
-            .collect();
-        let width = channels + drifts + dofs;
-        let values = self.map_instants(Vec::new, |values: &mut Vec<f64>, made| {
-            let start = values.len();
-            values.resize(start + candidates.len() * width, f64::NAN);
-            let out = &mut values[start..];
-            let in_force = plan.in_force(made.instant.t);
-            for ComparedRow { of, residuals, h } in comparisons(made, &plan, &in_force) {
-                for ((out, residuals), &set) in
-                    out.chunks_exact_mut(width).zip(residuals).zip(&in_force)
-                {
-                    let ([constant, drifting], h) = (&fitted[set], &h[plan.sets[set].gains]);
-                    let remains = residuals - dot(h, constant.as_slice());
-                    match of {
-                        ComparedQuantity::Route(dof) => out[channels + drifts + dof] = remains,
-                        ComparedQuantity::Channel(channel) => {
-                            out[channel] = remains;
-                            if channel < drifts {
-                                let line = line(h, made.late, drifts);
-                                out[channels + channel] =
-                                    residuals - dot(&line, drifting.as_slice());
-                            }
-                        }
-                    }
-                }
-            }
-            for (row, joint) in
-                (0..made.rows.count).filter_map(|row| Some((row, made.rows.joint(row, offsets)?)))
-            {
-                let share = &made.rows.g(row)[offsets + FRICTION * joint..][..FRICTION];
-                for ((out, &set), ParameterCourse { friction, .. }) in out
-                    .chunks_exact_mut(width)
-                    .zip(&in_force)
-                    .zip(&plan.courses)
-                {
-                    let d = plan.sets[set].d.as_slice();
-                    out[offsets + joint] =
-                        made.rows.without_bodies(row, d) - dot(share, &friction[joint]);
-                }
-            }
-        });
-        let values: Vec<f64> = values.concat();
-        let column = |which: usize, place: usize| -> Vec<f64> {
-            let at = which * width + place;
-            values
-                .chunks_exact(candidates.len() * width)
-                .map(|all| all[at])
-                .collect()
+        let mut parts = parts.into_iter();
+        let (mut normals, mut rights) = parts.next().unwrap_or_else(zero);
+        for (more, others) in parts {
+            (normals.iter_mut().zip(more)).for_each(|(normal, more)| *normal += more);
+            (rights.iter_mut().zip(others)).for_each(|(right, other)| *right += other);
+        }
+        let of_set = |(right, set): (&DVector<f64>, &ParameterSet)| {
+            [offsets, width].map(|count| solved(&normals[set.gains], right, count))
         };
-        (0..candidates.len())
-            .map(|which| PredictionErrors {
-                channels: (0..channels)
-                    .map(|channel| column(which, channel))
-                    .collect(),
-                drifting: (channels..channels + drifts)
-                    .map(|place| column(which, place))
-                    .collect(),
-                routes: (channels + drifts..width)
-                    .map(|place| column(which, place))
-                    .collect(),
-            })
-            .collect()
+        rights.iter().zip(&plan.sets).map(of_set).collect()
     }
 
     /// Runs `each` over all instants, on all cores, with an accumulator of its own for each part of
@@ -500,10 +475,7 @@ fn comparisons(made: &InstantRows<'_, '_>, plan: &JudgedSets, sets: &[usize]) ->
     for (dof, along) in made.measurement.two_routes(rows) {
         compared.push(ComparedRow {
             of: ComparedQuantity::Route(dof),
-            residuals: residuals
-                .iter()
-                .map(|residuals| along.dot(residuals))
-                .collect(),
+            residuals: residuals.iter().map(|own| along.dot(own)).collect(),
             h: vec![g.tr_mul(&along).as_slice().to_vec(); plan.gains.len()],
         });
     }
@@ -557,10 +529,8 @@ impl JudgedSets {
 
 /// Coefficients of the constant offsets, then of `drifts` linear drifts.
 fn line(h: &[f64], late: f64, drifts: usize) -> Vec<f64> {
-    h.iter()
-        .copied()
-        .chain(h.iter().take(drifts).map(|x| late * x))
-        .collect()
+    let drifts = h.iter().take(drifts).map(|x| late * x);
+    h.iter().copied().chain(drifts).collect()
 }
 
 /// Least-squares solution for the first `count` offsets. Unobserved ones are zero.
@@ -603,11 +573,8 @@ fn in_columns_of(from: &Unknowns, d: &DVector<f64>, to: &Unknowns) -> DVector<f6
 fn gains(unknowns: &Unknowns, d: &DVector<f64>) -> Vec<Matrix6<f64>> {
     let of_sensor = |sensor: &usize| {
         let mut gain = Matrix6::identity();
-        for (extra, value) in unknowns
-            .extra
-            .iter()
-            .zip(d.iter().skip(unknowns.inertial()))
-        {
+        let values = d.iter().skip(unknowns.inertial());
+        for (extra, value) in unknowns.extra.iter().zip(values) {
             if let ExtraParameter::Calibration(own, Unknown::Gain { channel, of }) = extra
                 && own == sensor
             {
@@ -664,10 +631,9 @@ pub(crate) fn friction<'b>(
     for part in parts {
         for ((normal, rights), (more, others)) in total.iter_mut().zip(part) {
             *normal += more;
-            rights
-                .iter_mut()
-                .zip(others)
-                .for_each(|(right, other)| *right += other);
+            for (right, other) in rights.iter_mut().zip(others) {
+                *right += other;
+            }
         }
     }
     let solve = |normal: &Matrix3<f64>, right: &Vector3<f64>| -> [f64; FRICTION] {

@@ -45,14 +45,7 @@ pub(crate) fn rotors_not_separable(
         return Vec::new();
     }
     let (mut r, _) = identified.information.to_triangle();
-    for (place, spread) in spread.iter().enumerate() {
-        let columns = r
-            .columns(LINK_PARAMETERS * place, LINK_PARAMETERS)
-            .into_owned()
-            * spread;
-        r.columns_mut(LINK_PARAMETERS * place, LINK_PARAMETERS)
-            .copy_from(&columns);
-    }
+    scale_links(&mut r, spread);
     // Rotors without rows are not tested.
     fitted.retain(|column| r.column(*column).norm() > 0.0);
     let sum = |column: usize| {
@@ -65,10 +58,8 @@ pub(crate) fn rotors_not_separable(
             robot.model.dof_name(dof)
         ))
     };
-    combinations(&r, &fitted)
-        .into_iter()
-        .filter_map(sum)
-        .collect()
+    let sums = combinations(&r, &fitted).into_iter();
+    sums.filter_map(sum).collect()
 }
 
 /// Those of these columns of a matrix, none of them zero, that are linear combinations of all other
@@ -123,39 +114,34 @@ pub(crate) fn rotors(
             deviation: root.row(column).norm(),
         })
     };
-    unknowns
-        .extra
-        .iter()
-        .zip(unknowns.inertial()..)
-        .filter_map(rotor)
-        .collect()
+    let extra = unknowns.extra.iter().zip(unknowns.inertial()..);
+    extra.filter_map(rotor).collect()
 }
 
 /// `R` of the links' parameters, marginalised over the extra parameters, with columns in units of
 /// the prior's spread; and that spread: per link a matrix from such units to the ten parameters, `2
 /// tau^2 M^-1 = spread spread^T`.
 pub(crate) fn scaled_information(identified: &Identified) -> (DMatrix<f64>, Vec<DMatrix<f64>>) {
-    let r = of_links(identified);
-    let mut scaled = r.clone();
-    let mut spreads = Vec::new();
-    for (place, &link) in identified.unknowns.links.iter().enumerate() {
-        let metric = identified.prior.metric(link);
-        let inverse = metric
-            .cholesky()
-            .and_then(|c| c.l().try_inverse())
-            .map(|l| l.transpose());
-        let spread = inverse.unwrap_or_default() * (2.0_f64.sqrt() * identified.fit.tau);
-        let spread = DMatrix::from_fn(LINK_PARAMETERS, LINK_PARAMETERS, |i, j| spread[(i, j)]);
-        let columns = r
-            .columns(LINK_PARAMETERS * place, LINK_PARAMETERS)
-            .into_owned()
-            * &spread;
-        scaled
-            .columns_mut(LINK_PARAMETERS * place, LINK_PARAMETERS)
-            .copy_from(&columns);
-        spreads.push(spread);
-    }
+    let mut scaled = of_links(identified);
+    let spread = |&link: &usize| {
+        let factor = identified.prior.metric(link).cholesky();
+        let inverse = factor.and_then(|factor| factor.l().try_inverse());
+        let inverse = inverse.unwrap_or_default().transpose();
+        let spread = inverse * (2.0_f64.sqrt() * identified.fit.tau);
+        DMatrix::from_column_slice(LINK_PARAMETERS, LINK_PARAMETERS, spread.as_slice())
+    };
+    let spreads: Vec<DMatrix<f64>> = identified.unknowns.links.iter().map(spread).collect();
+    scale_links(&mut scaled, &spreads);
     (scaled, spreads)
+}
+
+/// Multiplies the columns of each link by one of these matrices.
+fn scale_links(r: &mut DMatrix<f64>, spreads: &[DMatrix<f64>]) {
+    for (place, spread) in spreads.iter().enumerate() {
+        let mut columns = r.columns_mut(LINK_PARAMETERS * place, LINK_PARAMETERS);
+        let scaled = columns.clone_owned() * spread;
+        columns.copy_from(&scaled);
+    }
 }
 
 /// Square-root information about the links' parameters, marginalised over the extra parameters: the
@@ -163,10 +149,8 @@ pub(crate) fn scaled_information(identified: &Identified) -> (DMatrix<f64>, Vec<
 /// have their prior; the others have none.
 pub(crate) fn of_links(identified: &Identified) -> DMatrix<f64> {
     let (r, _) = identified.information.to_triangle();
-    let (links, extra) = (
-        identified.unknowns.inertial(),
-        identified.unknowns.extra.len(),
-    );
+    let unknowns = &identified.unknowns;
+    let (links, extra) = (unknowns.inertial(), unknowns.extra.len());
     if extra == 0 {
         return r;
     }
@@ -175,24 +159,13 @@ pub(crate) fn of_links(identified: &Identified) -> DMatrix<f64> {
     let mut all = r
         .select_columns(&order)
         .resize_vertically(rows + extra, 0.0);
-    let unknowns = &identified.unknowns;
-    for (place, (precision, own)) in unknowns
-        .precision
-        .iter()
-        .copied()
-        .zip(&unknowns.extra)
-        .enumerate()
-    {
-        all[(rows + place, place)] = if own.lacks_cad() {
-            0.0
-        } else {
-            precision.sqrt()
-        };
+    for (place, (precision, own)) in unknowns.precision.iter().zip(&unknowns.extra).enumerate() {
+        if !own.lacks_cad() {
+            all[(rows + place, place)] = precision.sqrt();
+        }
     }
-    all.qr()
-        .r()
-        .view((extra, extra), (links, links))
-        .into_owned()
+    let r = all.qr().r();
+    r.view((extra, extra), (links, links)).into_owned()
 }
 
 /// A square root `F` of the covariance `F F^T` of CAD's errors: the prior's spread of each link and
@@ -206,9 +179,8 @@ pub(crate) fn cad_root(
 ) -> DMatrix<f64> {
     let count = unknowns.parameters();
     let fitted = unknowns.parameters_without_cad();
-    let given: Vec<usize> = (0..count)
-        .filter(|column| !fitted.contains(column))
-        .collect();
+    let given = (0..count).filter(|column| !fitted.contains(column));
+    let given: Vec<usize> = given.collect();
     let precision = &unknowns.precision;
     let mut root = DMatrix::zeros(count, count);
     for (place, spread) in spread.iter().enumerate() {
@@ -277,87 +249,60 @@ pub(crate) fn links(
 ) -> Vec<LinkOutcome> {
     let unknowns = &identified.unknowns;
     let moved = link_inertias(robot, unknowns, &identified.d);
+    let inverse = |spread: &DMatrix<f64>| {
+        let inverse = spread.clone().try_inverse();
+        inverse.unwrap_or_else(|| DMatrix::zeros(LINK_PARAMETERS, LINK_PARAMETERS))
+    };
+    let inverses: Vec<DMatrix<f64>> = spread.iter().map(inverse).collect();
+    // Of the rows of a link, in units of the prior's spread.
+    let scaled = |matrix: &DMatrix<f64>, place: usize| {
+        let own = matrix.rows(LINK_PARAMETERS * place, LINK_PARAMETERS);
+        &inverses[place] * own.into_owned()
+    };
     // Covariance of the estimate if CAD were right: P - P (prior's precision) P.
     let mut weighted = root.clone();
-    for (place, spread) in spread.iter().enumerate() {
-        let inverse = spread
-            .clone()
-            .try_inverse()
-            .unwrap_or_else(|| DMatrix::zeros(LINK_PARAMETERS, LINK_PARAMETERS));
-        let rows = inverse
-            * root
-                .rows(LINK_PARAMETERS * place, LINK_PARAMETERS)
-                .into_owned();
+    for place in 0..inverses.len() {
         weighted
             .rows_mut(LINK_PARAMETERS * place, LINK_PARAMETERS)
-            .copy_from(&rows);
+            .copy_from(&scaled(root, place));
     }
-    for (precision, row) in unknowns
-        .precision
-        .iter()
-        .copied()
-        .zip(unknowns.inertial()..)
-    {
+    for (precision, row) in unknowns.precision.iter().zip(unknowns.inertial()..) {
         weighted.row_mut(row).scale_mut(precision.sqrt());
     }
     // root root^T - (root weighed^T)(...)^T
     let shrinking = root * weighted.transpose();
-    robot
-        .model
-        .inertias()
-        .iter()
-        .enumerate()
-        .map(|(link, cad)| {
-            let floored = identified.prior.floors().iter().any(|f| f.link == link);
-            let floored = floored.then(|| *identified.prior.reference(link));
-            let Ok(place) = unknowns.links.binary_search(&link) else {
-                let metric = identified
-                    .prior
-                    .metric(link)
-                    .try_inverse()
-                    .unwrap_or_default();
-                let mut deviation = [0.0; 10];
-                for (k, value) in deviation.iter_mut().enumerate() {
-                    *value = (2.0 * metric[(k, k)]).max(0.0).sqrt() * identified.fit.tau;
-                }
-                return LinkOutcome {
-                    floored,
-                    deviation,
-                    ..unseen(robot, link, cad)
-                };
+    let outcome = |(link, cad): (usize, &RigidInertia)| {
+        let floored = identified.prior.floors().iter().any(|f| f.link == link);
+        let outcome = LinkOutcome {
+            floored: floored.then(|| *identified.prior.reference(link)),
+            ..unseen(robot, link, cad)
+        };
+        let Ok(place) = unknowns.links.binary_search(&link) else {
+            let metric = identified.prior.metric(link);
+            let metric = metric.try_inverse().unwrap_or_default();
+            return LinkOutcome {
+                deviation: std::array::from_fn(|k| {
+                    (2.0 * metric[(k, k)]).max(0.0).sqrt() * identified.fit.tau
+                }),
+                ..outcome
             };
-            let own = root
-                .rows(LINK_PARAMETERS * place, LINK_PARAMETERS)
-                .into_owned();
-            let mut deviation = [0.0; 10];
-            for (k, value) in deviation.iter_mut().enumerate() {
-                *value = wide.row(LINK_PARAMETERS * place + k).norm();
-            }
-            let inverse = spread[place]
-                .clone()
-                .try_inverse()
-                .unwrap_or_else(|| DMatrix::zeros(LINK_PARAMETERS, LINK_PARAMETERS));
-            let significance = significance(
-                &(&inverse * own),
-                &(&inverse
-                    * shrinking
-                        .rows(LINK_PARAMETERS * place, LINK_PARAMETERS)
-                        .into_owned()),
-                &(&inverse * identified.d.rows(LINK_PARAMETERS * place, LINK_PARAMETERS)),
-            );
-            LinkOutcome {
-                link,
-                name: robot.model.link_name(link).to_owned(),
-                cad: *cad,
-                floored,
-                identified: moved[link],
-                deviation,
-                retained_fraction: identified.retained[place],
-                significance,
-                seen: true,
-            }
-        })
-        .collect()
+        };
+        let change = identified.d.rows(LINK_PARAMETERS * place, LINK_PARAMETERS);
+        LinkOutcome {
+            identified: moved[link],
+            deviation: std::array::from_fn(|k| wide.row(LINK_PARAMETERS * place + k).norm()),
+            retained_fraction: identified.retained[place],
+            significance: significance(
+                &scaled(root, place),
+                &scaled(&shrinking, place),
+                &(&inverses[place] * change),
+            ),
+            seen: true,
+            ..outcome
+        }
+    };
+    let links = robot.model.inertias().iter().enumerate();
+    links.map(outcome).collect()
 }
 
 /// Significance of the change of a link's parameters as a standard normal deviate, from the link's
@@ -406,20 +351,14 @@ pub(crate) fn covariance(
     logs: &[ReducedLog],
     root: &DMatrix<f64>,
 ) -> CovarianceRoot {
-    let (links, p, s) = (
-        unknowns.inertial(),
-        unknowns.parameters(),
-        6 * unknowns.sensors.len(),
-    );
-    let mut columns = Vec::new();
-    for &link in &unknowns.links {
-        columns.extend(
-            (0..LINK_PARAMETERS).map(|parameter| ParameterColumn::Inertial { link, parameter }),
-        );
-    }
-    for &sensor in &unknowns.sensors {
-        columns.extend((0..6).map(|component| ParameterColumn::Offset { sensor, component }));
-    }
+    let (links, p) = (unknowns.inertial(), unknowns.parameters());
+    let s = 6 * unknowns.sensors.len();
+    let of_links = unknowns.links.iter().flat_map(|&link| {
+        (0..LINK_PARAMETERS).map(move |parameter| ParameterColumn::Inertial { link, parameter })
+    });
+    let of_sensors = unknowns.sensors.iter().flat_map(|&sensor| {
+        (0..6).map(move |component| ParameterColumn::Offset { sensor, component })
+    });
     let wide = root.ncols();
     let mut joint = DMatrix::zeros(p + s, wide + s);
     joint.view_mut((0, 0), (p, wide)).copy_from(root);
@@ -439,19 +378,14 @@ pub(crate) fn covariance(
             continue;
         }
         let moved = reduced.slope.select_rows(&own) * root;
-        let factor = reduced
-            .covariance
-            .select_rows(&own)
-            .select_columns(&own)
-            .cholesky();
+        let covariance = reduced.covariance.select_rows(&own).select_columns(&own);
+        let factor = covariance.cholesky();
         for (i, unknown) in own.iter().enumerate() {
-            joint
-                .view_mut((p + unknown, 0), (1, wide))
-                .copy_from(&-moved.row(i));
-            for (j, column) in own.iter().enumerate() {
-                joint[(p + unknown, wide + column)] =
-                    factor.as_ref().map_or(0.0, |f| f.l_dirty()[(i, j)])
-                        * f64::from(u8::from(j <= i));
+            let mut row = joint.view_mut((p + unknown, 0), (1, wide));
+            row.copy_from(&-moved.row(i));
+            for (j, column) in own[..=i].iter().enumerate() {
+                let entry = factor.as_ref().map_or(0.0, |f| f.l_dirty()[(i, j)]);
+                joint[(p + unknown, wide + column)] = entry;
             }
         }
     }
@@ -466,7 +400,7 @@ pub(crate) fn covariance(
     }
     let joint = joint.select_rows(&rows);
     CovarianceRoot {
-        columns,
+        columns: of_links.chain(of_sensors).collect(),
         calibrations,
         root: upper(&joint),
     }
@@ -500,42 +434,27 @@ pub(crate) fn expression(
         let Some(inverse) = spread.clone().try_inverse() else {
             continue;
         };
-        let factors = inverse.tr_mul(
-            &direction
-                .rows(LINK_PARAMETERS * place, LINK_PARAMETERS)
-                .into_owned(),
-        );
+        let own = direction.rows(LINK_PARAMETERS * place, LINK_PARAMETERS);
+        let factors = inverse.tr_mul(&own.into_owned());
         for (k, factor) in factors.iter().enumerate() {
-            parts.push((
-                LINK_PARAMETERS * place + k,
-                *factor,
-                (factor * spread.row(k).norm()).abs(),
-            ));
+            let size = (factor * spread.row(k).norm()).abs();
+            parts.push((LINK_PARAMETERS * place + k, *factor, size));
         }
     }
     parts.sort_by(|a, b| b.2.total_cmp(&a.2).then(a.0.cmp(&b.0)));
-    let term = |&(column, factor, _): &(usize, f64, f64)| Term {
-        coefficient: factor / parts[0].1,
-        column,
-        name: format!(
-            "{}.{}",
-            robot
-                .model
-                .link_name(unknowns.links[column / LINK_PARAMETERS]),
-            PARAMETERS[column % LINK_PARAMETERS]
-        ),
-    };
-    let leading: Vec<_> = parts
-        .iter()
-        .take(4)
-        .filter(|part| part.2 >= 0.1 * parts[0].2)
-        .collect();
-    let mut links: Vec<usize> = leading
-        .iter()
-        .map(|part| unknowns.links[part.0 / LINK_PARAMETERS])
-        .collect();
+    let link = |column: usize| unknowns.links[column / LINK_PARAMETERS];
+    let leading = parts.iter().take(4);
+    let leading = leading.filter(|part| part.2 >= 0.1 * parts[0].2);
+    let mut links: Vec<usize> = leading.clone().map(|part| link(part.0)).collect();
     links.dedup();
-    let mut terms = leading.into_iter().map(term);
+    let mut terms = leading.map(|&(column, factor, _)| {
+        let parameter = PARAMETERS[column % LINK_PARAMETERS];
+        Term {
+            coefficient: factor / parts[0].1,
+            column,
+            name: format!("{}.{parameter}", robot.model.link_name(link(column))),
+        }
+    });
     let Some(kept) = terms.next() else {
         return (String::new(), links);
     };
@@ -570,7 +489,7 @@ pub(crate) fn subspace(
         .ok();
     }
     regime.contacts = robot.always;
-    let of = |measured| {
+    let subspace = |measured| {
         let scope = Scope::SubTrees(&robot.structure);
         Identifiable::new(&robot.model, scope, &regime, measured, Offsets::Unknown).ok()
     };
@@ -580,11 +499,9 @@ pub(crate) fn subspace(
         matches!(regime.joints[dof], JointMotion::Locked(_))
             || identified.unknowns.joints.contains(&dof)
     };
-    let both = (0..regime.joints.len())
-        .all(is_measured)
-        .then(|| of(Measurement::Both))
-        .flatten();
-    both.or_else(|| of(Measurement::Wrench))
+    let all_measured = (0..regime.joints.len()).all(is_measured);
+    let both = all_measured.then(|| subspace(Measurement::Both));
+    both.flatten().or_else(|| subspace(Measurement::Wrench))
 }
 
 pub(crate) fn base_parameters(

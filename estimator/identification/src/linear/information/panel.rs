@@ -137,9 +137,8 @@ impl Panel {
             let value = a.get(column).copied().unwrap_or(y);
             return Err(InformationError::Value { column, value });
         }
-        let columns = self.values[self.rows..]
-            .iter_mut()
-            .step_by(self.stride.max(1));
+        let first = self.values[self.rows..].iter_mut();
+        let columns = first.step_by(self.stride.max(1));
         for ((to, filled), &value) in columns.zip(&mut self.filled).zip(a.iter().chain([&y])) {
             *to = value;
             *filled |= value != 0.0;

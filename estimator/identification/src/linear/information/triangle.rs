@@ -27,11 +27,8 @@ impl Triangle {
 
     pub(crate) fn right_sides(&self) -> impl Iterator<Item = f64> {
         let width = self.unknowns + 1;
-        self.values
-            .iter()
-            .skip(self.unknowns)
-            .step_by(width)
-            .copied()
+        let last = self.values.iter().skip(self.unknowns);
+        last.step_by(width).copied()
     }
 
     /// Absorbs the panel's rows and empties the panel. Returns the increase of the residual's

@@ -40,10 +40,8 @@ pub(super) struct SubtreeUnknowns {
 
 impl SubtreeUnknowns {
     pub(super) fn new(robot: &Robot, subtree: &SubTreeRegressor, offsets: &[Wrench]) -> Self {
-        let (links, sensors) = (
-            subtree.links().to_vec(),
-            subtree.sensors().collect::<Vec<_>>(),
-        );
+        let (links, sensors): (_, Vec<usize>) =
+            (subtree.links().to_vec(), subtree.sensors().collect());
         let cad = robot.model.inertias();
         let parameters = links.iter().flat_map(|&link| cad[link].parameters());
         let offsets = sensors.iter().flat_map(|&own| offsets[own].torque_first());
@@ -86,11 +84,8 @@ impl SubtreeUnknowns {
     fn scale(&self, row: &[f64], to: &mut [f64]) {
         let (of_links, offsets) = row.split_at(self.first_offset());
         let (to_links, to_offsets) = to.split_at_mut(self.first_offset());
-        let links = self
-            .roots
-            .iter()
-            .zip(of_links.chunks_exact(LINK_PARAMETERS));
-        for ((root, row), to) in links.zip(to_links.chunks_exact_mut(LINK_PARAMETERS)) {
+        let links = of_links.chunks_exact(LINK_PARAMETERS).zip(&self.roots);
+        for ((row, root), to) in links.zip(to_links.chunks_exact_mut(LINK_PARAMETERS)) {
             for (i, to) in to.iter_mut().enumerate() {
                 *to = root.row(i).iter().zip(row).map(|(u, a)| u * a).sum();
             }
@@ -104,27 +99,22 @@ impl SubtreeUnknowns {
     /// The unknowns of these unknowns of unit variance, `P^(1/2) w` beyond the reference.
     fn unscale(&self, scaled: &[f64]) -> Vec<f64> {
         let (of_links, offsets) = scaled.split_at(self.first_offset());
-        let links = self
-            .roots
-            .iter()
-            .zip(of_links.chunks_exact(LINK_PARAMETERS));
-        let links = links.flat_map(|(root, w)| {
-            (0..LINK_PARAMETERS).map(move |i| {
+        let links = of_links.chunks_exact(LINK_PARAMETERS).zip(&self.roots);
+        let links = links.flat_map(|(w, root)| {
+            let sum = move |i| {
                 root.column(i)
                     .iter()
                     .zip(w)
                     .map(|(u, w)| u * w)
                     .sum::<f64>()
-            })
+            };
+            (0..LINK_PARAMETERS).map(sum)
         });
-        let offsets = offsets
-            .iter()
-            .zip(UNKNOWN_OFFSET.iter().cycle())
-            .map(|(w, std)| w * std);
-        links
-            .chain(offsets)
-            .zip(&self.reference)
-            .map(|(own, reference)| own + reference)
+        let offsets = offsets.iter().zip(UNKNOWN_OFFSET.iter().cycle());
+        let changes = links.chain(offsets.map(|(w, deviation)| w * deviation));
+        let pairs = changes.zip(&self.reference);
+        pairs
+            .map(|(change, reference)| change + reference)
             .collect()
     }
 }
@@ -154,8 +144,8 @@ impl Branch {
                 let is_first = sensors.first() == Some(&number);
                 let other = if is_first { 1.0 / factor } else { 1.0 };
                 let own = if is_first { 1.0 } else { factor };
-                let of = |sensor: &usize| if *sensor == number { own } else { other };
-                (other, sensors.iter().map(of).collect())
+                let factor = |sensor: &usize| if *sensor == number { own } else { other };
+                (other, sensors.iter().map(factor).collect())
             }
             _ => (1.0, vec![1.0; sensors.len()]),
         };
@@ -169,6 +159,26 @@ impl Branch {
             log_odds: prior.ln(),
             is_refuted: false,
         }
+    }
+
+    /// The right side of a row, of which the reference leaves `rest` with the readings as stated.
+    fn right(&self, columns: &SubtreeUnknowns, now: &TickRows<'_>, row: usize, rest: f64) -> f64 {
+        let (of_links, offsets) = (now.rows.projected_row(row)).split_at(now.rows.offset_column());
+        let changes = (columns.sensors.iter().enumerate()).map(|(place, &sensor)| {
+            let reading = now.readings[sensor];
+            let change = match self.sight {
+                WrenchReading::Unit(..) => {
+                    let configured = &columns.reference[columns.first_offset()..];
+                    let six = |axis| configured[6 * place + axis];
+                    let offset = Wrench::from_torque_first(std::array::from_fn(six));
+                    (reading - offset) * (self.of_sensors[place] - 1.0)
+                }
+                sight => sight.reading(sensor, now.readings) - reading,
+            };
+            dot(&offsets[6 * place..6 * place + 6], &change.torque_first())
+        });
+        let bodies = (1.0 - self.of_links) * dot(of_links, &columns.reference);
+        rest + changes.sum::<f64>() + bodies
     }
 
     /// What multiplies the columns: `[d | s]`, and those of a contact.
@@ -266,39 +276,20 @@ impl HypothesisFit {
         let mut covariance = DMatrix::zeros(count, count);
         let mut scaled = vec![0.0; columns.count()];
         let rest = columns.rest(rows);
+        let sensors = columns.sensors.iter();
+        let variances: Vec<f64> = sensors.flat_map(|&own| now.variances[own]).collect();
         for i in 0..count {
-            let (of_links, offsets) = rows.projected_row(i).split_at(rows.offset_column());
+            let offsets = &rows.projected_row(i)[rows.offset_column()..];
             columns.scale(rows.projected_row(i), &mut scaled);
             for (column, value) in scaled.iter().enumerate() {
                 all[(i, column)] = *value;
             }
-            let right = rest[i];
             for (number, branch) in self.branches.iter().enumerate() {
-                let changes = (columns.sensors.iter().enumerate()).map(|(place, &sensor)| {
-                    let reading = now.readings[sensor];
-                    let change = match branch.sight {
-                        WrenchReading::Unit(..) => {
-                            let configured = &columns.reference[columns.first_offset()..];
-                            let six = |axis| configured[6 * place + axis];
-                            let offset = Wrench::from_torque_first(std::array::from_fn(six));
-                            (reading - offset) * (branch.of_sensors[place] - 1.0)
-                        }
-                        sight => sight.reading(sensor, now.readings) - reading,
-                    };
-                    dot(&offsets[6 * place..6 * place + 6], &change.torque_first())
-                });
-                let bodies = (1.0 - branch.of_links) * dot(of_links, &columns.reference);
-                all[(i, self.unknowns + number)] = right + changes.sum::<f64>() + bodies;
+                all[(i, self.unknowns + number)] = branch.right(columns, now, i, rest[i]);
             }
-            let channels = || {
-                columns
-                    .sensors
-                    .iter()
-                    .flat_map(|&sensor| now.variances[sensor])
-            };
             for j in 0..=i {
                 let others = &rows.projected_row(j)[rows.offset_column()..];
-                let terms = offsets.iter().zip(others).zip(channels());
+                let terms = offsets.iter().zip(others).zip(&variances);
                 let sum: f64 = terms.map(|((a, b), variance)| a * b * variance).sum();
                 (covariance[(i, j)], covariance[(j, i)]) = (sum, sum);
             }
@@ -430,25 +421,24 @@ impl HypothesisFit {
         let branch = &self.branches[number];
         let solution = factor.solve(&right);
         let (own, extra) = solution.as_slice().split_at(columns.count());
-        let mean = columns.unscale(own);
+        let mut mean = columns.unscale(own);
         let mut hypothesis = self.hypothesis(branch);
         hypothesis.view = self.view.at(extra);
-        let mut all = HypothesisPosterior {
+        // The offset is in the sensor's own unit.
+        let offset_factor = |&sensor: &usize| match branch.sight {
+            WrenchReading::Unit(number, factor) if number == sensor => factor,
+            _ => 1.0,
+        };
+        let offset_factors: Vec<f64> = columns.sensors.iter().map(offset_factor).collect();
+        scale_offsets(&mut mean[columns.first_offset()..], &offset_factors);
+        Some(HypothesisPosterior {
             hypothesis,
             mean,
             of_view: extra[..self.view.unknowns()].to_vec(),
-            // The offset is in the sensor's own unit.
-            offset_factors: (columns.sensors.iter())
-                .map(|&sensor| match branch.sight {
-                    WrenchReading::Unit(number, factor) if number == sensor => factor,
-                    _ => 1.0,
-                })
-                .collect(),
+            offset_factors,
             factor,
             noise: branch.noise,
-        };
-        all.scale_offsets(columns);
-        Some(all)
+        })
     }
 
     /// The factor of `noise + S` and b of a branch.
@@ -485,13 +475,6 @@ pub(super) struct HypothesisPosterior {
 }
 
 impl HypothesisPosterior {
-    fn scale_offsets(&mut self, columns: &SubtreeUnknowns) {
-        let offsets = self.mean[columns.first_offset()..].chunks_exact_mut(6);
-        for (six, factor) in offsets.zip(&self.offset_factors) {
-            six.iter_mut().for_each(|offset| *offset *= factor);
-        }
-    }
-
     /// The standard deviation of a number with these sensitivities to `[d | s]`, and to what
     /// [`MotionReading::at`] takes.
     pub(super) fn deviation(
@@ -502,16 +485,19 @@ impl HypothesisPosterior {
     ) -> f64 {
         let mut scaled = DVector::zeros(self.factor.l_dirty().nrows());
         columns.scale(sensitivity, &mut scaled.as_mut_slice()[..columns.count()]);
-        let offsets = scaled.as_mut_slice()[columns.first_offset()..columns.count()].chunks_mut(6);
-        for (six, factor) in offsets.zip(&self.offset_factors) {
-            six.iter_mut().for_each(|value| *value *= factor);
-        }
+        let offsets = columns.first_offset()..columns.count();
+        scale_offsets(&mut scaled.as_mut_slice()[offsets], &self.offset_factors);
         scaled.as_mut_slice()[columns.count()..][..of_view.len()].copy_from_slice(of_view);
-        let _ = self
-            .factor
-            .l_dirty()
-            .solve_lower_triangular_mut(&mut scaled);
+        let factor = self.factor.l_dirty();
+        let _ = factor.solve_lower_triangular_mut(&mut scaled);
         scaled.norm() * self.noise.sqrt()
+    }
+}
+
+/// Multiplies the offsets of each sensor.
+fn scale_offsets(offsets: &mut [f64], factors: &[f64]) {
+    for (six, factor) in offsets.chunks_exact_mut(6).zip(factors) {
+        six.iter_mut().for_each(|value| *value *= factor);
     }
 }
 

@@ -1,6 +1,6 @@
 //! What may be other than stated, and how the readings are to be taken then.
 
-use crate::robot::{ChannelRole, Robot};
+use crate::robot::{ChannelRole, NamedContact, Robot};
 use nalgebra::Rotation3;
 use proprio_dynamics::spatial::{Mat3, Vec3, Wrench};
 use proprio_dynamics::{FrameMotion, JointState};
@@ -104,28 +104,18 @@ impl Hypothesis {
     /// The channel whose readings are other than stated; none for a contact.
     #[must_use]
     pub const fn role(&self) -> Option<ChannelRole> {
+        use MotionReading as Motion;
+        use WrenchReading as Reading;
         match (self.view, self.sight) {
+            (Motion::Reversed(dof) | Motion::Degrees(dof), _) => Some(ChannelRole::Joint(dof)),
+            (Motion::Swapped(dof, _) | Motion::Encoder(dof, _), _) => Some(ChannelRole::Joint(dof)),
+            (Motion::Upright(_) | Motion::BaseTurned(_), _) => Some(ChannelRole::Base),
+            (Motion::ImuTurned(_) | Motion::ImuInG, _) => Some(ChannelRole::Base),
             (
-                MotionReading::Reversed(dof)
-                | MotionReading::Degrees(dof)
-                | MotionReading::Swapped(dof, _)
-                | MotionReading::Encoder(dof, _),
-                _,
-            ) => Some(ChannelRole::Joint(dof)),
-            (
-                MotionReading::Upright(_)
-                | MotionReading::ImuTurned(_)
-                | MotionReading::ImuInG
-                | MotionReading::BaseTurned(_),
-                _,
-            ) => Some(ChannelRole::Base),
-            (MotionReading::AsStated, WrenchReading::AsStated) => None,
-            (
-                _,
-                WrenchReading::Axes(sensor, _)
-                | WrenchReading::Unit(sensor, _)
-                | WrenchReading::Swapped(sensor, _),
+                Motion::AsStated,
+                Reading::Axes(sensor, _) | Reading::Unit(sensor, _) | Reading::Swapped(sensor, _),
             ) => Some(ChannelRole::Sensor(sensor)),
+            (Motion::AsStated, Reading::AsStated) => None,
         }
     }
 
@@ -147,81 +137,62 @@ struct DescribedHypothesis<'r> {
 
 impl fmt::Display for DescribedHypothesis<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        use MotionReading as Motion;
+        use WrenchReading as Reading;
         let robot = self.robot;
         let joint = |dof: usize| robot.model.dof_name(dof);
         let sensor = |number: usize| {
             let cut = robot.structure.sensors().get(number);
             cut.map_or("?", |cut| robot.model.joint_name(cut.joint()))
         };
-        match self.hypothesis.view {
-            MotionReading::AsStated => {}
-            MotionReading::Reversed(dof) => {
-                return write!(f, "the encoder of {} is reversed", joint(dof));
+        let Hypothesis {
+            view,
+            sight,
+            contact,
+        } = self.hypothesis;
+        let contact = contact.and_then(|number| robot.contacts.get(number));
+        match (view, sight, contact) {
+            (Motion::Reversed(dof), ..) => write!(f, "the encoder of {} is reversed", joint(dof)),
+            (Motion::Degrees(dof), ..) => write!(f, "the encoder of {} reads degrees", joint(dof)),
+            (Motion::Swapped(a, b), ..) => {
+                let (a, b) = (joint(a), joint(b));
+                write!(f, "the encoders of {a} and {b} are swapped")
             }
-            MotionReading::Degrees(dof) => {
-                return write!(f, "the encoder of {} reads degrees", joint(dof));
-            }
-            MotionReading::Swapped(a, b) => {
-                return write!(
-                    f,
-                    "the encoders of {} and {} are swapped",
-                    joint(a),
-                    joint(b)
-                );
-            }
-            MotionReading::Upright(_) => {
-                return f.write_str("gravity has another direction than stated");
-            }
-            MotionReading::ImuTurned(_) => {
-                return f.write_str("the IMU is mounted in another direction");
-            }
-            MotionReading::ImuInG => return f.write_str("the IMU reads accelerations in g"),
-            MotionReading::Encoder(dof, [offset, gain]) => {
-                return write!(
-                    f,
-                    "the encoder of {} has another zero or gain (right is {:.3} times its reading \
-                     {offset:+.3})",
-                    joint(dof),
-                    1.0 + gain,
-                );
-            }
-            MotionReading::BaseTurned(turn) => {
-                let angle = turn.norm().to_degrees();
-                return write!(f, "the base, or its IMU, is tilted by {angle:.0} degrees");
-            }
-        }
-        match self.hypothesis.sight {
-            WrenchReading::AsStated => {}
-            WrenchReading::Axes(number, axes) if axes == -Mat3::identity() => {
-                return write!(f, "the F/T sensor {} has the other sign", sensor(number));
-            }
-            WrenchReading::Axes(number, _) => {
-                return write!(f, "the F/T sensor {} has other axes", sensor(number));
-            }
-            WrenchReading::Unit(number, factor) => {
-                return write!(
-                    f,
-                    "the F/T sensor {} reads in another unit (right is {factor:.4} times its \
-                     reading)",
-                    sensor(number)
-                );
-            }
-            WrenchReading::Swapped(a, b) => {
-                let (a, b) = (sensor(a), sensor(b));
-                return write!(f, "the F/T sensors {a} and {b} are swapped");
-            }
-        }
-        match self
-            .hypothesis
-            .contact
-            .and_then(|number| robot.contacts.get(number))
-        {
-            Some(contact) => write!(
+            (Motion::Upright(_), ..) => f.write_str("gravity has another direction than stated"),
+            (Motion::ImuTurned(_), ..) => f.write_str("the IMU is mounted in another direction"),
+            (Motion::ImuInG, ..) => f.write_str("the IMU reads accelerations in g"),
+            (Motion::Encoder(dof, [offset, gain]), ..) => write!(
                 f,
-                "the contact {} has been present since the start",
-                contact.name
+                "the encoder of {} has another zero or gain (right is {:.3} times its reading \
+                 {offset:+.3})",
+                joint(dof),
+                1.0 + gain,
             ),
-            None => f.write_str("everything is as stated"),
+            (Motion::BaseTurned(turn), ..) => {
+                let angle = turn.norm().to_degrees();
+                write!(f, "the base, or its IMU, is tilted by {angle:.0} degrees")
+            }
+            (_, Reading::Axes(number, axes), _) => {
+                let what = if axes == -Mat3::identity() {
+                    "the other sign"
+                } else {
+                    "other axes"
+                };
+                write!(f, "the F/T sensor {} has {what}", sensor(number))
+            }
+            (_, Reading::Unit(number, factor), _) => write!(
+                f,
+                "the F/T sensor {} reads in another unit (right is {factor:.4} times its reading)",
+                sensor(number)
+            ),
+            (_, Reading::Swapped(a, b), _) => {
+                let (a, b) = (sensor(a), sensor(b));
+                write!(f, "the F/T sensors {a} and {b} are swapped")
+            }
+            (.., Some(NamedContact { name, .. })) => {
+                write!(f, "the contact {name} has been present since the start")
+            }
+            (Motion::AsStated, Reading::AsStated, None) => f.write_str("everything is as stated"),
         }
     }
 }
@@ -271,9 +242,10 @@ impl SeenMotion {
         match view {
             MotionReading::AsStated => {}
             MotionReading::Reversed(dof) => each.into_iter().for_each(|values| values[dof] *= -1.0),
-            MotionReading::Degrees(dof) => each
-                .into_iter()
-                .for_each(|values| values[dof] *= PI / 180.0),
+            MotionReading::Degrees(dof) => {
+                each.into_iter()
+                    .for_each(|values| values[dof] *= PI / 180.0);
+            }
             MotionReading::Swapped(a, b) => each.into_iter().for_each(|values| values.swap(a, b)),
             MotionReading::Upright(axis) => self.base.proper_acceleration = axis * GRAVITY,
             MotionReading::ImuTurned(turn) => self.turn_base(&turn),

@@ -200,13 +200,8 @@ impl SubtreeHypotheses {
         if self.stated() > UNLIKELY.ln() {
             return None;
         }
-        let all = self.fits.iter().flat_map(|fit| {
-            let branches = fit.branches.iter().enumerate();
-            branches.map(move |(number, branch)| (fit, number, branch))
-        });
-        let best = all
-            .filter(|(_, _, branch)| !branch.is_refuted)
-            .max_by(|a, b| a.2.log_odds.total_cmp(&b.2.log_odds));
+        let open = self.all().filter(|(_, _, branch)| !branch.is_refuted);
+        let best = open.max_by(|a, b| a.2.log_odds.total_cmp(&b.2.log_odds));
         let (fit, number, _) = best?;
         Some(fit.posterior(&self.columns, number)?.hypothesis)
     }
@@ -231,17 +226,20 @@ impl SubtreeHypotheses {
 
     /// All hypotheses that need cover, but the stated one.
     pub(super) fn alternatives(&self) -> Vec<HypothesisPosterior> {
-        let all = self.fits.iter().flat_map(|fit| {
-            fit.branches
-                .iter()
-                .enumerate()
-                .map(move |(number, branch)| (fit, number, branch))
-        });
-        all.filter(|(fit, _, branch)| {
+        let others = self.all().filter(|(fit, _, branch)| {
             branch.needs_cover() && fit.hypothesis(branch) != Hypothesis::AS_STATED
+        });
+        others
+            .filter_map(|(fit, number, _)| fit.posterior(&self.columns, number))
+            .collect()
+    }
+
+    /// All hypotheses: the fit, and the number of its branch.
+    fn all(&self) -> impl Iterator<Item = (&HypothesisFit, usize, &Branch)> {
+        self.fits.iter().flat_map(|fit| {
+            let branches = fit.branches.iter().enumerate();
+            branches.map(move |(number, branch)| (fit, number, branch))
         })
-        .filter_map(|(fit, number, _)| fit.posterior(&self.columns, number))
-        .collect()
     }
 }
 
@@ -258,48 +256,52 @@ pub(super) fn hypotheses(
     robot: &Robot,
     contacts: &ContactSet,
 ) -> Vec<HypothesisFit> {
-    let (model, sensor_count) = (&robot.model, robot.structure.sensors().len());
+    let sensor_count = robot.structure.sensors().len();
     let branch = |sight, prior| Branch::new(sight, prior, &columns.sensors);
     let mut first = vec![branch(WrenchReading::AsStated, 1.0)];
     for &sensor in &columns.sensors {
-        first.extend(
-            sights(sensor)
-                .into_iter()
-                .map(|sight| branch(sight, STRUCTURAL)),
-        );
         let others = (0..sensor_count).filter(|other| *other != sensor);
-        first.extend(others.map(|other| {
-            branch(
-                WrenchReading::Swapped(sensor.min(other), sensor.max(other)),
-                STRUCTURAL,
-            )
-        }));
+        let swapped =
+            others.map(|other| WrenchReading::Swapped(sensor.min(other), sensor.max(other)));
+        let all = sights(sensor).into_iter().chain(swapped);
+        first.extend(all.map(|sight| branch(sight, STRUCTURAL)));
     }
-    let mut fits = vec![HypothesisFit::new(
-        MotionReading::AsStated,
-        None,
-        columns,
-        first,
-    )];
+    let stated = MotionReading::AsStated;
+    let mut fits = vec![HypothesisFit::new(stated, None, columns, first)];
     let count = contacts.iter().count() as f64;
     fits.extend(contacts.iter().map(|contact| {
         let branches = vec![branch(WrenchReading::AsStated, CONTACT / count)];
-        HypothesisFit::new(MotionReading::AsStated, Some(contact), columns, branches)
+        HypothesisFit::new(stated, Some(contact), columns, branches)
     }));
-    let dofs: Vec<usize> = dofs_between(model, robot.base_link, &columns.links).collect();
+    fits.extend(
+        motion_readings(robot, &columns.links)
+            .into_iter()
+            .map(|view| {
+                let prior = match view.unknowns() {
+                    0 => STRUCTURAL,
+                    _ => ESTIMATED,
+                };
+                let branches = vec![branch(WrenchReading::AsStated, prior)];
+                HypothesisFit::new(view, None, columns, branches)
+            }),
+    );
+    fits
+}
+
+/// How the motion of joints and base may have to be taken, other than stated, as far as it concerns
+/// these links.
+fn motion_readings(robot: &Robot, links: &[usize]) -> Vec<MotionReading> {
+    let model = &robot.model;
+    let dofs: Vec<usize> = dofs_between(model, robot.base_link, links).collect();
+    let all = || dofs.iter().copied();
     let is_turning = |dof: &usize| {
         let joint = model
             .dof_joint(*dof)
             .and_then(|joint| model.joints().get(joint));
         joint.is_some_and(|joint| matches!(joint.kind, JointKind::Revolute(_)))
     };
-    let mut views: Vec<MotionReading> = dofs.iter().copied().map(MotionReading::Reversed).collect();
-    views.extend(
-        dofs.iter()
-            .copied()
-            .filter(is_turning)
-            .map(MotionReading::Degrees),
-    );
+    let mut views: Vec<MotionReading> = all().map(MotionReading::Reversed).collect();
+    views.extend(all().filter(is_turning).map(MotionReading::Degrees));
     // Of a limb's encoders any two may be swapped.
     for b in 0..model.dof_count() {
         let link = model.dof_joint(b).map_or(0, |joint| joint + 1);
@@ -307,19 +309,13 @@ pub(super) fn hypotheses(
         let concerned = limb.filter(|a| dofs.contains(a) || dofs.contains(&b));
         views.extend(concerned.map(|a| MotionReading::Swapped(a.min(b), a.max(b))));
     }
-    views.extend(
-        dofs.iter()
-            .map(|&dof| MotionReading::Encoder(dof, [0.0; 2])),
-    );
+    views.extend(all().map(|dof| MotionReading::Encoder(dof, [0.0; 2])));
     views.push(MotionReading::BaseTurned(Vec3::zeros()));
     match &robot.base {
         BaseMotion::Imu(pose) => {
             let to_base = |turn| pose.rotation * turn * pose.rotation.transpose();
-            views.extend(
-                quarter_turns()
-                    .into_iter()
-                    .map(|turn| MotionReading::ImuTurned(to_base(turn))),
-            );
+            let turns = quarter_turns().into_iter();
+            views.extend(turns.map(|turn| MotionReading::ImuTurned(to_base(turn))));
             views.push(MotionReading::ImuInG);
         }
         BaseMotion::Standing(motion) => {
@@ -327,24 +323,10 @@ pub(super) fn hypotheses(
             let axes = axes.into_iter().flat_map(|axis| [axis, -axis]);
             let stated = motion.proper_acceleration.normalize();
             // The nearest one is as good as stated.
-            views.extend(
-                axes.filter(|axis| axis.dot(&stated) < 0.9)
-                    .map(MotionReading::Upright),
-            );
+            let others = axes.filter(|axis| axis.dot(&stated) < 0.9);
+            views.extend(others.map(MotionReading::Upright));
         }
         BaseMotion::Stance(_) => {}
     }
-    fits.extend(views.into_iter().map(|view| {
-        let prior = match view.unknowns() {
-            0 => STRUCTURAL,
-            _ => ESTIMATED,
-        };
-        HypothesisFit::new(
-            view,
-            None,
-            columns,
-            vec![branch(WrenchReading::AsStated, prior)],
-        )
-    }));
-    fits
+    views
 }
