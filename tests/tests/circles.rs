@@ -325,11 +325,15 @@ fn a_type_name_stands_for_one_thing_in_its_crate() {
         .flat_map(|file| repeated(&Sources::read(file)))
         .collect();
     assert!(found.is_empty(), "{}", found.join("\n"));
-    let b = "pub struct A;\nconst C: u8 = 1;\nfn f() {}\n#[cfg(test)]\nmod tests { struct T; }\n";
-    let a = "enum A {}\nconst C: u8 = 2;\nfn f() {}\n#[cfg(test)]\nmod tests { struct T; }\n";
+    let b =
+        "pub struct Node;\nconst C: u8 = 1;\nfn f() {}\n#[cfg(test)]\nmod tests { struct Case; }\n";
+    let a = "enum Node {}\nconst C: u8 = 2;\nfn f() {}\n#[cfg(test)]\nmod tests { struct Case; }\n";
     let folder = written(&[("lib.rs", "mod a;\nmod b;\n"), ("a.rs", a), ("b.rs", b)]);
     let found = repeated(&Sources::read(&folder.path().join("lib.rs")));
-    assert!(found.len() == 1 && found[0].starts_with("A: "), "{found:?}");
+    assert!(
+        found.len() == 1 && found[0].starts_with("Node: "),
+        "{found:?}"
+    );
 }
 
 #[test]
