@@ -45,7 +45,7 @@
 //! [`temperature_variance`]: proprio_dynamics::calibration::Calibration::temperature_variance
 //!
 //! # Immediate estimates
-//! Without `max_wait_ms` nothing waits: the trigger's sample releases its estimate. Every
+//! By default nothing waits: the trigger's sample releases its estimate. Every
 //! other channel is evaluated from the samples that have arrived. Where none is stamped `t` or
 //! later, the adaptive window extrapolates: positions and angular velocities with the windows that
 //! differentiate them, wrenches and proper accelerations with one of their own (`prediction`). The
@@ -469,7 +469,6 @@ impl Pipeline {
 /// 62 Hz; the samples may show more.
 const ACCELEROMETER_NOISE: f64 = 0.035;
 
-/// The predictor of F/T sensor `number`, if estimates do not wait.
 /// An empty buffer for the samples of a channel.
 #[allow(
     clippy::expect_used,
@@ -509,6 +508,7 @@ fn sanity(setup: &Setup, role: ChannelRole) -> Sanity {
     }
 }
 
+/// The predictor of F/T sensor `number`, if estimates do not wait.
 fn sensor_predictor(setup: &Setup, number: usize) -> Option<Predictor<6>> {
     if setup.waits {
         return None;

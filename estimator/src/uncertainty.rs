@@ -97,12 +97,12 @@ impl Uncertainty {
     }
 
     /// The standard deviation of a torque [Nm or N].
-    pub(crate) fn torque(&self, solver: &Solver, dof: usize) -> f64 {
+    pub(crate) fn torque_std(&self, solver: &Solver, dof: usize) -> f64 {
         self.torque_variance(solver, dof).sqrt()
     }
 
     /// The standard deviations of a contact's wrench, `[fx fy fz tx ty tz]` [N, Nm].
-    pub(crate) fn contact(&self, solver: &Solver, contact: usize) -> [f64; 6] {
+    pub(crate) fn contact_std(&self, solver: &Solver, contact: usize) -> [f64; 6] {
         let noise = solver.contacts().get(contact).map(|own| own.deviation);
         let independent = [
             noise,
@@ -116,7 +116,7 @@ impl Uncertainty {
 
     /// The covariance of a sub-tree's imbalance without F/T noise [torque; force], at the origin of
     /// base coordinates [Nm, N].
-    pub(crate) fn imbalance(&self, subtree: usize) -> Option<Matrix6<f64>> {
+    pub(crate) fn imbalance_covariance(&self, subtree: usize) -> Option<Matrix6<f64>> {
         let parameters = self.parameters.imbalance_covariances().get(subtree)?;
         let places = self.places.imbalance_covariances().get(subtree)?;
         Some(parameters + places + self.motion.imbalance_covariance(subtree))

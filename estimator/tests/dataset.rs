@@ -509,7 +509,7 @@ fn given_velocities_are_kept_and_differentiated() {
     let usable = instants
         .observations()
         .iter()
-        .filter(|i| i.has_motion(&robot.channels));
+        .filter(|i| i.knows_motion(&robot.channels));
     let errors: Vec<[f64; 2]> = usable
         .map(|i| {
             [
@@ -555,7 +555,7 @@ fn derivatives_that_are_noise_are_not_used() {
         let usable = instants
             .observations()
             .iter()
-            .filter(|i| i.has_motion(&robot.channels));
+            .filter(|i| i.knows_motion(&robot.channels));
         let error = rms(usable.map(|i| i.acceleration[1] - motion(1, i.t.seconds())[2]));
         assert!(error < 0.1, "{error}");
     }
@@ -950,7 +950,7 @@ fn an_imu_tells_how_the_base_moves() {
     let usable: Vec<&Observation> = instants
         .observations()
         .iter()
-        .filter(|i| i.has_motion(&robot.channels))
+        .filter(|i| i.knows_motion(&robot.channels))
         .collect();
     assert!(usable.len() > 900);
     let alpha = rms(usable
@@ -1052,7 +1052,7 @@ fn the_logs_of_a_real_kuka_are_clean() {
         let usable = instants
             .observations()
             .iter()
-            .filter(|i| i.has_motion(&robot.channels) && i.torque.iter().all(|t| t.is_finite()))
+            .filter(|i| i.knows_motion(&robot.channels) && i.torque.iter().all(|t| t.is_finite()))
             .count();
         println!("{usable} of {} instants", instants.observations().len());
         assert!(

@@ -11,8 +11,8 @@ pub struct SinkError;
 
 /// A destination of samples. Never waits for readers.
 pub trait Sink {
-    /// Publishes a sample at `now`; fills in its epoch, sequence number and publication stamp.
-    /// Returns the number of readers that this call connected.
+    /// Publishes a sample at `now`, with its sequence number and publication stamp, and in shared
+    /// memory the epoch. Returns the number of readers that this call connected.
     ///
     /// # Errors
     /// [`SinkError`]: the sample was not published.

@@ -1,6 +1,7 @@
 //! Several recorded logs to one set of parameters: the stages of [`identify`].
 //!
-//! 1. [`prepare_logs`]: observations without motion are dropped, repeated logs are refused.
+//! 1. [`prepare_logs`]: observations whose motion is not known are dropped, repeated logs are
+//!    refused.
 //! 2. [`plausible_model`]: what contradicts the configuration is refused: units and signs of
 //!    readings, frames of F/T sensors, gravity ([`crate::diagnose::configuration`]). The
 //!    measurement model makes rows of observations ([`crate::measurement::model`]).
@@ -37,7 +38,7 @@ use crate::report::assemble;
 use crate::report::outcome::Outcome;
 use crate::robot::{IdentificationInput, Robot, TorqueSide};
 use crate::training::{
-    SEGMENT_INSTANTS, TrainingLog, no_log, prepare, reduced_segments, refuse_repeated, sample,
+    PreparedLog, SEGMENT_INSTANTS, no_log, prepare, reduced_segments, refuse_repeated, sample,
     segment_residuals, segments_of, training_instants, training_logs, training_logs_mut,
 };
 use proprio_dynamics::calibration::{Gain, Kind};
@@ -172,9 +173,9 @@ pub(crate) fn chosen_inputs(
 }
 
 /// Logs of observations with known motion; repeated ones are refused.
-pub(crate) fn prepare_logs(robot: &Robot, datasets: Vec<Dataset>) -> Vec<TrainingLog> {
+pub(crate) fn prepare_logs(robot: &Robot, datasets: Vec<Dataset>) -> Vec<PreparedLog> {
     let each = datasets.into_iter().map(|dataset| prepare(robot, dataset));
-    let mut logs: Vec<TrainingLog> = each.collect();
+    let mut logs: Vec<PreparedLog> = each.collect();
     refuse_repeated(&mut logs);
     logs
 }
@@ -184,9 +185,9 @@ pub(crate) fn prepare_logs(robot: &Robot, datasets: Vec<Dataset>) -> Vec<Trainin
 pub(crate) fn plausible_model<'a>(
     robot: &'a Robot,
     inputs: &[IdentificationInput],
-    logs: &mut [TrainingLog],
+    logs: &mut [PreparedLog],
 ) -> Result<ControlFlow<Box<Outcome>, MeasurementModel<'a>>, IdentifyError> {
-    let nothing = |logs: &[TrainingLog], reason: String, findings: Vec<Finding>| {
+    let nothing = |logs: &[PreparedLog], reason: String, findings: Vec<Finding>| {
         let mut outcome = assemble::nothing(robot, logs, reason);
         outcome.findings.extend(findings);
         Ok(ControlFlow::Break(Box::new(outcome)))
@@ -263,7 +264,7 @@ pub(crate) struct CleanFit {
 /// The rounds of fits and exclusions.
 struct Exclusion<'a, 'r> {
     measurement: &'a MeasurementModel<'r>,
-    logs: &'a mut [TrainingLog],
+    logs: &'a mut [PreparedLog],
     undeclared: Undeclared,
     drift: OffsetDrift,
     progress: &'a mut dyn FnMut(String, f64),
@@ -313,7 +314,7 @@ impl Exclusion<'_, '_> {
 /// does not change.
 pub(crate) fn exclude_disturbed(
     measurement: &MeasurementModel<'_>,
-    logs: &mut [TrainingLog],
+    logs: &mut [PreparedLog],
     progress: &mut dyn FnMut(String, f64),
 ) -> Result<CleanFit, IdentifyError> {
     // Offsets drift freely at first: with the limited drift, a load that comes or goes would look
@@ -372,7 +373,7 @@ pub(crate) fn exclude_disturbed(
 /// instants come back, and add information about the gains.)
 fn with_gains(
     measurement: &mut MeasurementModel<'_>,
-    logs: &mut [TrainingLog],
+    logs: &mut [PreparedLog],
     calibrated: Kind,
     mut clean: CleanFit,
     progress: &mut dyn FnMut(String, f64),
@@ -395,7 +396,7 @@ fn with_gains(
 /// from CAD is shrunk to the retained fraction.
 fn cross_validated_fit(
     measurement: &MeasurementModel<'_>,
-    training: &[&TrainingLog],
+    training: &[&PreparedLog],
     inputs: Vec<IdentificationInput>,
     calibrated: Kind,
     estimate: NoiseAndMap,
@@ -453,8 +454,8 @@ mod tests {
     use proprio_dynamics::ContactSet;
 
     /// A training log of these instants.
-    fn log(instants: &[Annotated]) -> TrainingLog {
-        TrainingLog {
+    fn log(instants: &[Annotated]) -> PreparedLog {
+        PreparedLog {
             file: String::new(),
             role: LogRole::Train,
             span: (instants[0].t, instants[instants.len() - 1].t),
@@ -473,8 +474,8 @@ mod tests {
         let robot = between_two_sensors();
         let all = readings(&robot, 15_000, &[0.1; 12], &[0.0; 12]);
         for (count, instants) in [(1, 15_000), (4, 12_000), (60, 1000), (100, 300)] {
-            let logs: Vec<TrainingLog> = (0..count).map(|_| log(&all[..instants])).collect();
-            let logs: Vec<&TrainingLog> = logs.iter().collect();
+            let logs: Vec<PreparedLog> = (0..count).map(|_| log(&all[..instants])).collect();
+            let logs: Vec<&PreparedLog> = logs.iter().collect();
             let wrench = [IdentificationInput::Wrench];
             let all = logs.iter().flat_map(|log| &log.instants);
             let measurement =

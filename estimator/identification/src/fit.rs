@@ -12,7 +12,7 @@ use crate::measurement::reduction::ReducedLog;
 use crate::measurement::unknowns::{ExtraParameter, Unknowns};
 use crate::prior::{MapEstimate, Posterior, Prior, PriorError};
 use crate::robot::{IdentificationInput, Robot};
-use crate::training::{TrainingLog, reduced_segments, sample, segment_residuals};
+use crate::training::{PreparedLog, reduced_segments, sample, segment_residuals};
 use nalgebra::DVector;
 use proprio_dynamics::DynamicsError;
 use proprio_dynamics::calibration::{Kind, Unknown};
@@ -239,7 +239,7 @@ pub(crate) struct NoiseAndMap {
 /// fit to nearly the same data; without it, the residuals of CAD give it.
 pub(crate) fn alternate_noise_and_map(
     measurement: &MeasurementModel<'_>,
-    training: &[&TrainingLog],
+    training: &[&PreparedLog],
     drift: OffsetDrift,
     from: Option<NoiseModel>,
     progress: &mut dyn FnMut(String, f64),

@@ -59,7 +59,7 @@ const SAMPLE_STRETCHES: usize = 10;
 pub(crate) const SEGMENT_INSTANTS: usize = 10_000;
 
 /// A log whose observations are ready to be used.
-pub(crate) struct TrainingLog {
+pub(crate) struct PreparedLog {
     pub file: String,
     pub role: LogRole,
     pub span: (Nanos, Nanos),
@@ -73,7 +73,7 @@ pub(crate) struct TrainingLog {
     pub disturbed: Vec<UnitSet>,
 }
 
-impl TrainingLog {
+impl PreparedLog {
     /// Excludes a joint's torque, for `reason`, and reports it with `finding`.
     pub(crate) fn exclude_torque(&mut self, dof: usize, reason: String, finding: Finding) {
         let is_there = |own: &&Annotated| own.torque.get(dof).is_some_and(|x| x.is_finite());
@@ -101,32 +101,32 @@ impl TrainingLog {
 }
 
 /// The training logs that are not refused.
-pub(crate) fn training_logs(logs: &[TrainingLog]) -> Vec<&TrainingLog> {
-    let is_used = |log: &&TrainingLog| log.role == LogRole::Train && !log.refused;
+pub(crate) fn training_logs(logs: &[PreparedLog]) -> Vec<&PreparedLog> {
+    let is_used = |log: &&PreparedLog| log.role == LogRole::Train && !log.refused;
     logs.iter().filter(is_used).collect()
 }
 
 /// All instants of these logs.
-pub(crate) fn training_instants(logs: &[TrainingLog]) -> impl Iterator<Item = &Annotated> {
+pub(crate) fn training_instants(logs: &[PreparedLog]) -> impl Iterator<Item = &Annotated> {
     (training_logs(logs).into_iter()).flat_map(|log| &log.instants)
 }
 
 pub(crate) fn training_logs_mut(
-    logs: &mut [TrainingLog],
-) -> impl Iterator<Item = &mut TrainingLog> {
-    let is_used = |log: &&mut TrainingLog| log.role == LogRole::Train && !log.refused;
+    logs: &mut [PreparedLog],
+) -> impl Iterator<Item = &mut PreparedLog> {
+    let is_used = |log: &&mut PreparedLog| log.role == LogRole::Train && !log.refused;
     logs.iter_mut().filter(is_used)
 }
 
 /// Refuses logs that repeat another one. Training twice on the same data would understate their
 /// noise, and training data cannot validate the result.
-pub(crate) fn refuse_repeated(logs: &mut [TrainingLog]) {
+pub(crate) fn refuse_repeated(logs: &mut [PreparedLog]) {
     for number in 1..logs.len() {
         let (before, rest) = logs.split_at_mut(number);
         let Some(log) = rest.first_mut().filter(|log| !log.refused) else {
             continue;
         };
-        let is_same = |other: &&mut TrainingLog| {
+        let is_same = |other: &&mut PreparedLog| {
             // To the bit, because what was not measured is NaN.
             let numbers = |of: &Annotated| -> Vec<u64> {
                 let readings = of.readings.iter().flat_map(Wrench::torque_first);
@@ -162,7 +162,7 @@ pub(crate) fn refuse_repeated(logs: &mut [TrainingLog]) {
 }
 
 /// Why nothing can be identified: the reasons for which the training logs were refused.
-pub(crate) fn no_log(logs: &[TrainingLog]) -> String {
+pub(crate) fn no_log(logs: &[PreparedLog]) -> String {
     /// Most reasons that are named.
     const NAMED: usize = 3;
     let training = logs.iter().filter(|log| log.role == LogRole::Train);
@@ -187,7 +187,7 @@ pub fn judged(robot: &Robot, dataset: Dataset) -> Vec<Observation> {
 }
 
 /// A log with the observations at which the motion is known; the reasons why others are excluded.
-pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
+pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> PreparedLog {
     let apart = stamps_apart(robot, &dataset);
     let Dataset {
         name: file,
@@ -205,7 +205,7 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
     let mut instants = Vec::new();
     for instant in all {
         let t = instant.t;
-        if !instant.has_motion(&robot.channels) {
+        if !instant.knows_motion(&robot.channels) {
             reasons.add(without_motion(robot, &instant), t);
             continue;
         }
@@ -234,7 +234,7 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> TrainingLog {
         let text = too_few(instants.len(), apart, &excluded, &findings);
         findings.push(Finding::refusal(FindingCode::TooShort, "", text));
     }
-    TrainingLog {
+    PreparedLog {
         file,
         role,
         span,
@@ -350,7 +350,7 @@ pub(crate) fn segment_residuals(
 }
 
 /// All instants of all logs, in segments of at most `most`.
-pub(crate) fn segments_of<'a>(training: &[&'a TrainingLog], most: usize) -> Vec<LogSegment<'a>> {
+pub(crate) fn segments_of<'a>(training: &[&'a PreparedLog], most: usize) -> Vec<LogSegment<'a>> {
     let mut segments = Vec::new();
     for (number, log) in training.iter().enumerate() {
         let count = log.instants.len().div_ceil(most).max(1);
@@ -369,7 +369,7 @@ pub(crate) fn segments_of<'a>(training: &[&'a TrainingLog], most: usize) -> Vec<
 /// a channel. Noise and the prior's scale need no more.
 pub(crate) fn sample<'a>(
     measurement: &MeasurementModel<'_>,
-    training: &[&'a TrainingLog],
+    training: &[&'a PreparedLog],
 ) -> Vec<LogSegment<'a>> {
     let total: usize = training.iter().map(|log| log.instants.len()).sum();
     if total <= SAMPLE_INSTANTS {

@@ -126,7 +126,7 @@ pub(super) struct Solved<'a> {
     pub(super) kinematics: &'a Kinematics,
     pub(super) solver: &'a Solver,
     /// The contacts that are known to be present.
-    pub(super) declared: &'a ContactSet,
+    pub(super) known: &'a ContactSet,
 }
 
 impl ResidualMonitor {
@@ -187,7 +187,7 @@ impl ResidualMonitor {
     }
 
     /// These, and those that may still be there, though the residual is plausible without them.
-    pub(super) fn possible(&self) -> ContactSet {
+    pub(super) fn lingering(&self) -> ContactSet {
         self.contacts(|state| state.lingering)
     }
 
@@ -218,8 +218,8 @@ impl ResidualMonitor {
             let subtree = &solved.structure.subtrees()[number];
             let is_free =
                 |contact: usize| solved.structure.contacts()[contact].kind != ContactKind::Wrench;
-            let declared = subtree.contacts.intersection(solved.declared);
-            let model_covariance = if subtree.sensors.is_empty() || !declared.iter().all(is_free) {
+            let known = subtree.contacts.intersection(solved.known);
+            let model_covariance = if subtree.sensors.is_empty() || !known.iter().all(is_free) {
                 None
             } else {
                 covariance(number)
@@ -227,7 +227,7 @@ impl ResidualMonitor {
             let Some(model_covariance) = model_covariance else {
                 // A contact that was there may still be there after the fault.
                 (state.mean, state.lately) = (None, 0.0);
-                if !declared.is_empty() {
+                if !known.is_empty() {
                     state.lingering = None;
                 }
                 state.steps.iter_mut().for_each(Step::end);
@@ -240,11 +240,11 @@ impl ResidualMonitor {
                     .torque_first(),
             );
             // The wrench of a known contact varies with its place, so no mean is formed.
-            let previous_mean = state.mean.filter(|_| declared.is_empty());
+            let previous_mean = state.mean.filter(|_| known.is_empty());
             let test = SubtreeTest {
                 solved,
                 number,
-                declared,
+                known,
                 b,
                 mean: Mean::next(previous_mean, solved.t, b),
                 noise: solved
@@ -275,7 +275,7 @@ impl ResidualMonitor {
                 state.lingering = state.residual.contact;
             } else if state.residual.is_unexplained
                 || state.lately > GONE
-                || declared != ContactSet::EMPTY
+                || known != ContactSet::EMPTY
             {
                 state.lingering = None;
             }
@@ -322,7 +322,7 @@ impl Mean {
 struct SubtreeTest<'a> {
     solved: &'a Solved<'a>,
     number: usize,
-    declared: ContactSet,
+    known: ContactSet,
     b: Vector6<f64>,
     mean: Mean,
     noise: Matrix6<f64>,
@@ -348,7 +348,7 @@ impl SubtreeTest<'_> {
         }
         let possible = self.solved.structure.subtrees()[self.number]
             .contacts
-            .difference(&self.declared);
+            .difference(&self.known);
         let (mut best, mut found) = (PLAUSIBLE, None);
         for contact in possible.iter() {
             let (left, _) = self.test(least, Some(contact));
@@ -401,11 +401,11 @@ impl SubtreeTest<'_> {
                 (0..3).for_each(|axis| covariance[(axis, axis)] += moment);
             }
             least.clear();
-            let declared = self.declared.iter().flat_map(columns);
+            let known = self.known.iter().flat_map(columns);
             let detected = detected_contact
                 .into_iter()
                 .flat_map(|contact| columns(contact).into_iter().take(3));
-            declared
+            known
                 .chain(detected)
                 .for_each(|(column, weight)| least.push(column, weight));
             let lower = noise_factor(covariance);

@@ -18,10 +18,10 @@ impl Pipeline {
     /// Computes the estimate at `t`: evaluates the channels, solves, tests the residuals, solves
     /// again if other contacts are detected, and writes the results.
     pub(super) fn compute_estimate(&mut self, t: Nanos) {
-        let active = self.active_contacts(t);
+        let known = self.active_contacts(t);
         self.contacts
             .place(&mut self.structure, &self.setup.robot.always, t);
-        let base = self.place_base(&active);
+        let base = self.place_base(&known);
         let at = At {
             t,
             until: self.until(t),
@@ -32,11 +32,11 @@ impl Pipeline {
         };
         self.inputs.evaluate(at, &self.buffers, base);
         // A contact detected at the last instant is most likely still there.
-        let possible = self.residuals.possible().difference(&active);
-        let mut solved = self.solve(t, &active.union(&possible));
-        self.test_residuals(t, &active, solved);
-        if solved && self.residuals.possible() != possible {
-            solved = self.solve(t, &active.union(&self.residuals.possible()));
+        let lingering = self.residuals.lingering().difference(&known);
+        let mut solved = self.solve(t, &known.union(&lingering));
+        self.test_residuals(t, &known, solved);
+        if solved && self.residuals.lingering() != lingering {
+            solved = self.solve(t, &known.union(&self.residuals.lingering()));
         }
         if solved {
             self.steps.update(
@@ -46,26 +46,26 @@ impl Pipeline {
                 &self.solver,
                 &self.inputs.readings,
                 [
-                    &active,
-                    &self.residuals.possible(),
+                    &known,
+                    &self.residuals.lingering(),
                     &self.residuals.suspected(),
                 ],
                 self.residuals.steps(),
             );
         }
-        self.write_estimate(t, &active, solved);
+        self.write_estimate(t, &known, solved);
     }
 
-    /// Solves with the contacts in `active` present, and computes all standard deviations. False if
-    /// the solver failed.
-    fn solve(&mut self, t: Nanos, active: &ContactSet) -> bool {
+    /// Solves with the contacts in `assumed` present, and computes all standard deviations. False
+    /// if the solver failed.
+    fn solve(&mut self, t: Nanos, assumed: &ContactSet) -> bool {
         let (model, structure) = (&self.parameters.model, &self.structure);
         let (inputs, kinematics, solver) = (&self.inputs, &mut self.kinematics, &mut self.solver);
-        self.dependences.update(structure, kinematics, active);
+        self.dependences.update(structure, kinematics, assumed);
         let solved = kinematics
             .update(model, inputs.joints(), &inputs.base)
             .and_then(|()| {
-                solver.solve(model, structure, kinematics, &inputs.readings, active, &[])
+                solver.solve(model, structure, kinematics, &inputs.readings, assumed, &[])
             })
             .and_then(|()| solver.update_deviations(structure));
         let solution = Solution {
@@ -76,7 +76,7 @@ impl Pipeline {
             base: &inputs.base,
             imu: inputs.imu.as_ref(),
             readings: &inputs.readings,
-            active,
+            active: assumed,
             kinematics,
             solver,
         };
@@ -88,9 +88,8 @@ impl Pipeline {
             .is_ok()
     }
 
-    /// Tests the residual of each sub-tree, when the contacts in `declared` are known to be
-    /// present.
-    fn test_residuals(&mut self, t: Nanos, declared: &ContactSet, is_solved: bool) {
+    /// Tests the residual of each sub-tree, when the contacts in `known` are present.
+    fn test_residuals(&mut self, t: Nanos, known: &ContactSet, is_solved: bool) {
         self.unwatched.clear();
         if !is_solved {
             return self.residuals.reset();
@@ -118,13 +117,13 @@ impl Pipeline {
             structure,
             kinematics: &self.kinematics,
             solver: &self.solver,
-            declared,
+            known,
         };
         let covariance = |number: usize| {
             let dependence = self.dependences.subtrees.get(number)?;
             let (reason, _) = validity.reason_and_cause(dependence);
             let has_no_fault = reason == Reason::None;
-            has_no_fault.then(|| self.uncertainty.imbalance(number))?
+            has_no_fault.then(|| self.uncertainty.imbalance_covariance(number))?
         };
         self.residuals.update(&solved, covariance);
     }
@@ -272,7 +271,7 @@ impl Judge<'_> {
     fn torque(&self, dof: usize) -> JointTorque {
         let least = self.doubts(dof).map_or(0.0, |doubt| doubt.deviation);
         let step = self.steps.torque().get(dof).copied().unwrap_or(0.0);
-        let own = self.uncertainty.torque(self.solver, dof);
+        let own = self.uncertainty.torque_std(self.solver, dof);
         let deviation = own.max(least).max(step);
         let bound = self.setup.max_deviation.get(dof);
         let (mut reason, mut cause) = self.torque_reason(dof);
@@ -328,7 +327,7 @@ impl Judge<'_> {
             _ => {}
         }
         let wrench = result.wrench.force_first();
-        let own = self.uncertainty.contact(self.solver, contact);
+        let own = self.uncertainty.contact_std(self.solver, contact);
         let deviation: [f64; 6] =
             std::array::from_fn(|i| own[i].max(self.steps.contact(contact, wrench[i])));
         let is_finite = result.wrench.is_finite() && deviation.iter().all(|x| x.is_finite());

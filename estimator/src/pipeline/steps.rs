@@ -172,8 +172,8 @@ impl StepCover {
     }
 
     /// Compares the torques of `solver` with those of all steps that are not refuted, and with
-    /// those of all contacts that are suspected. `declared` are the contacts that are known to be
-    /// present, `detected` those that residuals show. Does not allocate.
+    /// those of all contacts that are suspected. `known` are the contacts that are known to be
+    /// present, `lingering` those that residuals show. Does not allocate.
     #[allow(clippy::too_many_arguments, reason = "each of another kind")]
     pub(super) fn update<'a>(
         &mut self,
@@ -182,7 +182,7 @@ impl StepCover {
         kinematics: &Kinematics,
         solver: &Solver,
         readings: &[Wrench],
-        [declared, detected, suspected]: [&ContactSet; 3],
+        [known, lingering, suspected]: [&ContactSet; 3],
         steps: impl Iterator<Item = (usize, &'a Step)>,
     ) {
         self.torque.fill(0.0);
@@ -191,14 +191,14 @@ impl StepCover {
             let Some(change) = step.change() else {
                 continue;
             };
-            let own = structure.subtrees()[number].contacts.intersection(detected);
+            let own = structure.subtrees()[number].contacts.intersection(lingering);
             self.contacts = self.contacts.union(&own);
             self.readings.copy_from_slice(readings);
             let Some(reading) = self.readings.get_mut(step.sensor) else {
                 continue;
             };
             *reading += change;
-            let active = declared.union(&detected.difference(&own));
+            let active = known.union(&lingering.difference(&own));
             let solved =
                 self.solver
                     .solve(model, structure, kinematics, &self.readings, &active, &[]);
@@ -207,7 +207,7 @@ impl StepCover {
             }
             self.cover(solver);
         }
-        let assumed = declared.union(detected);
+        let assumed = known.union(lingering);
         if suspected.difference(&assumed) == ContactSet::EMPTY {
             return;
         }

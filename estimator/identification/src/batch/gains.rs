@@ -3,7 +3,7 @@
 use crate::fit::{IdentifyError, NoiseAndMap, OffsetDrift, alternate_noise_and_map};
 use crate::measurement::model::MeasurementModel;
 use crate::training::{
-    SEGMENT_INSTANTS, TrainingLog, segment_residuals, segments_of, training_instants,
+    PreparedLog, SEGMENT_INSTANTS, segment_residuals, segments_of, training_instants,
     training_logs, training_logs_mut,
 };
 use proprio_dynamics::calibration::Kind;
@@ -13,7 +13,7 @@ use proprio_dynamics::spatial::Wrench;
 /// fit predicts it ([`crate::measurement::model`]).
 pub(crate) fn fit_gains(
     measurement: &mut MeasurementModel<'_>,
-    logs: &mut [TrainingLog],
+    logs: &mut [PreparedLog],
     calibrated: Kind,
     mut estimate: NoiseAndMap,
     progress: &mut dyn FnMut(String, f64),
@@ -56,7 +56,7 @@ pub(crate) fn fit_gains(
 /// Stores in the training logs the noise-free readings that this fit predicts.
 fn set_fitted_readings(
     measurement: &MeasurementModel<'_>,
-    logs: &mut [TrainingLog],
+    logs: &mut [PreparedLog],
     estimate: &NoiseAndMap,
 ) {
     let unknowns = measurement.unknowns();

@@ -49,7 +49,7 @@ impl Observation {
 
     /// Whether the motion of every joint and of the base is known.
     #[must_use]
-    pub fn has_motion(&self, channels: &[Channel]) -> bool {
+    pub fn knows_motion(&self, channels: &[Channel]) -> bool {
         let known = |(c, fault): (&Channel, &Reason)| {
             matches!(c.role, ChannelRole::Sensor(_)) || *fault == Reason::None
         };

@@ -52,7 +52,7 @@ use crate::measurement::unknowns::Unknowns;
 use crate::online::bank::hypothesis::{GRAVITY, MotionReading};
 use crate::parallel;
 use crate::robot::{BaseMotion, IdentificationInput, Robot};
-use crate::training::TrainingLog;
+use crate::training::PreparedLog;
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
 use proprio_dynamics::spatial::Vec3;
 use proprio_dynamics::{DynamicsError, Structure};
@@ -95,7 +95,7 @@ const REMAINING_OF_GRAVITY: f64 = 1.0 / 9.0;
 pub(crate) fn check(
     robot: &Robot,
     inputs: &[IdentificationInput],
-    logs: &mut [TrainingLog],
+    logs: &mut [PreparedLog],
 ) -> Result<ControlFlow<(String, Vec<Finding>)>, DynamicsError> {
     let (mut all, mut trained) = (ConfigurationEvidence::new(robot), 0);
     let mut alone = Vec::new();
@@ -225,7 +225,7 @@ impl ConfigurationEvidence {
         &mut self,
         robot: &Robot,
         inputs: &[IdentificationInput],
-        log: &TrainingLog,
+        log: &PreparedLog,
     ) -> Result<(), DynamicsError> {
         let step = log.instants.len().div_ceil(MAX_OBSERVATIONS).max(1);
         let some: Vec<&Annotated> = log.instants.iter().step_by(step).collect();

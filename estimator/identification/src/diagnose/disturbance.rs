@@ -23,7 +23,7 @@ use crate::measurement::reduction::{LogSegment, residuals};
 use crate::measurement::rows::MeasurementRows;
 use crate::statistics::chi_square;
 use crate::statistics::quantile;
-use crate::training::{SEGMENT_INSTANTS, TrainingLog, map_segments};
+use crate::training::{PreparedLog, SEGMENT_INSTANTS, map_segments};
 use nalgebra::DVector;
 
 /// Normal deviate beyond which a block's square is outlying: one block in three million by chance.
@@ -63,7 +63,7 @@ const WINDOW: usize = 150;
 /// tested.
 pub(crate) fn contacts(
     measurement: &MeasurementModel<'_>,
-    all: &[&TrainingLog],
+    all: &[&PreparedLog],
     loads: &[LoadChange],
     noise: &NoiseModel,
     d: &DVector<f64>,

@@ -12,7 +12,7 @@ use crate::measurement::reduction::{LogSegment, ReducedLog, blocks, reduce};
 use crate::measurement::unknowns::Unknowns;
 use crate::parallel;
 use crate::prior::Prior;
-use crate::training::{TrainingLog, reduced_segments};
+use crate::training::{PreparedLog, reduced_segments};
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SMatrix, SVector};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_topics::Nanos;
@@ -190,7 +190,7 @@ struct LoadCandidate {
 /// with the larger gain; with a single log, the shorter one.
 pub(crate) fn find(
     measurement: &MeasurementModel<'_>,
-    training: &[&TrainingLog],
+    training: &[&PreparedLog],
     estimate: &NoiseAndMap,
 ) -> Option<LoadChange> {
     let mut segments = Vec::new();
@@ -253,7 +253,7 @@ pub(crate) fn find(
 }
 
 /// Length of the segments of a log \[s\].
-fn segment_seconds(log: &TrainingLog) -> f64 {
+fn segment_seconds(log: &PreparedLog) -> f64 {
     ((log.span.1 - log.span.0).seconds() / SEGMENTS as f64).max(SEGMENT_SECONDS)
 }
 
@@ -375,7 +375,7 @@ impl<'a> LoadSearch<'a> {
 /// found, since the noise no longer contains it.
 pub(crate) fn added_body(
     measurement: &MeasurementModel<'_>,
-    training: &[&TrainingLog],
+    training: &[&PreparedLog],
     load: &LoadChange,
     estimate: &NoiseAndMap,
 ) -> Option<(usize, AddedBody)> {

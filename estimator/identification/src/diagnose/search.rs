@@ -42,7 +42,7 @@ use crate::online::bank::hypothesis::MotionReading;
 use crate::prior::{MapEstimate, Posterior};
 use crate::report::outcome::TimeOffset;
 use crate::robot::Robot;
-use crate::training::{TrainingLog, map_segments};
+use crate::training::{PreparedLog, map_segments};
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::model::{Joint, JointKind};
 use std::f64::consts::FRAC_1_SQRT_2;
@@ -99,9 +99,9 @@ fn cost(unknowns: &Unknowns, fit: &MapEstimate, precision: &[f64]) -> f64 {
 
 /// Instants of all logs, so many in all and of each log at least, in stretches from the first to
 /// the last.
-fn stretches<'a>(training: &[&'a TrainingLog], enough: [usize; 2]) -> Vec<Vec<LogSegment<'a>>> {
+fn stretches<'a>(training: &[&'a PreparedLog], enough: [usize; 2]) -> Vec<Vec<LogSegment<'a>>> {
     let share = (enough[0] / training.len().max(1)).max(enough[1]);
-    let of_log = |log: &&'a TrainingLog| {
+    let of_log = |log: &&'a PreparedLog| {
         let all = log.instants.as_slice();
         let stretches = if all.len() > share { STRETCHES } else { 1 };
         let count = all.len().min(share) / stretches;
@@ -131,7 +131,7 @@ fn turning(robot: &Robot) -> Vec<usize> {
 /// Findings of wrong encoder signs, with a fit without gains.
 pub(crate) fn wrong_signs(
     measurement: &MeasurementModel<'_>,
-    training: &[&TrainingLog],
+    training: &[&PreparedLog],
     estimate: &NoiseAndMap,
 ) -> Vec<Finding> {
     let (robot, unknowns) = (measurement.robot(), measurement.unknowns());
@@ -266,7 +266,7 @@ impl SegmentColumns<'_> {
 /// The search for errors that are estimated.
 pub(crate) struct Search<'a> {
     measurement: &'a MeasurementModel<'a>,
-    training: &'a [&'a TrainingLog],
+    training: &'a [&'a PreparedLog],
     identified: &'a Identified,
     /// The tested joints.
     dofs: Vec<usize>,
@@ -282,7 +282,7 @@ pub(crate) struct Search<'a> {
 impl<'a> Search<'a> {
     pub(crate) fn new(
         measurement: &'a MeasurementModel<'a>,
-        training: &'a [&'a TrainingLog],
+        training: &'a [&'a PreparedLog],
         identified: &'a Identified,
     ) -> Self {
         let unknowns = &identified.unknowns;

@@ -12,7 +12,7 @@ use crate::measurement::channels;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
 use crate::robot::Robot;
-use crate::training::{Excluded, TrainingLog, training_logs, training_logs_mut};
+use crate::training::{Excluded, PreparedLog, training_logs, training_logs_mut};
 use nalgebra::DVector;
 use proprio_topics::Nanos;
 use std::ops::Range;
@@ -36,7 +36,7 @@ pub(crate) struct Undeclared {
 
 impl Undeclared {
     /// No disturbances, yet, of these logs.
-    pub(crate) fn none<'a>(logs: impl Iterator<Item = &'a mut TrainingLog>) -> Self {
+    pub(crate) fn none<'a>(logs: impl Iterator<Item = &'a mut PreparedLog>) -> Self {
         let contacts = logs.map(|log| vec![UnitSet::default(); log.instants.len()]);
         Self {
             loads: Vec::new(),
@@ -73,12 +73,12 @@ impl Undeclared {
     pub(crate) fn update<'a>(
         &mut self,
         measurement: &MeasurementModel<'_>,
-        logs: impl Iterator<Item = &'a mut TrainingLog>,
+        logs: impl Iterator<Item = &'a mut PreparedLog>,
         noise: &NoiseModel,
         d: &DVector<f64>,
     ) -> bool {
-        let logs: Vec<&mut TrainingLog> = logs.collect();
-        let seen: Vec<&TrainingLog> = logs.iter().map(|log| &**log).collect();
+        let logs: Vec<&mut PreparedLog> = logs.collect();
+        let seen: Vec<&PreparedLog> = logs.iter().map(|log| &**log).collect();
         let contacts = disturbance::contacts(measurement, &seen, &self.loads, noise, d);
         let unchanged = contacts == self.contacts;
         if !unchanged {
@@ -89,7 +89,7 @@ impl Undeclared {
     }
 
     /// Marks the disturbed instants of the logs.
-    pub(crate) fn mark<'a>(&self, logs: impl Iterator<Item = &'a mut TrainingLog>) {
+    pub(crate) fn mark<'a>(&self, logs: impl Iterator<Item = &'a mut PreparedLog>) {
         for (number, (log, contacts)) in logs.zip(&self.contacts).enumerate() {
             for (instant, contact) in log.instants.iter_mut().zip(contacts) {
                 let carries = |load: &&LoadChange| load.log == number && load.has(instant.t);
@@ -103,7 +103,7 @@ impl Undeclared {
     pub(crate) fn report(
         &self,
         measurement: &MeasurementModel<'_>,
-        logs: &mut [TrainingLog],
+        logs: &mut [PreparedLog],
         estimate: &NoiseAndMap,
     ) {
         let (loads, contacts) = (&self.loads, &self.contacts);
@@ -139,7 +139,7 @@ impl Undeclared {
 /// it.
 fn report_load<'a>(
     measurement: &MeasurementModel<'_>,
-    log: &mut TrainingLog,
+    log: &mut PreparedLog,
     load: &LoadChange,
     body: Option<&(usize, load::AddedBody)>,
     handovers: impl Iterator<Item = &'a ApparentContact>,
@@ -241,7 +241,7 @@ fn units(contacts: &[UnitSet]) -> UnitSet {
 
 /// The apparent contacts of a log with their causes; `loads`: loads whose hands may be one.
 fn apparent_contacts(
-    log: &TrainingLog,
+    log: &PreparedLog,
     contacts: &[UnitSet],
     loads: &[&LoadChange],
 ) -> Vec<ApparentContact> {
@@ -277,7 +277,7 @@ fn apparent_contacts(
 /// Each unit with contacts: its links, what is excluded, and in words how often, when and how long.
 fn suspected(
     robot: &Robot,
-    log: &TrainingLog,
+    log: &PreparedLog,
     contacts: &[ApparentContact],
 ) -> Vec<(String, Excluded, String)> {
     let contacts = contacts.iter().filter(|own| own.load.is_none());
@@ -310,14 +310,14 @@ fn suspected(
 }
 
 /// Reports undeclared disturbances of the validation logs, stores them in
-/// [`TrainingLog::disturbed`]. The figures of these logs still include all rows: validation data
+/// [`PreparedLog::disturbed`]. The figures of these logs still include all rows: validation data
 /// must not be selected by the model that they validate.
 pub(crate) fn report_validation(
     measurement: &MeasurementModel<'_>,
-    logs: &mut [TrainingLog],
+    logs: &mut [PreparedLog],
     identified: &Identified,
 ) {
-    let is_checked = |log: &&mut TrainingLog| log.role == LogRole::Validate && !log.refused;
+    let is_checked = |log: &&mut PreparedLog| log.role == LogRole::Validate && !log.refused;
     let robot = measurement.robot();
     let mut undeclared = Undeclared::none(logs.iter_mut().filter(is_checked));
     let converges = (0..ROUNDS).any(|_| {

@@ -15,11 +15,11 @@ use crate::report::uncertainty::{
     scaled_information, shrunk, subspace, unseen,
 };
 use crate::robot::Robot;
-use crate::training::{TrainingLog, training_logs};
+use crate::training::{PreparedLog, training_logs};
 use nalgebra::DMatrix;
 
 /// The outcome without identified parameters: CAD's, and the reason.
-pub(crate) fn nothing(robot: &Robot, logs: &[TrainingLog], reason: String) -> Outcome {
+pub(crate) fn nothing(robot: &Robot, logs: &[PreparedLog], reason: String) -> Outcome {
     let logs = logs.iter().map(|log| LogOutcome {
         file: log.file.clone(),
         role: log.role,
@@ -51,7 +51,7 @@ pub(crate) fn nothing(robot: &Robot, logs: &[TrainingLog], reason: String) -> Ou
 /// every stream.
 pub(crate) fn outcome(
     measurement: &MeasurementModel<'_>,
-    logs: &[TrainingLog],
+    logs: &[PreparedLog],
     identified: &Identified,
     (found, time_offsets): (Vec<Finding>, Vec<TimeOffset>),
 ) -> Outcome {

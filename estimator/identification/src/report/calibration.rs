@@ -7,7 +7,7 @@ use crate::measurement::model::MeasurementModel;
 use crate::measurement::unknowns::ExtraParameter;
 use crate::report::outcome::{CalibrationOutcome, ChannelNoise};
 use crate::robot::{AXES, Robot};
-use crate::training::TrainingLog;
+use crate::training::PreparedLog;
 use nalgebra::{DMatrix, Matrix6};
 use proprio_dynamics::calibration::{Calibration, Gain, Kind, Unknown, swapped};
 use proprio_dynamics::spatial::Wrench;
@@ -210,7 +210,7 @@ impl SensorErrors {
 pub(crate) fn channels(
     robot: &Robot,
     identified: &Identified,
-    training: &[&TrainingLog],
+    training: &[&PreparedLog],
 ) -> Vec<ChannelNoise> {
     let noise = &identified.noise;
     let seconds = training

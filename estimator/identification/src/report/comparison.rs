@@ -13,7 +13,7 @@ use crate::parallel;
 use crate::report::outcome::ModelComparison;
 use crate::report::prediction::{self, JudgedParameters};
 use crate::robot::Robot;
-use crate::training::{TrainingLog, training_instants};
+use crate::training::{PreparedLog, training_instants};
 use nalgebra::{DMatrix, DVector};
 
 /// A joint that moves by less is still \[rad\].
@@ -33,7 +33,7 @@ pub(crate) struct Judged<'a> {
 impl<'a> Judged<'a> {
     pub(crate) fn new(
         measurement: &MeasurementModel<'_>,
-        logs: &[TrainingLog],
+        logs: &[PreparedLog],
         identified: &'a Identified,
         root: &'a DMatrix<f64>,
     ) -> Self {

@@ -19,7 +19,7 @@ use crate::report::outcome::{
 };
 use crate::report::prediction::PredictionError;
 use crate::robot::{AXES, Robot};
-use crate::training::{MIN_FOLD, SEGMENT_INSTANTS, TrainingLog};
+use crate::training::{MIN_FOLD, PreparedLog, SEGMENT_INSTANTS};
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::Structure;
 use proprio_topics::Nanos;
@@ -72,7 +72,7 @@ pub(crate) fn with_friction_of_training(
 
 pub(crate) fn log_outcome(
     measurement: &mut MeasurementModel<'_>,
-    log: &TrainingLog,
+    log: &PreparedLog,
     judged: &Judged<'_>,
 ) -> LogOutcome {
     let (identified, sets, root) = (judged.identified, &judged.sets, judged.root);
@@ -268,7 +268,7 @@ fn sensor_outcomes(
 /// the offsets. None if no disturbance was found, because the comparison is then the same.
 pub(crate) fn undisturbed(
     measurement: &MeasurementModel<'_>,
-    log: &TrainingLog,
+    log: &PreparedLog,
     identified: &Identified,
     sets: &[DVector<f64>; 2],
 ) -> Option<SensorComparison> {

@@ -6,7 +6,7 @@ use crate::measurement::unknowns::{ExtraParameter, Unknowns};
 use crate::report::comparison::{STILL, UNREAD};
 use crate::report::outcome::{BaseParameterOutcome, CovarianceRoot, LinkOutcome, RotorOutcome};
 use crate::robot::{IdentificationInput, Robot};
-use crate::training::TrainingLog;
+use crate::training::PreparedLog;
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::regressor::identifiable::{
@@ -465,7 +465,7 @@ pub(crate) fn expression(
 /// Identifiable subspace for the joints that moved in the logs.
 pub(crate) fn subspace(
     robot: &Robot,
-    training: &[&TrainingLog],
+    training: &[&PreparedLog],
     identified: &Identified,
 ) -> Option<Identifiable> {
     let mut regime = robot.regime();
