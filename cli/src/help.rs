@@ -266,7 +266,7 @@ pub(crate) fn run(args: &HelpArgs, mut program: Command) {
 mod tests {
     use super::*;
     use crate::CommandLine;
-    use clap::CommandFactory as _;
+    use clap::{CommandFactory as _, Parser as _};
 
     fn ask(words: &str) -> Lookup {
         answer(
@@ -398,5 +398,67 @@ mod tests {
                 verb.get_name()
             );
         }
+    }
+
+    /// The commands of a document: whole ones of its blocks, and parts of them in lines of text.
+    fn commands(text: &str) -> Vec<(String, bool)> {
+        let mut all = Vec::new();
+        for (number, part) in text.split("```").enumerate() {
+            if number % 2 == 0 {
+                let inline = part.split('`').skip(1).step_by(2);
+                all.extend(inline.map(|line| (line.replace('\n', " "), false)));
+            } else if let Some(block) = part.strip_prefix("sh\n") {
+                let block = block.replace("\\\n", " ");
+                all.extend(block.lines().map(|line| (line.to_owned(), true)));
+            }
+        }
+        all
+    }
+
+    /// What is given to `proprio` in this line of a shell, if anything is.
+    fn arguments(line: &str) -> Option<Vec<String>> {
+        let line = line.replace("cargo run --release -- ", "proprio ");
+        let line = line
+            .strip_prefix("source <(")
+            .map_or(line.as_str(), |rest| rest.trim_end_matches(')'));
+        let line = line.strip_prefix("sudo -u proprio ").unwrap_or(line);
+        let line = line.strip_prefix("sudo ").unwrap_or(line);
+        let line = line.strip_prefix("target/release/").unwrap_or(line);
+        let line = line.strip_prefix("proprio ")?;
+        Some(line.split_whitespace().map(ToOwned::to_owned).collect())
+    }
+
+    /// In every document, each command has legal options and values; those in blocks are whole.
+    #[test]
+    fn each_command_of_the_documents_is_legal() {
+        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+        let others = ["README.md", "SECURITY.md", "CONTRIBUTING.md"]
+            .map(|name| std::fs::read_to_string(root.join(name)).expect("a document"));
+        let mut count = 0;
+        let texts = PAGES
+            .iter()
+            .map(|(_, _, text)| *text)
+            .chain(others.iter().map(String::as_str));
+        for (line, is_whole) in texts.flat_map(commands) {
+            let Some(mut arguments) = arguments(&line) else {
+                continue;
+            };
+            // In text a word in capitals stands for any: `proprio ctl tare SENSOR`.
+            if !is_whole {
+                arguments.push("--help".into());
+            }
+            let parsed =
+                CommandLine::try_parse_from(["proprio".to_owned()].into_iter().chain(arguments));
+            let problem = parsed
+                .err()
+                .filter(|error| error.kind() != ErrorKind::DisplayHelp);
+            assert!(
+                problem.is_none(),
+                "`{line}`: {}",
+                problem.map_or_else(String::new, |e| e.to_string())
+            );
+            count += 1;
+        }
+        assert!(count > 80, "{count} commands");
     }
 }

@@ -277,8 +277,7 @@ pub(crate) fn run(args: &RecordArgs, config: &DomainConfig) -> anyhow::Result<()
         listener.wait((now + Nanos::from_millis(100)).min(end.unwrap_or(Nanos::MAX)));
     }
     session.write_all(listener.series())?;
-    let lost_frames = frames.as_ref().map(RawFrames::lost);
-    finish(args, session, &listener, began, lost_frames)
+    finish(args, session, &listener, began, frames.as_ref())
 }
 
 /// Ends the recording, and says what it has.
@@ -287,7 +286,7 @@ fn finish(
     session: Session,
     listener: &Listener,
     began: Nanos,
-    lost_frames: Option<u64>,
+    frames: Option<&RawFrames>,
 ) -> anyhow::Result<()> {
     let Session {
         order,
@@ -314,8 +313,8 @@ fn finish(
             counts.torques
         );
     }
-    if let Some(lost) = lost_frames {
-        print_line!("{} frames, {lost} lost", counts.frames);
+    if let Some(frames) = frames {
+        print_line!("{} frames, {} lost", counts.frames, frames.lost());
     }
     if let Some(note) = note {
         print_line!("{note}");

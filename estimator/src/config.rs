@@ -583,7 +583,8 @@ impl Config {
         }
         if self.output.timing == Some(Timing::Immediate) && self.output.max_wait_ms.is_some() {
             return Err(
-                "output.max_wait_ms is of no use with timing = \"immediate\": remove one of them"
+                "output.max_wait_ms is of no use with timing = \"immediate\"; remove one of them, \
+                 or set timing = \"aligned\""
                     .into(),
             );
         }

@@ -1,6 +1,7 @@
 //! Turns a recording back into a table of samples, frames, and files.
 
 use crate::write::{About, PROPRIO};
+use mcap::records::op;
 use mcap::records::{Channel, Record};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{McapError, parse_record};
@@ -82,6 +83,9 @@ pub(crate) fn walk<S>(
                 reader.notify_read(read);
             }
             Ok(LinearReadEvent::Record { data, opcode }) => {
+                if opcode == op::ATTACHMENT && !is_whole_attachment(data) {
+                    return Err(McapError::UnexpectedEof.into());
+                }
                 let record = parse_record(opcode, data)?;
                 if matches!(record, Record::DataEnd(_)) {
                     is_ended = false;
@@ -97,6 +101,18 @@ pub(crate) fn walk<S>(
         }
     }
     Ok(is_ended)
+}
+
+/// Whether a record has all that goes around an attachment's data, for [`parse_record`] takes that
+/// for granted: two times, name and media type with their lengths, the data's length; then, behind
+/// the data, a checksum.
+fn is_whole_attachment(record: &[u8]) -> bool {
+    let after_text = |from: usize| {
+        let length = record.get(from..)?.first_chunk::<4>()?;
+        from.checked_add(4 + u32::from_le_bytes(*length) as usize)
+    };
+    let around = after_text(16).and_then(after_text);
+    around.is_some_and(|end| end.saturating_add(8 + 4) <= record.len())
 }
 
 /// The table that is being made.

@@ -241,6 +241,22 @@ proptest! {
     }
 }
 
+/// Lengths above all: of records, names and attachments.
+#[test]
+fn each_byte_may_be_damaged() {
+    let whole = recording(&values(&[0.5], 40), 10);
+    for place in 0..whole.len() {
+        for with in [0, 32, 255] {
+            let mut damaged = whole.clone();
+            damaged[place] = with;
+            let _ = (
+                to_table(damaged.as_slice(), Vec::new()),
+                about(damaged.as_slice()),
+            );
+        }
+    }
+}
+
 #[test]
 fn a_recording_says_what_it_is_and_has_its_files() {
     let recording = recording(&values(&[1.0], 10), 4);

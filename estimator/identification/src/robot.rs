@@ -155,15 +155,22 @@ pub(crate) fn stated_noise(cut: &SensorCut) -> [f64; 6] {
     Wrench::from_parts(cut.noise().force, cut.noise().torque).torque_first()
 }
 
-/// The degrees of freedom that move a link against the root.
-pub(crate) fn dofs_above(model: &Model, mut link: usize) -> Vec<usize> {
-    let mut dofs = Vec::new();
+/// The links from this one up to the root, which is left out.
+fn links_above(model: &Model, mut link: usize) -> Vec<usize> {
+    let mut links = Vec::new();
     while link > 0 {
-        let joint = &model.joints()[link - 1];
-        dofs.extend(joint.dof);
-        link = joint.parent;
+        links.push(link);
+        link = model.joints()[link - 1].parent;
     }
-    dofs
+    links
+}
+
+/// The degrees of freedom that move a link against the root.
+pub(crate) fn dofs_above(model: &Model, link: usize) -> Vec<usize> {
+    let links = links_above(model, link).into_iter();
+    links
+        .filter_map(|link| model.joints()[link - 1].dof)
+        .collect()
 }
 
 /// The degrees of freedom that move one of these links against the base, ascending: their joints
@@ -173,15 +180,18 @@ pub(crate) fn dofs_between(
     base: usize,
     links: &[usize],
 ) -> impl Iterator<Item = usize> + use<> {
-    let of_base = dofs_above(model, base);
+    // Joints are compared, not degrees of freedom: several may follow one.
+    let of_base = links_above(model, base);
     let mut is_between = vec![false; model.dof_count()];
     for &link in links {
-        let own = dofs_above(model, link);
-        for dof in own.iter().filter(|dof| !of_base.contains(dof)) {
-            is_between[*dof] = true;
-        }
-        for dof in of_base.iter().filter(|dof| !own.contains(dof)) {
-            is_between[*dof] = true;
+        let own = links_above(model, link);
+        let there = own.iter().filter(|link| !of_base.contains(link));
+        let back = of_base.iter().filter(|link| !own.contains(link));
+        for dof in there
+            .chain(back)
+            .filter_map(|link| model.joints()[link - 1].dof)
+        {
+            is_between[dof] = true;
         }
     }
     (0..is_between.len()).filter(move |&dof| is_between[dof])
@@ -399,5 +409,38 @@ impl Robot {
         self.contacts
             .get(contact)
             .map_or("the support of the base", |c| c.name.as_str())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A joint that follows one on the way to the base moves the links beyond it.
+    #[test]
+    fn a_joint_that_follows_another_is_between_links() {
+        let link = |name: &str| {
+            format!(
+                "<link name=\"{name}\"><inertial><mass value=\"1\"/><inertia ixx=\"1\" ixy=\"0\" \
+                 ixz=\"0\" iyy=\"1\" iyz=\"0\" izz=\"1\"/></inertial></link>"
+            )
+        };
+        let joint = |name: &str, parent: &str, child: &str, mimic: &str| {
+            format!(
+                "<joint name=\"{name}\" type=\"continuous\"><parent link=\"{parent}\"/>\
+                 <child link=\"{child}\"/><axis xyz=\"0 0 1\"/>{mimic}</joint>"
+            )
+        };
+        let text = ["a", "b", "c"].map(link).concat()
+            + &joint("first", "a", "b", "")
+            + &joint("second", "b", "c", "<mimic joint=\"first\"/>");
+        let model = Model::from_urdf(&format!("<robot name=\"r\">{text}</robot>"), &[]).unwrap();
+        assert_eq!(model.dof_count(), 1);
+        let between = |base: usize, link: usize| dofs_between(&model, base, &[link]).collect();
+        assert_eq!(
+            [between(0, 2), between(1, 2), between(2, 1)],
+            [[0]; 3].map(Vec::from)
+        );
+        assert_eq!(between(1, 1), Vec::<usize>::new());
     }
 }

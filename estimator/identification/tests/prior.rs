@@ -107,19 +107,30 @@ fn units() -> [Matrix4<f64>; 10] {
     })
 }
 
-/// Gradient of the divergence by the ten parameters, `tr((J0^-1 - J^-1) E_a)`.
+/// `L^-1`, where `J = L L^T`.
+fn whitening(pseudo_inertia: Matrix4<f64>) -> Matrix4<f64> {
+    let root = pseudo_inertia.cholesky().unwrap().l();
+    root.try_inverse().unwrap()
+}
+
+/// Gradient of the divergence by the ten parameters, `tr((J0^-1 - J^-1) E_a)`: with `J0 = L L^T`
+/// and `J = L (1 + U) L^T` it is `tr((1 - (1 + U)^-1) L^-1 E_a L^-T)`, without the difference of
+/// two inverses of nearly singular matrices.
 fn gradient(prior: &Prior, link: usize, phi: &[f64; 10]) -> [f64; 10] {
-    let inverse = |body: &RigidInertia| body.pseudo_inertia().try_inverse().unwrap();
-    let change = inverse(prior.reference(link)) - inverse(&RigidInertia::from_parameters(phi));
-    units().map(|unit| (change * unit).trace())
+    let reference = prior.reference(link).pseudo_inertia();
+    let whiten = whitening(reference);
+    let change = RigidInertia::from_parameters(phi).pseudo_inertia() - reference;
+    let one = Matrix4::identity();
+    let stretched = one + whiten * change * whiten.transpose();
+    let slope = one - stretched.cholesky().unwrap().inverse();
+    units().map(|unit| (slope * whiten * unit * whiten.transpose()).trace())
 }
 
 /// Hessian of the divergence by the ten parameters, `tr(J^-1 E_a J^-1 E_b)`.
 fn hessian(phi: &[f64; 10]) -> SMatrix<f64, 10, 10> {
-    let body = RigidInertia::from_parameters(phi).pseudo_inertia();
-    let inverse = body.try_inverse().unwrap();
-    let products = units().map(|unit| inverse * unit);
-    SMatrix::from_fn(|a, b| (products[a] * products[b]).trace())
+    let whiten = whitening(RigidInertia::from_parameters(phi).pseudo_inertia());
+    let whitened = units().map(|unit| whiten * unit * whiten.transpose());
+    SMatrix::from_fn(|a, b| (whitened[a] * whitened[b]).trace())
 }
 
 /// Gradient of the cost, and the size of its terms.

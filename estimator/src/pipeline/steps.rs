@@ -191,7 +191,9 @@ impl StepCover {
             let Some(change) = step.change() else {
                 continue;
             };
-            let own = structure.subtrees()[number].contacts.intersection(lingering);
+            let own = structure.subtrees()[number]
+                .contacts
+                .intersection(lingering);
             self.contacts = self.contacts.union(&own);
             self.readings.copy_from_slice(readings);
             let Some(reading) = self.readings.get_mut(step.sensor) else {

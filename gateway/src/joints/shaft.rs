@@ -58,7 +58,7 @@ impl Takes {
     }
 }
 
-/// A input of a shaft while it runs.
+/// An input of a shaft while it runs.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct RunningInput {
     takes: Takes,

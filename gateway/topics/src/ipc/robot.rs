@@ -746,15 +746,15 @@ impl Attacher {
     }
 
     fn look(&mut self, now: Nanos) -> Missing {
-        let mut problem = match self.renew_domain() {
-            Ok(()) => self.open_ports(),
-            Err(problem) => Some(problem),
-        };
-        let Some(domain) = &self.domain else {
+        if let Err(problem) = self.renew_domain() {
             return Missing {
-                problem,
+                problem: Some(problem),
                 ..Missing::default()
             };
+        }
+        let mut problem = self.open_ports();
+        let Some(domain) = &self.domain else {
+            return Missing::default();
         };
         let robot = &self.robot;
         let gateway = self.gateway.look(domain, robot, now);
