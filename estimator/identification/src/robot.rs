@@ -436,7 +436,8 @@ mod tests {
             + &joint("second", "b", "c", "<mimic joint=\"first\"/>");
         let model = Model::from_urdf(&format!("<robot name=\"r\">{text}</robot>"), &[]).unwrap();
         assert_eq!(model.dof_count(), 1);
-        let between = |base: usize, link: usize| dofs_between(&model, base, &[link]).collect();
+        let between =
+            |base: usize, link: usize| dofs_between(&model, base, &[link]).collect::<Vec<usize>>();
         assert_eq!(
             [between(0, 2), between(1, 2), between(2, 1)],
             [[0]; 3].map(Vec::from)
