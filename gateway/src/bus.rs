@@ -1,7 +1,7 @@
 //! The data plane of one bus: the loop that moves frames from the link through the devices to the
 //! sink and sends the devices' frames. One thread owns it. After start it allocates nothing but the
 //! 48 bytes with which iceoryx2 lends each payload, takes no lock, and waits only for frames, at
-//! most [`MAX_TURN`] at a time. (But if the domain is damaged, the sink makes its port anew.)
+//! most `MAX_TURN` at a time. (But if the domain is damaged, the sink makes its port anew.)
 //!
 //! **Time.** Before a frame is processed, the devices are advanced to its stamp; when no frame is
 //! waiting, to the clock. After a stall, frames that wait are thus no silence, and a silence
@@ -276,7 +276,7 @@ impl<S: Sink> Bus<S> {
         self.queue.retry = Nanos::MIN;
     }
 
-    /// Stops the devices, within [`STOP_TIME`].
+    /// Stops the devices, within `STOP_TIME`.
     pub fn stop(&mut self, clock: &impl Clock) {
         let now = clock.now();
         // A device that took over now would start its board again.

@@ -140,7 +140,7 @@ pub fn realtime_offset() -> Nanos {
 /// second estimates the offset plus the shortest delay. The estimate follows the drift of the
 /// adapter's clock; with a drift of 50 ppm its error is at most 50 us.
 ///
-/// A frame whose stamps disagree by more than [`HardwareToMonotonic::LONGEST_WAY`] is not
+/// A frame whose stamps disagree by more than `HardwareToMonotonic::LONGEST_WAY` is not
 /// converted: the adapter's clock has been set. If it was set forward (the difference falls), the
 /// estimate starts again; if back, the old offset expires after a second.
 #[derive(Debug, Clone)]

@@ -1,5 +1,5 @@
 //! The share of a bus's time that frames take. [`of_bus`] is what its devices need, from their own
-//! frames: `--check` shows it, and a configuration that cannot work is refused by it. [`Meter`] is
+//! frames: `--check` shows it, and a configuration that cannot work is refused by it. `Meter` is
 //! what is measured while the gateway runs.
 
 use proprio_drivers::{
