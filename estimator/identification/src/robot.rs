@@ -173,13 +173,9 @@ pub(crate) fn dofs_above(model: &Model, link: usize) -> Vec<usize> {
         .collect()
 }
 
-/// The degrees of freedom that move one of these links against the base, ascending: their joints
-/// are on a path between them.
-pub(crate) fn dofs_between(
-    model: &Model,
-    base: usize,
-    links: &[usize],
-) -> impl Iterator<Item = usize> + use<> {
+/// Per degree of freedom, whether it moves one of these links against the base: one of its joints
+/// is on a path between them.
+pub(crate) fn is_between(model: &Model, base: usize, links: &[usize]) -> Vec<bool> {
     // Joints are compared, not degrees of freedom: several may follow one.
     let of_base = links_above(model, base);
     let mut is_between = vec![false; model.dof_count()];
@@ -194,7 +190,17 @@ pub(crate) fn dofs_between(
             is_between[dof] = true;
         }
     }
-    (0..is_between.len()).filter(move |&dof| is_between[dof])
+    is_between
+}
+
+/// The degrees of freedom that move one of these links against the base, ascending.
+pub(crate) fn dofs_between(
+    model: &Model,
+    base: usize,
+    links: &[usize],
+) -> impl Iterator<Item = usize> + use<> {
+    let all = is_between(model, base, links).into_iter().enumerate();
+    all.filter_map(|(dof, is_between)| is_between.then_some(dof))
 }
 
 impl Robot {

@@ -25,20 +25,6 @@ fn bad_rows_are_named_and_take_nothing_else_with_them() {
     set(&mut lines, 50, 0, "soon");
     place.write("good.csv", &without(&log, &[10, 20, 30, 40, 50]));
     place.write("bad.csv", &(lines.join("\n") + "\n"));
-    let estimate = |log: &str, out: &str| {
-        place
-            .run(&[
-                "estimate",
-                "--config",
-                "estimator.toml",
-                "--log",
-                log,
-                "--out",
-                out,
-                "--json",
-            ])
-            .good()
-    };
     let assess = [
         "estimate",
         "--config",
@@ -69,14 +55,14 @@ fn bad_rows_are_named_and_take_nothing_else_with_them() {
         assessment["predicted"]["relative_error"]["cad"].is_null(),
         "{told}"
     );
-    let clean = estimate("good.csv", "good.out");
+    let clean = place.estimate("good.csv", "good.out");
     assert_eq!(
         place.read("a.out"),
         place.read("good.out"),
         "figures change no estimate"
     );
     assert!(clean.err.is_empty(), "{}", clean.err);
-    let dirty = estimate("bad.csv", "bad.out");
+    let dirty = place.estimate("bad.csv", "bad.out");
     assert_eq!(
         place.read("good.out"),
         place.read("bad.out"),
@@ -166,19 +152,7 @@ fn faults_and_gaps_of_a_log_are_in_its_table_of_samples() {
         gap.len() == 1 && (3.0..3.1).contains(&gap[0]),
         "one reading after the lost half: {gap:?}"
     );
-    let told = place
-        .run(&[
-            "estimate",
-            "--config",
-            "estimator.toml",
-            "--log",
-            "samples.csv",
-            "--out",
-            "estimates.csv",
-            "--json",
-        ])
-        .good()
-        .json();
+    let told = place.estimate("samples.csv", "estimates.csv").json();
     let withheld = told["withheld_by_reason"].as_object().unwrap();
     let sum: u64 = withheld.values().map(|count| count.as_u64().unwrap()).sum();
     assert!(withheld["device_fault"].as_u64().unwrap() > 1000, "{told}");
@@ -217,22 +191,8 @@ fn stamps_that_go_backwards_are_counted_and_take_nothing_else_with_them() {
     worse.insert(120, lines[99]);
     place.write("good.csv", &log);
     place.write("bad.csv", &(worse.join("\n") + "\n"));
-    let estimate = |log: &str, out: &str| {
-        place
-            .run(&[
-                "estimate",
-                "--config",
-                "estimator.toml",
-                "--log",
-                log,
-                "--out",
-                out,
-                "--json",
-            ])
-            .good()
-    };
-    estimate("good.csv", "good.out");
-    let dirty = estimate("bad.csv", "bad.out");
+    place.estimate("good.csv", "good.out");
+    let dirty = place.estimate("bad.csv", "bad.out");
     assert_same(&place.read("good.out"), &place.read("bad.out"), "estimates");
     let json = dirty.json();
     assert_eq!(
@@ -541,19 +501,7 @@ fn encode_and_decode_are_inverses_within_half_a_step() {
         (&201.into(), &(201 * 9).into(), &0.into()),
         "{told}"
     );
-    let told = place
-        .run(&[
-            "decode",
-            "--config",
-            "gateway.toml",
-            "--log",
-            "session.log",
-            "--out",
-            "again.csv",
-            "--json",
-        ])
-        .good()
-        .json();
+    let told = place.decode("session.log", "again.csv").json();
     assert_eq!(
         (&told["samples"], &told["bad_lines"], &told["unclaimed"]),
         (&(201 * 9).into(), &0.into(), &0.into()),
@@ -756,19 +704,7 @@ fn a_decoded_session_is_the_simulators_truth() {
         ..SimulationSettings::default()
     };
     place.write("session.log", &session(4.0, &settings));
-    let told = place
-        .run(&[
-            "decode",
-            "--config",
-            "gateway.toml",
-            "--log",
-            "session.log",
-            "--out",
-            "s.csv",
-            "--json",
-        ])
-        .good()
-        .json();
+    let told = place.decode("session.log", "s.csv").json();
     for device in told["devices"].as_array().unwrap() {
         assert!(
             device["refusal"].is_null() && device["counts"].as_object().unwrap().is_empty(),

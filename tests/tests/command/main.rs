@@ -146,6 +146,24 @@ impl Place {
             .collect()
     }
 
+    /// Estimates from a table; the summary.
+    fn estimate(&self, log: &str, out: &str) -> Ran {
+        let config = "estimator.toml";
+        let args = [
+            "estimate", "--config", config, "--log", log, "--out", out, "--json",
+        ];
+        self.run(&args).good()
+    }
+
+    /// Decodes a log of frames; the summary.
+    fn decode(&self, log: &str, out: &str) -> Ran {
+        let config = "gateway.toml";
+        let args = [
+            "decode", "--config", config, "--log", log, "--out", out, "--json",
+        ];
+        self.run(&args).good()
+    }
+
     /// `proprio` in this folder and its domain; a run's own temporary files go to its folder `tmp`.
     fn command(&self, args: &[&str]) -> Command {
         let mut command = self.rig.command(args);

@@ -32,7 +32,7 @@ use crate::dataset::observation::{Annotated, Observation, UnitSet};
 use crate::dataset::stream::range;
 use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::{ExtraParameter, FRICTION, Unknowns, friction_row};
-use crate::robot::{IdentificationInput, Robot, TorqueSide, dofs_between};
+use crate::robot::{IdentificationInput, Robot, TorqueSide, is_between};
 use nalgebra::{DVector, Matrix6, Vector6};
 use proprio_dynamics::calibration::{Kind, Unknown};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
@@ -523,11 +523,6 @@ impl<'a> MeasurementModel<'a> {
                 .filter(|unit| *unit < structure.subtrees().len());
             touched.extend(subtrees.flat_map(|unit| structure.links_of(unit)));
         }
-        let model = &self.robot.model;
-        let mut blocked = vec![false; model.dof_count()];
-        for dof in dofs_between(model, self.kinematics.base(), &touched) {
-            blocked[dof] = true;
-        }
-        blocked
+        is_between(&self.robot.model, self.kinematics.base(), &touched)
     }
 }
