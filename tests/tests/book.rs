@@ -43,7 +43,7 @@ proprio help topics
 
 == first.md
 proprio demo
-    elsewhere tests/tests/command.rs: fn a_demonstration_ends_well: needs the machine for itself
+    elsewhere tests/tests/command/demo.rs: fn a_demonstration_ends_well: needs the machine for itself
 proprio status
     shows device l_elbow_motor streaming
     shows estimates/s
@@ -188,7 +188,7 @@ source <(proprio completions bash)
 
 == commissioning/steps.md
 sudo ip link set can0
-    elsewhere tests/tests/vcan.rs: fn interfaces_go_and_come_back: needs root and CAN
+    elsewhere tests/tests/vcan/main.rs: fn interfaces_go_and_come_back: needs root and CAN
 proprio doctor
     shows CAN interfaces
 proprio scan --bus can0
@@ -290,11 +290,11 @@ sudo proprio install
 
 == figures/truth.md
 cargo run
-    elsewhere tests/tests/command.rs: fn a_demonstration_with_faults: needs the machine for itself
+    elsewhere tests/tests/command/demo.rs: fn a_demonstration_with_faults: needs the machine for itself
 
 == ../../../README.md
 cargo run
-    elsewhere tests/tests/command.rs: fn a_demonstration_ends_well: needs the machine for itself
+    elsewhere tests/tests/command/demo.rs: fn a_demonstration_ends_well: needs the machine for itself
 cargo install cargo-deb
     elsewhere tests/run: cargo-deb --version: builds for minutes
 cargo deb
