@@ -42,6 +42,8 @@ impl ChannelBuffer {
 pub(super) struct Sanity {
     repeats: Repeats<6>,
     jumps: Jumps<6>,
+    /// Of measured derivatives: velocity and acceleration, or angular acceleration.
+    derivatives: Jumps<3>,
     is_encoder: bool,
     /// An encoder's readings repeat themselves as its noise makes impossible, or since it stopped
     /// at once.
@@ -67,6 +69,7 @@ impl Sanity {
         Self {
             repeats: Repeats::default(),
             jumps: Jumps::new(peaks),
+            derivatives: Jumps::default(),
             is_encoder: false,
             is_still: false,
             is_stuck: false,
@@ -88,6 +91,22 @@ impl Sanity {
     /// Whether the last reading does not continue the motion of those before.
     pub(super) fn has_stepped(&self) -> bool {
         self.jumps.has_stepped()
+    }
+
+    /// The measured derivatives at `t`, NaN where there are none: none of them if one cannot be
+    /// true. They then are what the value itself shows.
+    pub(super) fn derivatives(
+        &mut self,
+        t: Nanos,
+        measured: [f64; 3],
+        quality: Quality,
+    ) -> [f64; 3] {
+        // One that stops at once does so with the value itself, which is judged.
+        let is_doubtful = self.derivatives.look(t, &measured, quality);
+        match is_doubtful && !self.derivatives.has_stopped() {
+            true => [f64::NAN; 3],
+            false => measured,
+        }
     }
 
     /// The flags of a reading at `t`, NaN where it has fewer than six values, with `quality` as its

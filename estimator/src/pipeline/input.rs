@@ -210,6 +210,14 @@ impl Arrival<'_> {
         }
     }
 
+    /// Its measured derivatives, as far as they can be true.
+    fn derivatives(&mut self, measured: [f64; 3]) -> [f64; 3] {
+        match &mut self.sanity {
+            Some(sanity) => sanity.derivatives(self.t, measured, self.quality),
+            None => measured,
+        }
+    }
+
     /// Whether it continues those before it.
     fn is_continued(&self) -> bool {
         !self.quality.intersects(Quality::ZERO_CHANGED)
@@ -238,7 +246,8 @@ impl Arrival<'_> {
                 [j.position],
                 Reason::of_quality(quality, Quality::UNTRUSTED_ENCODER),
             );
-            history.push(self.t, [j.position, j.velocity, j.acceleration], quality);
+            let [velocity, acceleration, _] = self.derivatives([j.velocity, j.acceleration, NONE]);
+            history.push(self.t, [j.position, velocity, acceleration], quality);
         }
         fate
     }
@@ -276,7 +285,7 @@ impl Arrival<'_> {
             let fault = Reason::of_quality(quality, Quality::DEVICE_FAULT);
             self.predict(predictor, &i.proper_acceleration, fault);
             differentiate(window, self.t, i.angular_velocity, fault);
-            let [bx, by, bz] = i.angular_acceleration;
+            let [bx, by, bz] = self.derivatives(i.angular_acceleration);
             history.push(self.t, [ax, ay, az, gx, gy, gz, bx, by, bz], quality);
         }
         fate

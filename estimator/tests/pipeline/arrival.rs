@@ -269,3 +269,49 @@ fn a_gap_of_everything_does_not_reach_back() {
         }
     }
 }
+
+/// Drives report velocities with their positions, and a bit of one may be wrong.
+#[test]
+fn a_measured_velocity_that_cannot_be_true_is_as_if_not_measured() {
+    let begin = setup(|_| {});
+    // The joints and the sensor at the same instants: there a measured velocity is used as it is.
+    let mut events = recording_with(&begin, 1.0, |_| 0.0);
+    let joint = begin.robot.channel(Kind::Joint, "l_elbow").unwrap();
+    let mut last = None;
+    for (channel, t, reading, _) in &mut events {
+        if let (true, Reading::Joint(state)) = (*channel == joint, reading) {
+            if let Some((then, before)) = last {
+                state.velocity = (state.position - before) / (*t - then).seconds();
+            }
+            last = Some((*t, state.position));
+        }
+    }
+    let (true_ones, _) = run(begin, &events);
+    let mut own: Vec<&mut Reading> = (events.iter_mut())
+        .filter(|event| event.0 == joint && event.1 > Nanos::from_millis(500))
+        .map(|event| &mut event.2)
+        .collect();
+    for (number, wrong) in [(0, 60.0), (25, -60.0), (50, f64::MAX)] {
+        let Reading::Joint(state) = &mut *own[number] else {
+            panic!("a joint");
+        };
+        state.velocity = wrong;
+    }
+    let (estimates, pipeline) = run(setup(|_| {}), &events);
+    assert_eq!(pipeline.counts().not_finite, 0);
+    for (one, other) in true_ones.iter().zip(&estimates) {
+        for (one, other) in one.torques.joints().iter().zip(other.torques.joints()) {
+            assert_eq!(one.valid, other.valid);
+            let apart = (one.torque - other.torque).abs();
+            assert!(!(apart > 0.05), "{apart} Nm at {:?}", one);
+        }
+    }
+    // They are of those instants, not of none.
+    assert!(
+        estimates
+            .iter()
+            .filter(|one| one.t > Nanos::from_millis(500))
+            .count()
+            > 400
+    );
+}

@@ -63,8 +63,9 @@ pub(crate) struct ComponentJob {
     /// The sensitivities of the previous second's means to the bodies, a column per channel, and
     /// the parameters used for them.
     pub(crate) before: Option<(DMatrix<f64>, Vec<f64>)>,
-    /// The variances with which the rows are whitened.
+    /// The variances with which the rows are whitened, from this slot on.
     pub(crate) whitened: Vec<f64>,
+    pub(crate) whitened_from: i64,
     pub(crate) drift_rates: Vec<f64>,
     pub(crate) period: f64,
     pub(crate) tau: f64,
@@ -112,6 +113,16 @@ impl SlotRange {
         (count <= LONGEST).then_some(Self { first, count })
     }
 
+    /// The part of it from this slot on, if there is any.
+    fn from(self, first: i64) -> Option<Self> {
+        let end = self.first + self.count as i64;
+        let first = self.first.max(first);
+        let count = usize::try_from(end - first)
+            .ok()
+            .filter(|count| *count > 0)?;
+        Some(Self { first, count })
+    }
+
     pub(crate) fn place(&self, slot: i64) -> Option<usize> {
         usize::try_from(slot - self.first)
             .ok()
@@ -140,6 +151,7 @@ impl ComponentJob {
             channels: component.layout.trackers(period.seconds()),
             before: None,
             whitened: component.variances.clone(),
+            whitened_from: i64::MIN,
             drift_rates: component.drift_rates.clone(),
             period: period.seconds(),
             tau: prior.expected_tau(),
@@ -353,12 +365,13 @@ impl ComponentJob {
         let rows = [&self.learnt, &self.rejected_rows];
         let is_solved =
             self.estimate.len() == unknowns && self.newest.root.ncols() + offset_count == unknowns;
-        let Some(span) = SlotRange::of(rows.into_iter()).filter(|_| is_solved) else {
+        let span = SlotRange::of(rows.into_iter()).filter(|_| is_solved);
+        let Some(span) = span.and_then(|span| span.from(self.whitened_from)) else {
             return self.take_seconds(&seconds);
         };
         let observations = span.count;
         let (series, shown) = self.series(&rows, &span, &self.estimate);
-        let mut sensitivities = self.sensitivities(&rows);
+        let mut sensitivities = self.sensitivities(&rows, &span);
         let counts: Vec<f64> = (series.chunks_exact(observations))
             .map(|own| own.iter().filter(|x| x.is_finite()).count() as f64)
             .collect();
@@ -466,13 +479,15 @@ impl ComponentJob {
 
     /// The sensitivity of each channel's share, summed over observations, to the bodies: its column
     /// of rows^T x weights.
-    pub(crate) fn sensitivities(&self, rows: &[&RowBuffer]) -> DMatrix<f64> {
+    pub(crate) fn sensitivities(&self, rows: &[&RowBuffer], span: &SlotRange) -> DMatrix<f64> {
         let (offset_count, unknowns) = (self.variances.len(), self.information.unknowns());
         let mut sensitivities = DMatrix::zeros(unknowns - offset_count, offset_count);
         for rows in rows {
             for (kind, rows) in self.layout.columns.iter().zip(rows.iter()) {
-                let (width, count) = (kind.width(), rows.slots().len());
-                let all = DMatrixView::from_slice(rows.values(), width, count);
+                let width = kind.width();
+                let before = rows.slots().partition_point(|slot| *slot < span.first);
+                let count = rows.slots().len() - before;
+                let all = DMatrixView::from_slice(&rows.values()[width * before..], width, count);
                 let weights = DMatrix::from_fn(count, kind.offsets, |row, place| {
                     self.whitened[kind.columns[place]] * all[(place, row)]
                 });
