@@ -11,8 +11,8 @@ use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Supervised, Supervision};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, Output, OutputInfo, Spec, SpecError, bytes, keys,
-    wrench,
+    Claim, Decoded, Device, Driver, Frame, Id, OutputInfo, Spec, SpecError, StampedReading, bytes,
+    keys, wrench,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -159,12 +159,12 @@ impl Family for Aft {
         let mut quality = Quality::GOOD;
         let force = axes(first, NEWTON, 0, &mut quality);
         let torque = axes(second, NEWTON_METRE, 3, &mut quality);
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
-            ..Output::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
+            ..StampedReading::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        link.give(output, frame, out);
+        link.give(stamped, frame, out);
     }
 
     fn reset(&mut self) {

@@ -15,7 +15,8 @@ use crate::family::{Family, Supervised, Supervision};
 use crate::objects::Objects;
 use crate::signal::Bits;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, Id, Mode, OutputInfo, Spec, SpecError, StampedReading,
+    bytes,
 };
 use alloc::boxed::Box;
 use alloc::format;
@@ -409,12 +410,12 @@ impl Encoder {
             position: counts as f64 / counts_per_turn * TAU,
             ..JointState::ABSENT
         });
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
-            ..Output::new(0, frame, quality, reading)
+            ..StampedReading::new(0, frame, quality, reading)
         };
-        link.give(output, frame, out);
+        link.give(stamped, frame, out);
     }
 }
 

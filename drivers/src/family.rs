@@ -8,7 +8,7 @@
 use crate::bringup::{Bringup, Inquiry};
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
-    NotSent, Output, State, Transmit,
+    NotSent, StampedReading, State, Transmit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -162,7 +162,8 @@ pub(crate) fn count_faults(quality: Quality, frame: &Frame, out: &mut Decoded) {
 pub(crate) fn temperature(output: u8, celsius: f64, frame: &Frame, out: &mut Decoded) {
     if celsius.is_finite() {
         let reading = Reading::Temperature(Temperature { celsius });
-        out.push(Output::new(output, frame, Quality::GOOD, reading), frame.id);
+        let stamped = StampedReading::new(output, frame, Quality::GOOD, reading);
+        out.push(stamped, frame.id);
     }
 }
 
@@ -188,17 +189,18 @@ impl<Q: Inquiry> Supervision<Q> {
         out: &mut Decoded,
     ) {
         let reading = Reading::Joint(state);
-        self.give(Output::new(output, frame, quality, reading), frame, out);
+        let stamped = StampedReading::new(output, frame, quality, reading);
+        self.give(stamped, frame, out);
     }
 
     /// Adds a main reading that `frame` completes, counts the faults in its quality, and marks the
     /// first one after a gap.
-    pub(crate) fn give(&mut self, mut output: Output, frame: &Frame, out: &mut Decoded) {
-        count_faults(output.quality, frame, out);
+    pub(crate) fn give(&mut self, mut stamped: StampedReading, frame: &Frame, out: &mut Decoded) {
+        count_faults(stamped.quality, frame, out);
         if self.bringup.reading(frame.t) {
-            output.quality |= Quality::GAP_BEFORE;
+            stamped.quality |= Quality::GAP_BEFORE;
         }
-        out.push(output, frame.id);
+        out.push(stamped, frame.id);
     }
 
     /// Readings were lost: they are counted, and the next one is marked.

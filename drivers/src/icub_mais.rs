@@ -10,7 +10,8 @@ use crate::bringup::{Bringup, NoInquiry};
 use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Outputs, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, OutputInfo, Outputs, Spec, SpecError, StampedReading,
+    bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -121,7 +122,8 @@ impl Family for Mais {
                 position: f64::from(*count),
                 ..JointState::ABSENT
             });
-            out.push(Output::new(output, frame, quality, reading), frame.id);
+            let stamped = StampedReading::new(output, frame, quality, reading);
+            out.push(stamped, frame.id);
         }
     }
 }

@@ -12,8 +12,8 @@ use crate::held::HeldValue;
 use crate::icub::{self, class};
 use crate::icub_motor::mode;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Outputs, Spec, SpecError,
-    bytes,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Outputs, Spec, SpecError,
+    StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -201,7 +201,8 @@ impl Mc4 {
                 velocity: joint.velocity.at(frame, self.hold),
                 ..JointState::ABSENT
             });
-            out.push(Output::new(output, frame, quality, reading), frame.id);
+            let stamped = StampedReading::new(output, frame, quality, reading);
+            out.push(stamped, frame.id);
         }
     }
 
@@ -222,7 +223,8 @@ impl Mc4 {
                 faults,
             });
             if self.outputs.0.contains(&output) {
-                out.push(Output::new(output, frame, joint.status, reading), frame.id);
+                let stamped = StampedReading::new(output, frame, joint.status, reading);
+                out.push(stamped, frame.id);
             }
         }
     }

@@ -10,7 +10,7 @@ use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -182,10 +182,8 @@ impl TwoFoc {
             faults: bytes::u32_le(data, 4),
         };
         self.status = quality_of(&actuator);
-        out.push(
-            Output::new(0, frame, self.status, Reading::Actuator(actuator)),
-            frame.id,
-        );
+        let stamped = StampedReading::new(0, frame, self.status, Reading::Actuator(actuator));
+        out.push(stamped, frame.id);
     }
 }
 

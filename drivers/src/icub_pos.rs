@@ -11,7 +11,8 @@ use crate::configure::{Configure, Setting};
 use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Outputs, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, OutputInfo, Outputs, Spec, SpecError, StampedReading,
+    bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -274,8 +275,8 @@ impl Family for Pos {
                 position,
                 ..JointState::ABSENT
             });
-            let output = Output::new(output, frame, quality, reading);
-            out.push(output, frame.id);
+            let stamped = StampedReading::new(output, frame, quality, reading);
+            out.push(stamped, frame.id);
         }
     }
 }

@@ -10,7 +10,9 @@ use crate::bringup::{Bringup, NoInquiry};
 use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
-use crate::{Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Spec, SpecError, bytes};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError, StampedReading, bytes,
+};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Skin};
@@ -232,12 +234,12 @@ impl Family for SkinPatch {
         }
         self.gap &= !bit;
         self.seen |= bit;
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
-            ..Output::new(0, frame, quality, Reading::Skin(skin))
+            ..StampedReading::new(0, frame, quality, Reading::Skin(skin))
         };
-        out.push(output, frame.id);
+        out.push(stamped, frame.id);
     }
 
     fn reset(&mut self) {

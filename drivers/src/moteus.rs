@@ -11,8 +11,8 @@ use crate::bytes::{self, i16_le, u32_le};
 use crate::family::{Family, Supervised, Supervision, next_in_step};
 use crate::held::OnChange;
 use crate::{
-    Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, NotSent, Output, OutputInfo, Spec,
-    SpecError,
+    Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, NotSent, OutputInfo, Spec, SpecError,
+    StampedReading,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -386,13 +386,15 @@ impl Family for MoteusController {
                 encoder: 0,
                 faults: self.fault,
             });
-            out.push(Output::new(0, frame, self.quality(), reading), frame.id);
+            let stamped = StampedReading::new(0, frame, self.quality(), reading);
+            out.push(stamped, frame.id);
         }
         if let Some(celsius) = told.temperature.filter(|celsius| celsius.is_finite())
             && self.temperature.is_due((), frame)
         {
             let reading = Reading::Temperature(Temperature { celsius });
-            out.push(Output::new(0, frame, Quality::GOOD, reading), frame.id);
+            let stamped = StampedReading::new(0, frame, Quality::GOOD, reading);
+            out.push(stamped, frame.id);
         }
         let Some(position) = told.position else {
             return;

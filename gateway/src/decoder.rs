@@ -7,7 +7,8 @@ use crate::joints::{Joints, ShaftState};
 use crate::plan::{BusPlan, DevicePlan, OutputPlan};
 use crate::status::BusStatus;
 use proprio_drivers::{
-    Claim, CommandFailed, Decoded, Device, Frame, Mode, NotSent, Output, SpecError, State, Transmit,
+    Claim, CommandFailed, Decoded, Device, Frame, Mode, NotSent, SpecError, StampedReading, State,
+    Transmit,
 };
 use proprio_topics::sanity::Repeats;
 use proprio_topics::{
@@ -104,7 +105,7 @@ impl Channels {
         &mut self,
         number: u16,
         running: &mut Running,
-        reading: &Output,
+        reading: &StampedReading,
         publish: &mut impl FnMut(&mut Sample),
     ) {
         let mut outputs = running.outputs.iter().zip(&mut running.repeats);
@@ -163,7 +164,7 @@ impl Channels {
 
     /// The flags of a reading that is no joint's state; `None`: it is a main reading whose stamp
     /// runs backward.
-    fn quality(&mut self, output: &OutputPlan, reading: &Output) -> Option<Quality> {
+    fn quality(&mut self, output: &OutputPlan, reading: &StampedReading) -> Option<Quality> {
         let mut quality = match &output.input {
             Some(input) => self.joints.flags(input, reading.quality),
             None => reading.quality,

@@ -34,7 +34,7 @@ pub use wrap::Wrap;
 
 use crate::config::JointQuantity;
 use coupling::CoupledMotors;
-use proprio_drivers::Output;
+use proprio_drivers::StampedReading;
 use proprio_topics::{JointState, Nanos, Quality};
 use shaft::{RunningInput, Shaft};
 
@@ -276,25 +276,25 @@ impl Joints {
         }
     }
 
-    /// Takes the reading `output` of a device, with its `state`, through the gear `map`; calls
+    /// Takes the reading `stamped` of a device, with its `state`, through the gear `map`; calls
     /// `publish` with the channel of each sample that it completes. False: its stamp runs backward,
     /// and it was not taken.
     pub(crate) fn push(
         &mut self,
         at: &ShaftInput,
         map: &JointMap,
-        output: &Output,
+        stamped: &StampedReading,
         mut state: JointState,
         mut publish: impl FnMut(u32, &ShaftState),
     ) -> bool {
         let Some(input) = self.input(at) else {
             return true;
         };
-        if output.acquired < input.last {
+        if stamped.acquired < input.last {
             return false;
         }
-        input.last = output.acquired;
-        let mut quality = output.quality;
+        input.last = stamped.acquired;
+        let mut quality = stamped.quality;
         if std::mem::take(&mut input.replaced) {
             input.turns = wrap::Turns::default();
             quality |= Quality::GAP_BEFORE | Quality::ZERO_CHANGED;
@@ -303,16 +303,16 @@ impl Joints {
             let trusted = !quality.intersects(Quality::UNTRUSTED_ENCODER);
             let anew;
             (state.position, anew) =
-                (input.turns).unwrap(wrap, output.acquired, state.position, trusted);
+                (input.turns).unwrap(wrap, stamped.acquired, state.position, trusted);
             if anew {
                 quality |= Quality::GAP_BEFORE | Quality::ZERO_CHANGED;
             }
         }
         let measured = ShaftState {
-            acquired: output.acquired,
-            stamp: output.stamp,
-            device_time: output.device_time,
-            device_counter: output.device_counter,
+            acquired: stamped.acquired,
+            stamp: stamped.stamp,
+            device_time: stamped.device_time,
+            device_counter: stamped.device_counter,
             quality,
             state: map.joint(state),
             max_silence: input.max_silence,

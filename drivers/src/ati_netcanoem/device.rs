@@ -9,7 +9,7 @@ use crate::family::{Family, Supervised, Supervision, next_in_step};
 use crate::pairing::within;
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Driver, Frame,
-    Mode, NotSent, Output, OutputInfo, Spec, SpecError,
+    Mode, NotSent, OutputInfo, Spec, SpecError, StampedReading,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -175,12 +175,12 @@ fn give(
     if first.status & STATUS_FAULTS != 0 || unnamed || !is_trusted {
         quality |= Quality::DEVICE_FAULT;
     }
-    let output = Output {
+    let stamped = StampedReading {
         acquired: first.t,
         stamp: first.stamp,
-        ..Output::new(0, frame, quality, reading)
+        ..StampedReading::new(0, frame, quality, reading)
     };
-    link.give(output, frame, out);
+    link.give(stamped, frame, out);
 }
 
 impl Driver for AtiNetcanoemOptions {

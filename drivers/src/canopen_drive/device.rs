@@ -10,7 +10,7 @@ use crate::canopen::{
 use crate::family::{Family, Supervised, Supervision};
 use crate::objects::Objects;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, Output, OutputInfo, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, Id, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -209,7 +209,8 @@ impl CanopenDrive {
                 encoder: self.last.status,
                 faults: self.last.error.unwrap_or(u32::from(self.state.error)),
             });
-            out.push(Output::new(0, frame, self.quality(), reading), frame.id);
+            let stamped = StampedReading::new(0, frame, self.quality(), reading);
+            out.push(stamped, frame.id);
         }
         if table.alone & bit != 0 {
             let at = |bit: u8| bit.trailing_zeros() as usize;
@@ -296,9 +297,9 @@ impl CanopenDrive {
             current,
             ..JointState::ABSENT
         });
-        let mut output = Output::new(0, frame, self.quality(), reading);
-        (output.acquired, output.stamp) = measured.unwrap_or((frame.t, frame.stamp));
-        link.give(output, frame, out);
+        let mut stamped = StampedReading::new(0, frame, self.quality(), reading);
+        (stamped.acquired, stamped.stamp) = measured.unwrap_or((frame.t, frame.stamp));
+        link.give(stamped, frame, out);
     }
 }
 

@@ -6,7 +6,8 @@ use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Supervised, Supervision, temperature};
 use crate::held::OnChange;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading,
+    bytes, mit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -33,7 +34,8 @@ impl CubemarsMotor {
             faults: u32::from(stage.error),
         });
         let quality = quality_of(stage.error);
-        out.push(Output::new(JOINT, frame, quality, actuator), frame.id);
+        let stamped = StampedReading::new(JOINT, frame, quality, actuator);
+        out.push(stamped, frame.id);
         temperature(DRIVE, stage.celsius, frame, out);
     }
 }

@@ -9,7 +9,8 @@ use crate::bringup::{Bringup, Timing};
 use crate::family::{Family, Rounds, Supervised, Supervision, temperature};
 use crate::held::OnChange;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading,
+    bytes, mit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -45,7 +46,8 @@ impl DamiaoMotor {
                 encoder: u32::from(state == SENSOR),
                 faults: u32::from(faults),
             });
-            out.push(Output::new(JOINT, frame, quality, actuator), frame.id);
+            let stamped = StampedReading::new(JOINT, frame, quality, actuator);
+            out.push(stamped, frame.id);
             for (output, celsius) in [FET, MOTOR].into_iter().zip(told.celsius) {
                 temperature(output, f64::from(celsius), frame, out);
             }

@@ -8,7 +8,8 @@ use crate::family::{Family, Supervised, Supervision};
 use crate::pairing::within;
 use crate::signal::Message;
 use crate::{
-    Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, Output, OutputInfo, Spec, SpecError,
+    Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, OutputInfo, Spec, SpecError,
+    StampedReading,
 };
 use alloc::borrow::Cow;
 use alloc::boxed::Box;
@@ -222,7 +223,7 @@ impl Assembly {
         after_silence: bool,
         frame: &Frame,
         out: &mut Decoded,
-    ) -> Option<Output> {
+    ) -> Option<StampedReading> {
         let mut quality = Quality::GOOD;
         if self.fault {
             quality |= Quality::DEVICE_FAULT;
@@ -265,11 +266,11 @@ impl Assembly {
         };
         #[allow(clippy::cast_possible_truncation)] // the number of such a device's readings
         let device_counter = self.count.unwrap_or(0) as u32;
-        Some(Output {
+        Some(StampedReading {
             acquired: self.t,
             stamp: self.stamp,
             device_counter,
-            ..Output::new(number, frame, quality, reading)
+            ..StampedReading::new(number, frame, quality, reading)
         })
     }
 }
@@ -359,8 +360,8 @@ impl Family for DbcDevice {
             }
             let after_silence = link.bringup.reading(frame.t);
             let number = u8::try_from(part.reading).unwrap_or(u8::MAX);
-            if let Some(output) = assembly.finish(number, after_silence, frame, out) {
-                out.push(output, frame.id);
+            if let Some(stamped) = assembly.finish(number, after_silence, frame, out) {
+                out.push(stamped, frame.id);
             }
         }
         if is_short {

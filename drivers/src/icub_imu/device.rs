@@ -11,7 +11,8 @@ use crate::family::{Family, Supervised, Supervision};
 use crate::icub::{self, class, command};
 use crate::pairing::{self, HalfOrder, Limit, Paired, Pairing};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, NotSent, OutputInfo, Spec, SpecError, StampedReading,
+    bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -134,28 +135,28 @@ impl ImuDevice {
         if self.not_calibrated {
             quality |= Quality::NOT_CALIBRATED;
         }
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
             device_counter: u32::from(self.sequence.unwrap_or(0)),
-            ..Output::new(0, frame, quality, Reading::Imu(imu))
+            ..StampedReading::new(0, frame, quality, Reading::Imu(imu))
         };
-        self.give(output, frame, link, out);
+        self.give(stamped, frame, link, out);
     }
 
     /// Adds a reading; the first one after something was lost is marked.
     fn give(
         &mut self,
-        mut output: Output,
+        mut stamped: StampedReading,
         frame: &Frame,
         link: &mut Supervision<Configure>,
         out: &mut Decoded,
     ) {
         if core::mem::take(&mut self.gap) {
-            output.quality |= Quality::GAP_BEFORE;
+            stamped.quality |= Quality::GAP_BEFORE;
         }
         self.seen = true;
-        link.give(output, frame, out);
+        link.give(stamped, frame, out);
     }
 
     fn triple(
@@ -284,12 +285,12 @@ impl ImuDevice {
             set(true, rate);
             (acquired, stamp) = (t, kind);
         }
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
-            ..Output::new(0, frame, Quality::GOOD, Reading::Imu(imu))
+            ..StampedReading::new(0, frame, Quality::GOOD, Reading::Imu(imu))
         };
-        self.give(output, frame, link, out);
+        self.give(stamped, frame, link, out);
     }
 }
 

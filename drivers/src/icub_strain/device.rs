@@ -10,7 +10,7 @@ use crate::icub::{self, class, command};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::{
     Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
-    Driver, Frame, Mode, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
+    Driver, Frame, Mode, NotSent, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -172,11 +172,11 @@ struct Whole {
 }
 
 impl Whole {
-    fn output(&self, quality: Quality, reading: Reading, frame: &Frame) -> Output {
-        Output {
+    fn output(&self, quality: Quality, reading: Reading, frame: &Frame) -> StampedReading {
+        StampedReading {
             acquired: self.acquired,
             stamp: self.stamp,
-            ..Output::new(0, frame, quality, reading)
+            ..StampedReading::new(0, frame, quality, reading)
         }
     }
 }
@@ -515,8 +515,8 @@ fn temperature(data: &[u8], frame: &Frame, out: &mut Decoded) {
         [mask, _, _, _, _] if mask & 1 == 1 => {
             let celsius = f64::from(bytes::i16_le(data, 1)) * CELSIUS_PER_LSB;
             let reading = Reading::Temperature(Temperature { celsius });
-            let output = Output::new(0, frame, Quality::GOOD, reading);
-            out.push(output, frame.id);
+            let stamped = StampedReading::new(0, frame, Quality::GOOD, reading);
+            out.push(stamped, frame.id);
         }
         [_, _, _, _, _] => out.fault(Counter::Value, 1, frame.id),
         _ => out.fault(Counter::Length, 1, frame.id),

@@ -9,7 +9,7 @@ use crate::family::{Family, Supervised, Supervision};
 use crate::wrench::{NewZero, TareCommand, at_end};
 use crate::{
     Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
-    Driver, Frame, Mode, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
+    Driver, Frame, Mode, NotSent, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -138,13 +138,13 @@ impl Jr3 {
         quality |= self.zero.mark(frame.t);
         let [fx, fy, fz, tx, ty, tz] = values;
         let (force, torque) = ([fx, fy, fz], [tx, ty, tz]);
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
             device_counter: u32::from(half.counter),
-            ..Output::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
+            ..StampedReading::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        link.give(output, frame, out);
+        link.give(stamped, frame, out);
     }
 
     /// The number of periods in which the sensor takes `samples`, to the nearest.

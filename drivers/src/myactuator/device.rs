@@ -6,7 +6,8 @@ use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Rounds, Supervised, Supervision, temperature};
 use crate::held::{HeldValue, OnChange};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading,
+    bytes, mit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -96,7 +97,8 @@ impl MyactuatorMotor {
                 faults: u32::from(errors),
             });
             let quality = self.keys.quality(errors);
-            out.push(Output::new(JOINT, frame, quality, reading), frame.id);
+            let stamped = StampedReading::new(JOINT, frame, quality, reading);
+            out.push(stamped, frame.id);
         }
     }
 

@@ -7,7 +7,7 @@ use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Rounds, Supervised, Supervision, temperature};
 use crate::held::HeldValue;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -78,7 +78,8 @@ impl OdriveAxis {
             encoder: faults & self.keys.firmware.encoder_errors(),
             faults,
         });
-        out.push(Output::new(JOINT, frame, self.status, reading), frame.id);
+        let stamped = StampedReading::new(JOINT, frame, self.status, reading);
+        out.push(stamped, frame.id);
     }
 }
 

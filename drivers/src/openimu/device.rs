@@ -10,7 +10,9 @@ use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Supervised, Supervision};
 use crate::group::FrameGroup;
 use crate::pairing::Limit;
-use crate::{Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Spec, SpecError, bytes};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError, StampedReading, bytes,
+};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Saturation};
@@ -163,12 +165,12 @@ impl Family for OpenImuSensor {
         link.lost(Counter::Unpaired, dropped, frame, out);
         let Some(whole) = whole else { return };
         let OpenImuSample { imu, quality } = whole.content;
-        let output = Output {
+        let stamped = StampedReading {
             acquired: whole.acquired,
             stamp: whole.stamp,
-            ..Output::new(0, frame, quality, Reading::Imu(imu))
+            ..StampedReading::new(0, frame, quality, Reading::Imu(imu))
         };
-        link.give(output, frame, out);
+        link.give(stamped, frame, out);
     }
 
     fn reset(&mut self) {

@@ -9,8 +9,8 @@ use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Supervised, Supervision};
 use crate::wrench::{self, NewZero};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, Mode, NotSent, Output, OutputInfo, Spec, SpecError,
-    bytes,
+    Claim, Decoded, Device, Driver, Frame, Id, Mode, NotSent, OutputInfo, Spec, SpecError,
+    StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -113,13 +113,13 @@ impl Opto {
         quality |= self.zero.mark(frame.t);
         let torque = [f64::NAN; 3];
         let (acquired, stamp) = first;
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
             device_counter: u32::from(counter),
-            ..Output::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
+            ..StampedReading::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        link.give(output, frame, out);
+        link.give(stamped, frame, out);
     }
 }
 

@@ -9,7 +9,7 @@ use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::wrench::{self, NewZero, TareCommand};
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Driver, Frame,
-    Id, Mode, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
+    Id, Mode, NotSent, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -141,12 +141,12 @@ impl Rft {
         let (wrench, mut quality) = self.wrench(a, b);
         quality |= self.zero.mark(frame.t);
         let (acquired, stamp) = first;
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
-            ..Output::new(0, frame, quality, Reading::Wrench(wrench))
+            ..StampedReading::new(0, frame, quality, Reading::Wrench(wrench))
         };
-        link.give(output, frame, out);
+        link.give(stamped, frame, out);
     }
 }
 

@@ -9,8 +9,8 @@ use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Rounds, Supervised, Supervision, quality_of, temperature};
 use crate::held::{HeldValue, OnChange};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, Mode, Output, OutputInfo, Spec, SpecError, bytes,
-    mit,
+    Claim, Decoded, Device, Driver, Frame, Id, Mode, OutputInfo, Spec, SpecError, StampedReading,
+    bytes, mit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -42,7 +42,8 @@ impl RobstrideMotor {
                 encoder: faults & self.keys.encoder,
                 faults,
             });
-            out.push(Output::new(JOINT, frame, self.quality(), reading), frame.id);
+            let stamped = StampedReading::new(JOINT, frame, self.quality(), reading);
+            out.push(stamped, frame.id);
         }
         due
     }

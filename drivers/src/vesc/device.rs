@@ -8,7 +8,9 @@ use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes::{self, i16_be, u32_be};
 use crate::family::{Family, Supervised, Supervision, temperature};
 use crate::held::HeldValue;
-use crate::{Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading,
+};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Actuator, JointState, Kind, Quality, Reading};
@@ -39,8 +41,8 @@ impl VescController {
             encoder: 0,
             faults: 0,
         });
-        let output = Output::new(JOINT, frame, Quality::GOOD, actuator);
-        out.push(output, frame.id);
+        let stamped = StampedReading::new(JOINT, frame, Quality::GOOD, actuator);
+        out.push(stamped, frame.id);
     }
 
     fn position(

@@ -7,7 +7,7 @@ use crate::family::{Family, Supervised, Supervision};
 use crate::group::{FrameGroup, PartialReading};
 use crate::pairing::Limit;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -132,14 +132,14 @@ impl Mti {
         } else {
             Nanos::MIN
         };
-        let output = Output {
+        let stamped = StampedReading {
             acquired: whole.acquired,
             stamp: whole.stamp,
             device_time,
             device_counter: u32::from(sample.counter),
-            ..Output::new(0, frame, quality, Reading::Imu(sample.imu))
+            ..StampedReading::new(0, frame, quality, Reading::Imu(sample.imu))
         };
-        link.give(output, frame, out);
+        link.give(stamped, frame, out);
     }
 }
 

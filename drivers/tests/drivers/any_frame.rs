@@ -319,14 +319,14 @@ fn drive(device: &mut dyn Device, board: &mut dyn Board, events: &[Event], liste
             Event::Stop => device.stop(now),
         }
         let _ = (device.state(), device.next_wake(), board.period());
-        for output in &out.readings {
-            assert!(is_finite(&output.reading), "{output:?}");
+        for stamped in &out.readings {
+            assert!(is_finite(&stamped.reading), "{stamped:?}");
             // Decoded readings can be encoded again (a wrench only if the board knows its scale).
             let mut frames = Frames::new();
             let _ = board.encode(
-                output.output,
-                &output.reading,
-                output.quality | Quality::GOOD,
+                stamped.output,
+                &stamped.reading,
+                stamped.quality | Quality::GOOD,
                 &mut frames,
             );
         }

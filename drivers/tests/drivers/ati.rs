@@ -5,7 +5,7 @@ use crate::rig::{
     Rig, board, count, decode, encode, frame, listener, options, poll, spec, supervisor,
 };
 use proprio_drivers::{
-    Decoded, Device, Fault, Frame, Mode, NotSent, Options, Output, SpecError, State,
+    Decoded, Device, Fault, Frame, Mode, NotSent, Options, SpecError, StampedReading, State,
 };
 use proprio_topics::{Counter, Nanos, Quality, Reading, Refusal, Wrench};
 use proptest::prelude::*;
@@ -72,7 +72,7 @@ fn session_listener(keys: &str) -> Box<dyn Device> {
     options("ati_netcanoem", keys).device(&listen).unwrap()
 }
 
-fn assert_read(readings: &[Output], wrenches: &[[f64; 6]]) {
+fn assert_read(readings: &[StampedReading], wrenches: &[[f64; 6]]) {
     assert_eq!(readings.len(), wrenches.len());
     for (reading, right) in readings.iter().zip(wrenches) {
         for (a, b) in values(&reading.reading).iter().zip(right) {
@@ -145,13 +145,13 @@ fn halves(n: i16, status: u16, ms: f64) -> [Frame; 2] {
     ]
 }
 
-fn decode_keys(frames: &[Frame]) -> (Vec<Output>, Vec<Fault>) {
+fn decode_keys(frames: &[Frame]) -> (Vec<StampedReading>, Vec<Fault>) {
     decode(&mut *listener("ati_netcanoem", KEYS, &[]), frames)
 }
 
 /// The number of each reading, if its halves belong together, and whether it follows a gap.
-fn numbers(readings: &[Output]) -> Vec<(i32, bool)> {
-    let number = |reading: &Output| {
+fn numbers(readings: &[StampedReading]) -> Vec<(i32, bool)> {
+    let number = |reading: &StampedReading| {
         let [a, b, ..] = values(&reading.reading);
         assert_eq!(a, b, "halves of different readings");
         let gap = reading.quality.contains(Quality::GAP_BEFORE);

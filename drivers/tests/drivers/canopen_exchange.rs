@@ -2,7 +2,9 @@
 //! which process data make a reading.
 
 use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, spec, supervisor};
-use proprio_drivers::{Decoded, Device, EncodeError, Frame, Frames, Mode, NotSent, Output, State};
+use proprio_drivers::{
+    Decoded, Device, EncodeError, Frame, Frames, Mode, NotSent, StampedReading, State,
+};
 use proprio_topics::{
     Actuator, Counter, JointState, Nanos, Quality, Reading, Refusal, StampKind, Temperature,
 };
@@ -19,8 +21,8 @@ fn turned(turns: f64) -> Reading {
 }
 
 /// The positions \[turns\] of joints in `readings`.
-fn positions(readings: &[Output]) -> Vec<f64> {
-    let joint = |output: &Output| match output.reading {
+fn positions(readings: &[StampedReading]) -> Vec<f64> {
+    let joint = |stamped: &StampedReading| match stamped.reading {
         Reading::Joint(joint) => Some(joint.position / TAU),
         _ => None,
     };

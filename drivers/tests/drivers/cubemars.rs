@@ -6,7 +6,7 @@ use crate::rig::{
     options, refused, shown_keys, spec, texts,
 };
 use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode};
-use proprio_drivers::{Output, State};
+use proprio_drivers::{StampedReading, State};
 use proprio_topics::{Counter, JointState, Kind, Nanos, Quality, Reading, StampKind, Temperature};
 use proptest::prelude::*;
 use std::f64::consts::TAU;
@@ -24,7 +24,7 @@ fn motor(keys: &str, number: u32) -> Box<dyn Device> {
 }
 
 /// Errors and temperatures told.
-fn told(readings: &[Output]) -> Vec<(u32, f64)> {
+fn told(readings: &[StampedReading]) -> Vec<(u32, f64)> {
     let mut told = Vec::new();
     for pair in readings.windows(2) {
         if let (Reading::Actuator(actuator), Reading::Temperature(temperature)) =
@@ -505,7 +505,7 @@ proptest! {
     }
 }
 
-fn told_once(readings: &[Output]) -> (u32, f64) {
+fn told_once(readings: &[StampedReading]) -> (u32, f64) {
     let told = told(readings);
     assert_eq!(told.len(), 1);
     told[0]

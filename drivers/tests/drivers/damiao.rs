@@ -6,7 +6,9 @@ use crate::rig::{
     near, options, poll, refused, sends_nothing, shown_keys, spec, texts,
 };
 use proprio_drivers::State;
-use proprio_drivers::{Claim, Decoded, Device, EncodeError, Frame, Frames, Id, Mode, Output};
+use proprio_drivers::{
+    Claim, Decoded, Device, EncodeError, Frame, Frames, Id, Mode, StampedReading,
+};
 use proprio_topics::{
     Counter, JointState, Nanos, Quality, Reading, Refusal, StampKind, Temperature,
 };
@@ -25,7 +27,7 @@ fn motor(keys: &str, address: u32, mode: Mode) -> Box<dyn Device> {
 }
 
 /// Mode and faults, temperatures of FET and motor.
-fn told(readings: &[Output]) -> Vec<(u32, u32, f64, f64)> {
+fn told(readings: &[StampedReading]) -> Vec<(u32, u32, f64, f64)> {
     let told = readings.windows(3).filter_map(|three| {
         let [a, b, c] = [0, 1, 2].map(|place| (three[place].output, three[place].reading));
         match (a, b, c) {

@@ -3,7 +3,7 @@
 
 use crate::rig::{FD, Rig, board, count, decode, encode, listener, options, spec, supervisor};
 use proprio_drivers::{
-    Board, Decoded, Device, Frame, Frames, Id, Mode, NotSent, Output, SpecError, State,
+    Board, Decoded, Device, Frame, Frames, Id, Mode, NotSent, SpecError, StampedReading, State,
 };
 use proprio_topics::{
     Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind, Temperature,
@@ -25,12 +25,12 @@ fn reply(hex: &str) -> Frame {
     frame.at(Nanos::from_millis(5), StampKind::Software)
 }
 
-fn read(hex: &str) -> (Vec<Output>, Vec<proprio_drivers::Fault>) {
+fn read(hex: &str) -> (Vec<StampedReading>, Vec<proprio_drivers::Fault>) {
     decode(&mut *listener("moteus", "", &[0]), &[reply(hex)])
 }
 
-fn joint(output: &Output) -> JointState {
-    match output.reading {
+fn joint(stamped: &StampedReading) -> JointState {
+    match stamped.reading {
         Reading::Joint(joint) => joint,
         other => panic!("{other:?}"),
     }
@@ -168,8 +168,8 @@ fn states_are_told_on_change_and_once_a_second() {
         let reply = reply(&format!("2100{mode:02X}210E1F210F{fault:02X}505050"));
         let t = Nanos::from_millis(ms);
         let (readings, _) = decode(&mut *device, &[reply.at(t, StampKind::Software)]);
-        for output in readings {
-            match output.reading {
+        for stamped in readings {
+            match stamped.reading {
                 Reading::Actuator(state) => told.push((ms, state.mode, state.faults)),
                 Reading::Temperature(warmth) => told.push((ms, 0, warmth.celsius as u32)),
                 _ => {}
@@ -276,7 +276,7 @@ fn replies_without_the_position_are_no_reading_of_the_joint() {
     let (readings, faults) = read("21000A50");
     assert!(matches!(
         readings[..],
-        [Output {
+        [StampedReading {
             reading: Reading::Actuator(_),
             ..
         }]
@@ -311,7 +311,7 @@ fn temperatures_are_read_in_each_type() {
         let (readings, faults) = read(hex);
         assert!(faults.is_empty());
         let [
-            Output {
+            StampedReading {
                 reading: Reading::Temperature(Temperature { celsius }),
                 ..
             },

@@ -140,8 +140,8 @@ fn what_comes_in_other_frames_is_held_and_then_absent() {
     );
     assert!(faults.is_empty(), "{faults:?}");
     let (absent, mut read) = (f64::NAN, Vec::new());
-    for output in &readings {
-        let joint = joint(&output.reading);
+    for stamped in &readings {
+        let joint = joint(&stamped.reading);
         assert_eq!(joint.velocity, TAU * 0.5);
         read.push([joint.current, joint.torque]);
     }
@@ -598,8 +598,8 @@ proptest! {
             encode(&mut *axis, 1, &told, Quality::GOOD);
             let frames = encode(&mut *axis, 2, &told, Quality::GOOD);
             let (readings, _) = decode(&mut *host, &frames);
-            for output in &readings {
-                let Reading::Temperature(back) = output.reading else { panic!("{output:?}") };
+            for stamped in &readings {
+                let Reading::Temperature(back) = stamped.reading else { panic!("{stamped:?}") };
                 prop_assert!(near(back.celsius, celsius));
             }
             prop_assert_eq!(readings.len(), 2);

@@ -326,13 +326,13 @@ fn disturbed(without: &[&str], late: Option<(&str, f64)>) -> Vec<Frame> {
 fn numbers(frames: &[Frame]) -> (Vec<i64>, Vec<bool>, u32) {
     let (readings, faults) = decode(&mut *listener("openimu", ALL, &[]), frames);
     let (mut read, mut gaps) = (Vec::new(), Vec::new());
-    for output in &readings {
+    for stamped in &readings {
         let Imu {
             proper_acceleration,
             angular_velocity,
             orientation,
             ..
-        } = imu(output);
+        } = imu(stamped);
         // The nose's height is the sine of the pitch.
         let pitch = turned(orientation, [1.0, 0.0, 0.0])[2].asin() / DEGREE;
         let all = [
@@ -347,7 +347,7 @@ fn numbers(frames: &[Frame]) -> (Vec<i64>, Vec<bool>, u32) {
             "a reading of two periods: {all:?}"
         );
         read.push(all[0]);
-        gaps.push(output.quality.contains(Quality::GAP_BEFORE));
+        gaps.push(stamped.quality.contains(Quality::GAP_BEFORE));
     }
     (read, gaps, count(&faults, Counter::Unpaired))
 }

@@ -4,7 +4,9 @@ use crate::rig::{
     Rig, board, count, decode, encode, frame, listener, options, reading, refused_at, shown_keys,
     spec, supervisor, texts, wrench,
 };
-use proprio_drivers::{Device, Format, Frame, Frames, Id, Mode, NotSent, Output, SpecError, State};
+use proprio_drivers::{
+    Device, Format, Frame, Frames, Id, Mode, NotSent, SpecError, StampedReading, State,
+};
 use proprio_topics::{Counter, Nanos, Quality, Reading, Saturation, StampKind, Wrench};
 use proptest::array::{uniform3, uniform6};
 use proptest::prelude::*;
@@ -28,14 +30,14 @@ fn paired(driver: &str, keys: &str, halves: &[(&str, f64)]) -> (Vec<(u16, bool)>
         })
         .collect();
     let (readings, faults) = decode(&mut *listener(driver, keys, &[]), &frames);
-    let of = |output: &Output| {
-        let Wrench { force, torque } = wrench(&output.reading);
+    let of = |stamped: &StampedReading| {
+        let Wrench { force, torque } = wrench(&stamped.reading);
         let number = (torque[2] * 100.0).round();
         for k in 0..3 {
-            assert!(near(force[k], number, 0.1), "halves of two: {output:?}");
-            assert!(near(torque[k] * 100.0, number, 0.3), "{output:?}");
+            assert!(near(force[k], number, 0.1), "halves of two: {stamped:?}");
+            assert!(near(torque[k] * 100.0, number, 0.3), "{stamped:?}");
         }
-        let gap = output.quality.contains(Quality::GAP_BEFORE);
+        let gap = stamped.quality.contains(Quality::GAP_BEFORE);
         (number as u16, gap)
     };
     let numbers = readings.iter().map(of).collect();

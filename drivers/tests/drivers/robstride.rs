@@ -7,7 +7,7 @@ use crate::rig::{
     texts,
 };
 use proprio_drivers::State;
-use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, Output};
+use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, StampedReading};
 use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Temperature};
 use proptest::prelude::*;
 use std::f64::consts::{PI, TAU};
@@ -26,9 +26,9 @@ fn motor(keys: &str, address: u32, mode: Mode) -> Box<dyn Device> {
 }
 
 /// Modes and faults.
-fn told(readings: &[Output]) -> Vec<(u32, u32)> {
+fn told(readings: &[StampedReading]) -> Vec<(u32, u32)> {
     (readings.iter())
-        .filter_map(|output| match output.reading {
+        .filter_map(|stamped| match stamped.reading {
             Reading::Actuator(actuator) => Some((actuator.mode, actuator.faults)),
             _ => None,
         })

@@ -6,7 +6,7 @@ use crate::rig::{
     takes_eight_bytes, temperatures, texts,
 };
 use proprio_drivers::State;
-use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, Output};
+use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, StampedReading};
 use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
 use proptest::prelude::*;
 use std::f64::consts::TAU;
@@ -197,7 +197,7 @@ fn nothing_is_sent() {
     rig.board_loses = Box::new(|_, _| false);
     let before = rig.readings.len();
     rig.run(100);
-    let is_gap = |output: &&Output| output.quality.contains(Quality::GAP_BEFORE);
+    let is_gap = |stamped: &&StampedReading| stamped.quality.contains(Quality::GAP_BEFORE);
     assert_eq!(rig.readings[before..].iter().filter(is_gap).count(), 1);
     rig.device.stop(rig.now);
     rig.run(10);

@@ -6,7 +6,7 @@ use crate::rig::{
     supervisor, texts, wrench,
 };
 use proprio_drivers::{
-    Decoded, Device, Frame, Frames, Id, Mode, NotSent, Output, SpecError, State,
+    Decoded, Device, Frame, Frames, Id, Mode, NotSent, SpecError, StampedReading, State,
 };
 use proprio_topics::{Counter, Nanos, Quality, Refusal, Saturation, StampKind};
 use proptest::array::uniform6;
@@ -60,11 +60,11 @@ fn jr3(keys: &str, halves: &[(&str, f64)]) -> Found {
     let keys = format!("full_scale_n = [16384, 1, 1]\nfull_scale_nm = [16384, 1, 1]\n{keys}");
     let frames: Vec<Frame> = halves.iter().map(|(name, ms)| half(name, *ms)).collect();
     let (readings, faults) = decode(&mut *listener("jr3_can", &keys, &[]), &frames);
-    let of = |output: &Output| {
-        let read = wrench(&output.reading);
-        let counter = f64::from((output.device_counter as u16).cast_signed());
-        assert_eq!([read.force[0], read.torque[0]], [counter; 2], "{output:?}");
-        (output.device_counter, output.quality)
+    let of = |stamped: &StampedReading| {
+        let read = wrench(&stamped.reading);
+        let counter = f64::from((stamped.device_counter as u16).cast_signed());
+        assert_eq!([read.force[0], read.torque[0]], [counter; 2], "{stamped:?}");
+        (stamped.device_counter, stamped.quality)
     };
     (readings.iter().map(of).collect(), faults_of(&faults))
 }
@@ -221,7 +221,7 @@ fn a_jr3_is_asked_started_and_stopped() {
     assert_eq!(rig.sent[rig.sent.len() - 3..], commands);
     // The board never stopped, and was started again with another zero.
     assert_eq!(rig.readings[7].quality, GAP);
-    let changed = |r: &&Output| r.quality.contains(Quality::ZERO_CHANGED);
+    let changed = |r: &&StampedReading| r.quality.contains(Quality::ZERO_CHANGED);
     assert_eq!(rig.readings[8..].iter().filter(changed).count(), 1);
     rig.device.stop(rig.now);
     rig.run(30);
@@ -247,7 +247,7 @@ fn all_readings_around_a_new_zero_of_a_jr3_are_marked() {
         let mut rig = Rig::started("jr3_can", JR3, Mode::Supervise, sent);
         rig.board_loses = Box::new(move |_, frame| ack_lost && frame.len() == 1);
         rig.run(150);
-        let changed = |r: &Output| r.quality.contains(Quality::ZERO_CHANGED);
+        let changed = |r: &StampedReading| r.quality.contains(Quality::ZERO_CHANGED);
         let marks: Vec<bool> = rig.readings.iter().map(changed).collect();
         assert_eq!(marks.len(), 15);
         marks.iter().take_while(|mark| **mark).count()

@@ -5,7 +5,7 @@ use crate::rig::{
     Rig, board, decode, encode, frame, listener, options, reading, refused_at, shown_keys, spec,
     texts, wrench,
 };
-use proprio_drivers::{Frame, Frames, Id, Mode, Output, SpecError, State};
+use proprio_drivers::{Frame, Frames, Id, Mode, SpecError, StampedReading, State};
 use proprio_topics::{Counter, Nanos, Quality, Saturation, StampKind};
 use proptest::array::uniform3;
 use proptest::prelude::*;
@@ -90,11 +90,11 @@ fn opto(halves: &[&str]) -> Found {
     let frames: Vec<Frame> = halves.iter().map(|name| opto_half(name, 0.0)).collect();
     let mut device = listener("optoforce_daq", "counts_per_newton = [1, 1, 1]", &[]);
     let (readings, faults) = decode(&mut *device, &frames);
-    let of = |output: &Output| {
-        let force = wrench(&output.reading).force[0];
-        let counter = f64::from((output.device_counter as u16).cast_signed());
-        assert_eq!(force, counter, "halves of two: {output:?}");
-        (output.device_counter, output.quality)
+    let of = |stamped: &StampedReading| {
+        let force = wrench(&stamped.reading).force[0];
+        let counter = f64::from((stamped.device_counter as u16).cast_signed());
+        assert_eq!(force, counter, "halves of two: {stamped:?}");
+        (stamped.device_counter, stamped.quality)
     };
     (readings.iter().map(of).collect(), faults_of(&faults))
 }
@@ -324,7 +324,7 @@ fn all_readings_around_a_new_zero_of_an_optoforce_are_marked() {
         let mut rig = Rig::new("optoforce_daq", &keys, &[], sent);
         rig.board_loses = Box::new(move |_, frame| answer_lost && frame.len() == 7);
         rig.run(150);
-        let changed = |r: &Output| r.quality.contains(Quality::ZERO_CHANGED);
+        let changed = |r: &StampedReading| r.quality.contains(Quality::ZERO_CHANGED);
         let marks: Vec<bool> = rig.readings.iter().map(changed).collect();
         assert_eq!(marks.len(), 15);
         marks.iter().take_while(|mark| **mark).count()
