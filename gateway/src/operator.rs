@@ -2,7 +2,7 @@
 //! buses, and answers when the devices have replied.
 
 use crate::control::{Asked, ControlOrder, refusal};
-use crate::decoder::build;
+use crate::devices::build;
 use crate::inbox::{Busy, Replacement, Reply, Request};
 use crate::plan::{Plan, did_you_mean};
 use crate::reload::{DeviceChange, changes};

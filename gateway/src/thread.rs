@@ -3,7 +3,7 @@
 use crate::bus::{Bus, Turn};
 use crate::clock::Monotonic;
 use crate::config::FrameSource;
-use crate::decoder::Decoder;
+use crate::devices::BusDevices;
 use crate::inbox::{Inbox, Requests, inbox};
 use crate::link::adapter::{self, Adapter};
 use crate::link::interface::{Interfaces, Netlink};
@@ -110,8 +110,8 @@ impl BusThread {
         // recording.
         let listens = bus.listen_only || matches!(bus.source, FrameSource::Replay { .. });
         let mode = listens.then_some(Mode::Listen);
-        let decoder = Decoder::new(number, bus, mode, Arc::clone(&status))?;
-        let (name, claims) = (&domain.config().name, decoder.claims());
+        let devices = BusDevices::new(number, bus, mode, Arc::clone(&status))?;
+        let (name, claims) = (&domain.config().name, devices.claims());
         let link = open_own(plan, bus, number, name, &claims, replay_start)?;
         let claim = match &bus.source {
             FrameSource::SocketCan(adapter) if !listens => claim_interface(adapter),
@@ -121,7 +121,7 @@ impl BusThread {
         let (ended, renewal) = (Arc::default(), Arc::default());
         let work = BusLoop {
             link,
-            decoder,
+            devices,
             inbox,
             status: Arc::clone(&status),
             renewal: Arc::clone(&renewal),
@@ -173,7 +173,7 @@ impl BusThread {
 /// What a bus thread works with.
 struct BusLoop {
     link: Box<dyn Link>,
-    decoder: Decoder,
+    devices: BusDevices,
     inbox: Inbox,
     status: Arc<BusStatus>,
     renewal: Arc<Renewal>,
@@ -185,7 +185,7 @@ impl BusLoop {
     /// Makes turns until it is told to stop, then stops the boards.
     fn run(self, writer: Writer<Sample>, robot: &str) {
         let sink = SharedMemory::new(writer, robot, self.renewal);
-        let mut bus = Bus::new(self.link, self.decoder, sink, self.status).with_inbox(self.inbox);
+        let mut bus = Bus::new(self.link, self.devices, sink, self.status).with_inbox(self.inbox);
         while !self.stop.load(Acquire) {
             if bus.turn(&Monotonic) == Turn::Ended {
                 if let Some(note) = bus.link_note() {

@@ -18,7 +18,7 @@
 
 use crate::clock::{Clock, Monotonic, sleep_until};
 use crate::config::FrameSource;
-use crate::decoder::Decoder;
+use crate::devices::BusDevices;
 use crate::link::adapter;
 use crate::link::socketcan::SocketCan;
 use crate::link::virtual_bus::VirtualBus;
@@ -197,13 +197,13 @@ fn alternate(readings: &[Vec<f64>]) -> bool {
 
 fn doubled(plan: &Plan, number: usize, bus: &BusPlan, frames: &[Frame]) -> Vec<String> {
     let status = Arc::new(BusStatus::new(0, bus));
-    let Ok(mut decoder) = Decoder::new(0, bus, Some(Mode::Listen), status) else {
+    let Ok(mut devices) = BusDevices::new(0, bus, Some(Mode::Listen), status) else {
         return Vec::new();
     };
     let mut channels: BTreeMap<u32, Vec<(Nanos, Vec<f64>)>> = BTreeMap::new();
     for frame in frames {
-        decoder.poll_transmit(frame.t, |_, _| {});
-        decoder.on_frame(frame, |sample| {
+        devices.poll_transmit(frame.t, |_, _| {});
+        devices.on_frame(frame, |sample| {
             if let Some(values) = sample.reading().and_then(|reading| values(&reading)) {
                 let channel = channels.entry(sample.channel).or_default();
                 channel.push((sample.header.acquired, values));

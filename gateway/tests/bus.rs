@@ -4,7 +4,7 @@
 use proprio_drivers::{Command, CommandFailed, CommandRefused, Frame, Id};
 use proprio_gateway::bus::{Bus, QUEUE, RETRY};
 use proprio_gateway::clock::Manual;
-use proprio_gateway::decoder::{Decoder, build};
+use proprio_gateway::devices::{BusDevices, build};
 use proprio_gateway::inbox::{Replacement, Reply, Request, Requests, inbox};
 use proprio_gateway::link::{Link, LinkCounters, ListenOnly, Received, TransmitError};
 use proprio_gateway::plan::{BusPlan, Plan};
@@ -94,11 +94,11 @@ impl Rig {
 
     fn of(plan: &BusPlan, link: impl Fn(Scripted) -> Box<dyn Link>) -> Self {
         let status = Arc::new(BusStatus::new(0, plan));
-        let decoder = Decoder::new(0, plan, None, Arc::clone(&status)).unwrap();
+        let devices = BusDevices::new(0, plan, None, Arc::clone(&status)).unwrap();
         let script = Arc::new(Mutex::new(Script::default()));
         let link = link(Scripted(Arc::clone(&script)));
         let (requests, inbox) = inbox(plan.devices.len());
-        let bus = Bus::new(link, decoder, Memory::default(), Arc::clone(&status));
+        let bus = Bus::new(link, devices, Memory::default(), Arc::clone(&status));
         let bus = bus.with_inbox(inbox);
         let now = Nanos::from_millis(1000);
         Self {

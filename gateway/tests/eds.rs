@@ -9,7 +9,7 @@
 
 use proprio_drivers::objects::Objects;
 use proprio_drivers::{Board, Decoded, Device, Frame, Frames, Id, Options, StampedReading, State};
-use proprio_gateway::decoder::build;
+use proprio_gateway::devices::build;
 use proprio_gateway::plan::{DevicePlan, Plan};
 use proprio_topics::{JointState, Nanos, Quality, Reading, Refusal, StampKind};
 use std::f64::consts::TAU;

@@ -2,7 +2,7 @@
 
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::config::FrameSource;
-use proprio_gateway::decoder::Decoder;
+use proprio_gateway::devices::BusDevices;
 use proprio_gateway::link::adapter::Adapter;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, Received};
@@ -164,28 +164,28 @@ fn listen(
 ) -> (u64, Vec<(String, Vec<u64>)>) {
     let plan = &robot.plan.buses[bus];
     let status = Arc::new(BusStatus::new(0, plan));
-    let mut decoder = Decoder::new(0, plan, None, Arc::clone(&status)).unwrap();
+    let mut devices = BusDevices::new(0, plan, None, Arc::clone(&status)).unwrap();
     let mut link = VirtualBus::open(domain, name, &[]).unwrap();
     let clock = Monotonic;
     while !stop.load(Relaxed) {
         let mut sent = Vec::new();
-        decoder.poll_transmit(clock.now(), |device, t| {
+        devices.poll_transmit(clock.now(), |device, t| {
             link.send(&t.frame).unwrap();
             sent.push((device, t.frame));
         });
         for (device, frame) in sent {
-            decoder.on_sent(device, &frame, Ok(clock.now()));
+            devices.on_sent(device, &frame, Ok(clock.now()));
         }
         let deadline = clock.now() + Nanos::from_millis(10);
         if let Received::Frame(frame) =
-            link.recv(decoder.next_wake().map_or(deadline, |w| w.min(deadline)))
+            link.recv(devices.next_wake().map_or(deadline, |w| w.min(deadline)))
         {
-            decoder.on_frame(&frame, |_| {});
+            devices.on_frame(&frame, |_| {});
         }
     }
     // Read the rest of the buffer.
     while let Received::Frame(frame) = link.recv(clock.now() + Nanos::from_millis(100)) {
-        decoder.on_frame(&frame, |_| {});
+        devices.on_frame(&frame, |_| {});
     }
     assert_eq!(link.counters().dropped, 0);
     let devices = status

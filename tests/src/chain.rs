@@ -28,7 +28,7 @@ use crate::truth::random::Random;
 use proprio_estimator::pipeline::Pipeline;
 use proprio_gateway::bus::Bus;
 use proprio_gateway::clock::Clock;
-use proprio_gateway::decoder::{Decoder, build};
+use proprio_gateway::devices::{BusDevices, build};
 use proprio_gateway::plan::{ChannelPlan, DevicePlan, Plan};
 use proprio_gateway::publish::SharedMemory;
 use proprio_gateway::status::BusStatus;
@@ -358,14 +358,15 @@ impl Chain {
     fn start(&mut self, epoch: u64) {
         for (number, plan) in (0..).zip(&self.plan.buses) {
             let status = Arc::new(BusStatus::new(number, plan));
-            let decoder = Decoder::new(number, plan, None, Arc::clone(&status)).expect("devices");
+            let devices =
+                BusDevices::new(number, plan, None, Arc::clone(&status)).expect("devices");
             let writer = Writer::create(&self.domain, &self.plan.robot, epoch).expect("a port");
             let sink = SharedMemory::new(writer, &self.plan.robot, Arc::new(Renewal::default()));
             let end = self.wires[number as usize].clone();
             self.buses.push(Running {
                 before: end.with(|wire| wire.passed.delivered),
                 clock: end.with(|wire| wire.clock.clone()),
-                bus: Bus::new(Box::new(end), decoder, sink, Arc::clone(&status)),
+                bus: Bus::new(Box::new(end), devices, sink, Arc::clone(&status)),
                 status,
             });
         }

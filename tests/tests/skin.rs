@@ -1,5 +1,5 @@
 //! A skin from the bus to the contact wrench: the simulated boards of an arm and of the skin on its
-//! forearm, the gateway's decoders, and the estimator.
+//! forearm, the gateway's devices, and the estimator.
 #![allow(missing_docs)]
 
 use proprio_simulator::record::record;

@@ -6,7 +6,7 @@ mod offline;
 mod plan;
 
 use proprio_drivers::{Board, Frames, Mode, Spec};
-use proprio_gateway::decoder::{Decoder, build};
+use proprio_gateway::devices::{BusDevices, build};
 use proprio_gateway::inbox::{Replacement, Reply, Request};
 use proprio_gateway::offline::{decode, encode};
 use proprio_gateway::plan::Plan;
@@ -108,7 +108,7 @@ fn ms(ms: f64) -> Nanos {
 /// A bus with its boards.
 struct Rig {
     plan: Plan,
-    decoder: Decoder,
+    devices: BusDevices,
     boards: Vec<Box<dyn Board>>,
     status: Arc<BusStatus>,
 }
@@ -119,7 +119,7 @@ impl Rig {
         let bus = &plan.buses[0];
         let status = Arc::new(BusStatus::new(0, bus));
         let mode = Mode::Listen;
-        let decoder = Decoder::new(0, bus, Some(mode), Arc::clone(&status)).unwrap();
+        let devices = BusDevices::new(0, bus, Some(mode), Arc::clone(&status)).unwrap();
         let boards = bus.devices.iter().map(|device| {
             let spec = Spec {
                 mode,
@@ -129,7 +129,7 @@ impl Rig {
         });
         Self {
             boards: boards.collect(),
-            decoder,
+            devices,
             status,
             plan,
         }
@@ -161,10 +161,10 @@ impl Rig {
         let board = &mut self.boards[device];
         board.encode(0, &reading, quality, &mut frames).unwrap();
         let mut samples = Vec::new();
-        self.decoder.poll_transmit(t, |_, _| {});
+        self.devices.poll_transmit(t, |_, _| {});
         for frame in &frames {
             let frame = frame.at(t, StampKind::Software);
-            self.decoder
+            self.devices
                 .on_frame(&frame, |sample| samples.push(*sample));
         }
         samples
@@ -201,7 +201,7 @@ impl Rig {
             outputs: new.outputs,
         });
         let number = u16::try_from(device).unwrap();
-        let reply = self.decoder.request(number, request, Nanos::ZERO);
+        let reply = self.devices.request(number, request, Nanos::ZERO);
         assert!(matches!(reply, Some(Reply::Replaced(_))), "at once");
     }
 

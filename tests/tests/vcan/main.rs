@@ -12,7 +12,7 @@ mod traffic;
 use proprio_drivers::{Claim, Frame};
 use proprio_estimator::setup::Setup;
 use proprio_gateway::clock::{Clock as _, Monotonic, sleep_until};
-use proprio_gateway::decoder::Decoder;
+use proprio_gateway::devices::BusDevices;
 use proprio_gateway::link::send_by;
 use proprio_gateway::link::socketcan::SocketCan;
 use proprio_gateway::log;
@@ -601,7 +601,7 @@ fn interfaces_go_and_come_back() {
 fn claims(plan: &Plan, number: usize) -> Vec<Claim> {
     let bus = &plan.buses[number];
     let status = Arc::new(BusStatus::new(0, bus));
-    Decoder::new(0, bus, None, status)
+    BusDevices::new(0, bus, None, status)
         .expect("devices")
         .claims()
 }
