@@ -18,7 +18,7 @@
 mod motion;
 pub mod propagation;
 
-pub(crate) use motion::Solution;
+pub(crate) use motion::OperatingPoint;
 
 use crate::inertial::InertialState;
 use motion::{MotionErrors, sum_of_squares};
@@ -70,18 +70,18 @@ impl Uncertainty {
     /// Sizes differ, or a number is not finite.
     pub(crate) fn update(
         &mut self,
-        solution: &Solution<'_>,
+        point: &OperatingPoint<'_>,
         place_std: impl Fn(usize) -> PlaceStd,
     ) -> Result<(), DynamicsError> {
-        let Solution {
+        let OperatingPoint {
             t,
             structure,
             solver,
             kinematics,
             ..
-        } = *solution;
+        } = *point;
         self.parameters.update(structure, solver, kinematics, t)?;
-        self.motion.update(solution)?;
+        self.motion.update(point)?;
         self.places.update(structure, solver, kinematics, place_std)
     }
 

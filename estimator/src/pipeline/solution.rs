@@ -8,7 +8,7 @@ use super::residuals::{self, ResidualMonitor, SubtreeResidual};
 use super::steps::StepCover;
 use super::validity::{Dependences, ValidityCheck, first_fault};
 use crate::setup::Setup;
-use crate::uncertainty::{Solution, Uncertainty};
+use crate::uncertainty::{OperatingPoint, Uncertainty};
 use proprio_dynamics::{ContactSet, Dependence, Determinacy, DofSet, SensorSet, Solver, Structure};
 use proprio_identification::online::Doubt;
 use proprio_identification::robot::ChannelRole;
@@ -68,7 +68,7 @@ impl Pipeline {
                 solver.solve(model, structure, kinematics, &inputs.readings, assumed, &[])
             })
             .and_then(|()| solver.update_deviations(structure));
-        let solution = Solution {
+        let point = OperatingPoint {
             t,
             model,
             structure,
@@ -84,7 +84,7 @@ impl Pipeline {
         let place_std =
             |contact: usize| places.get(contact).map_or_else(Default::default, |p| p.std);
         solved
-            .and_then(|()| self.uncertainty.update(&solution, place_std))
+            .and_then(|()| self.uncertainty.update(&point, place_std))
             .is_ok()
     }
 
