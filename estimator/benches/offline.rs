@@ -18,7 +18,7 @@ use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::{RigidInertia, Vec3};
 use proprio_dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
 use proprio_estimator::config::Config;
-use proprio_estimator::reading;
+use proprio_estimator::sample_log;
 use proprio_estimator::setup::Setup;
 use proprio_identification::{LogRole, Verdict, identify};
 use std::fmt::Write as _;
@@ -160,7 +160,7 @@ fn identify_a_log(bencher: Bencher<'_, '_>, samples: usize) {
     bencher.counter(ItemsCount::new(samples)).bench_local(|| {
         let log = text.as_bytes();
         let dataset =
-            reading::dataset(&setup.robot, "log.csv", LogRole::Train, log).expect("a log");
+            sample_log::dataset(&setup.robot, "log.csv", LogRole::Train, log).expect("a log");
         let outcome = identify(&setup.robot, vec![dataset], &[], &mut |_| ()).expect("an outcome");
         assert_eq!(outcome.verdict, Verdict::Identified);
         outcome

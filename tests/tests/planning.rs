@@ -5,7 +5,7 @@
 use proprio_dynamics::spatial::{Pose, RigidInertia, Vec3};
 use proprio_dynamics::{FrameMotion, JointState, Kinematics};
 use proprio_estimator::config::Config;
-use proprio_estimator::reading;
+use proprio_estimator::sample_log;
 use proprio_estimator::setup::Setup;
 use proprio_identification::forecast::SensorNoise;
 use proprio_identification::prior::cad_root;
@@ -192,7 +192,7 @@ fn record(
 fn identified(robot: &Robot, logs: &[String]) -> Outcome {
     let datasets = logs
         .iter()
-        .map(|log| reading::dataset(robot, "log.csv", LogRole::Train, log.as_bytes()).unwrap());
+        .map(|log| sample_log::dataset(robot, "log.csv", LogRole::Train, log.as_bytes()).unwrap());
     identify(robot, datasets.collect(), &[], &mut |_| {}).unwrap()
 }
 

@@ -6,7 +6,7 @@
 use proprio_estimator::config::{Config, Occurrence};
 use proprio_estimator::export::parameters;
 use proprio_estimator::offline::estimate;
-use proprio_estimator::reading;
+use proprio_estimator::sample_log;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::link::send_by;
 use proprio_gateway::link::virtual_bus::VirtualBus;
@@ -570,7 +570,8 @@ fn on_line_the_torques_of_a_real_leg_are_what_they_are_from_its_log() {
     let identified = {
         let setup = leg.setup();
         let log = texts[1].as_bytes();
-        let dataset = reading::dataset(&setup.robot, spans[1], LogRole::Train, log).expect("a log");
+        let dataset =
+            sample_log::dataset(&setup.robot, spans[1], LogRole::Train, log).expect("a log");
         let outcome = identify(&setup.robot, vec![dataset], &[], &mut |_| ()).expect("an outcome");
         let mut with = setup.clone();
         with.apply(&parameters(&outcome, &setup.robot, "this test").expect("parameters"))

@@ -3,7 +3,7 @@
 use crate::convert::check_columns;
 use crate::samples;
 use anyhow::Context;
-use proprio_estimator::reading;
+use proprio_estimator::sample_log;
 use proprio_estimator::setup::Setup;
 use proprio_identification::{Dataset, LogRole};
 use std::fs::File;
@@ -39,7 +39,7 @@ pub(super) fn read(
     role: LogRole,
     table: &mut (impl Read + Send),
 ) -> anyhow::Result<Dataset> {
-    let dataset = reading::dataset_or_unreadable(&setup.robot, name, role, table);
+    let dataset = sample_log::dataset_or_unreadable(&setup.robot, name, role, table);
     dataset.with_context(|| name.to_owned())
 }
 

@@ -14,7 +14,7 @@ use proprio_dynamics::spatial::{RigidInertia, Wrench};
 use proprio_dynamics::{InverseDynamics, JointState, Kinematics};
 use proprio_estimator::config::Config;
 use proprio_estimator::differentiate::{Settings as WindowSettings, Window};
-use proprio_estimator::reading;
+use proprio_estimator::sample_log;
 use proprio_estimator::setup::Setup;
 use proprio_identification::dataset::observation::Observation;
 use proprio_identification::dataset::smooth::{Scratch, Smoother};
@@ -164,7 +164,7 @@ impl Table {
 }
 
 fn read(robot: &Robot, log: impl std::io::Read) -> Dataset {
-    reading::dataset(robot, "log", LogRole::Train, log).expect("a log")
+    sample_log::dataset(robot, "log", LogRole::Train, log).expect("a log")
 }
 
 const COLUMNS: [&str; 8] = [

@@ -247,7 +247,8 @@ fn what_can_not_be_is_said_of_a_log_that_is_only_estimated_from() {
     let found = |log: &str| -> Vec<FindingCode> {
         let findings = implausible(
             &setup.robot,
-            reading::dataset(&setup.robot, "", LogRole::Validate, log.as_bytes()).expect("a log"),
+            sample_log::dataset(&setup.robot, "", LogRole::Validate, log.as_bytes())
+                .expect("a log"),
         );
         findings.iter().map(|finding| finding.code).collect()
     };
@@ -279,7 +280,7 @@ fn what_can_not_be_is_said_of_a_log_that_is_only_estimated_from() {
         .expect("its own");
     let turned = of_all(&wrench, -1.0);
     let codes = |setup: &Setup| {
-        let log = reading::dataset(&setup.robot, "", LogRole::Validate, turned.as_bytes());
+        let log = sample_log::dataset(&setup.robot, "", LogRole::Validate, turned.as_bytes());
         implausible(&setup.robot, log.expect("a log"))
     };
     assert_eq!(codes(&identified), codes(&setup));
@@ -321,7 +322,7 @@ fn simulated_arm_is_identified_and_its_uncertainty_is_true() {
             let truth = real(&setup, seed);
             let right = Calibration::new(cross_talk(0.01, 700 + seed), Wrench::zero(), None);
             let log = miscalibrated(&simulate(&setup, &truth, 12.0, memory, seed), &right);
-            let dataset = reading::dataset(&setup.robot, "arm", LogRole::Train, log.as_bytes())
+            let dataset = sample_log::dataset(&setup.robot, "arm", LogRole::Train, log.as_bytes())
                 .expect("a log");
             let outcome =
                 identify(&setup.robot, vec![dataset], &[], &mut |_| {}).expect("an outcome");

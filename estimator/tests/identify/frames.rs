@@ -67,7 +67,7 @@ fn a_payload_is_what_a_link_carries_more_than_before() {
             translation: Vec3::new(0.0, 0.03, 0.1),
         };
         let found = |log: &str| {
-            let dataset = reading::dataset(&setup.robot, "log", LogRole::Train, log.as_bytes());
+            let dataset = sample_log::dataset(&setup.robot, "log", LogRole::Train, log.as_bytes());
             let (frame, known) = (Frame { link, pose }, known(&reference, &setup.robot));
             let logs = vec![dataset.expect("a log")];
             payload(&setup.robot, &known, &frame, logs, &[]).expect("a payload")

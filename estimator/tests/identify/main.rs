@@ -22,7 +22,7 @@ use proprio_estimator::export::{known, parameters};
 use proprio_estimator::inertial::InertialState;
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::setup::Setup;
-use proprio_estimator::{offline, reading};
+use proprio_estimator::{offline, sample_log};
 use proprio_identification::robot::{BaseMotion, IdentificationInput, TorqueSide};
 use proprio_identification::{
     Finding, FindingCode, JointOutcome, LogOutcome, LogRole, Outcome, Predicted, Severity,
@@ -60,7 +60,8 @@ fn between(log: &str, from: f64, to: f64) -> String {
 
 fn run(setup: &Setup, logs: &[(&str, LogRole, &str)], inputs: &[IdentificationInput]) -> Outcome {
     let dataset = |(file, role, text): &(&str, LogRole, &str)| {
-        reading::dataset_or_unreadable(&setup.robot, file, *role, text.as_bytes()).expect("a log")
+        sample_log::dataset_or_unreadable(&setup.robot, file, *role, text.as_bytes())
+            .expect("a log")
     };
     let datasets = logs.iter().map(dataset).collect();
     let outcome = identify(&setup.robot, datasets, inputs, &mut |_| {}).expect("an outcome");

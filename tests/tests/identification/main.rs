@@ -23,7 +23,7 @@ use proprio_estimator::offline::estimate;
 use proprio_estimator::parameters::{Offset, Parameters, Provenance};
 use proprio_estimator::pipeline::{Estimate, Job, Pipeline};
 use proprio_estimator::setup::Setup;
-use proprio_estimator::{files, reading};
+use proprio_estimator::{files, sample_log};
 use proprio_identification::online::{DetectedChange, ObservationCounts, Paused};
 use proprio_identification::{FindingCode, LogRole, Outcome, Severity, Verdict, identify};
 use proprio_topics::csv::{Row, SeriesValue, TableReader, Value, What};
@@ -597,7 +597,7 @@ fn standing(log: &str, until: f64, times: usize) -> String {
 fn identified(sessions: &Sessions, logs: &[(&str, &str, LogRole)]) -> Outcome {
     let robot = sessions.setup(Urdf::Cad, None).robot;
     let dataset = |(file, text, role): &(&str, &str, LogRole)| {
-        reading::dataset_or_unreadable(&robot, file, *role, text.as_bytes()).unwrap()
+        sample_log::dataset_or_unreadable(&robot, file, *role, text.as_bytes()).unwrap()
     };
     let datasets = logs.iter().map(dataset).collect();
     identify(&robot, datasets, &[], &mut |_| {}).unwrap()
