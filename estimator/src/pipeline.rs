@@ -74,10 +74,10 @@ mod drives;
 mod estimate;
 mod identification;
 mod input;
+mod offset_steps;
 mod prediction;
 mod residuals;
 mod solution;
-mod steps;
 mod validity;
 
 pub use estimate::{Counts, Estimate};
@@ -94,6 +94,7 @@ use channels::Inputs;
 use contacts::Contacts;
 use drives::{Drives, Instant};
 use identification::OnlineIdentification;
+use offset_steps::OffsetStepCover;
 use prediction::Predictor;
 use proprio_dynamics::spatial::Wrench;
 use proprio_dynamics::{
@@ -105,7 +106,6 @@ use proprio_identification::robot::ChannelRole;
 use proprio_topics::{DriveEstimate, InertiaEstimate, Nanos, Reason, TorqueBudget};
 use residuals::ResidualMonitor;
 use std::collections::VecDeque;
-use steps::StepCover;
 use validity::Dependences;
 
 /// The estimator's core: no input, no output, no clock.
@@ -139,7 +139,7 @@ pub struct Pipeline {
     /// Tests the F/T residual of each sub-tree.
     residuals: ResidualMonitor,
     /// What else the residuals may be.
-    steps: StepCover,
+    steps: OffsetStepCover,
     /// See [`validity::ValidityCheck`].
     unwatched: Vec<(ContactSet, Reason, u32)>,
     /// Per F/T sensor, since when its zero is another one than that of the offset in use.
@@ -224,7 +224,7 @@ impl Pipeline {
             solver: Solver::new(&setup.robot.structure),
             uncertainty: Box::new(uncertainty),
             residuals: ResidualMonitor::new(&setup.robot.structure),
-            steps: StepCover::new(&setup.robot.structure, dofs),
+            steps: OffsetStepCover::new(&setup.robot.structure, dofs),
             unwatched: Vec::with_capacity(setup.robot.structure.subtrees().len()),
             new_zeros: vec![None; setup.robot.structure.sensors().len()],
             dependences: Dependences {

@@ -59,8 +59,8 @@ impl SampleLogError {
 /// possible. [`Dataset::findings`] lists both.
 ///
 /// # Errors
-/// [`SampleLogError`]: it is no log, or lacks a joint that is not locked, or the IMU of the base. A
-/// missing F/T sensor is a finding here; `proprio identify` refuses the log before.
+/// [`SampleLogError`]: it is no log, or lacks a joint that is not locked, or the IMU of the base.
+/// A missing F/T sensor is a finding here; `proprio identify` refuses the log before.
 pub fn dataset(
     robot: &Robot,
     name: &str,

@@ -4,8 +4,8 @@
 use super::Pipeline;
 use super::channels::At;
 use super::contacts::Place;
+use super::offset_steps::OffsetStepCover;
 use super::residuals::{self, ResidualMonitor, SubtreeResidual};
-use super::steps::StepCover;
 use super::validity::{Dependences, ValidityCheck, first_fault};
 use crate::setup::Setup;
 use crate::uncertainty::{OperatingPoint, Uncertainty};
@@ -202,7 +202,7 @@ struct Judge<'a> {
     solver: &'a Solver,
     uncertainty: &'a Uncertainty,
     residuals: &'a ResidualMonitor,
-    steps: &'a StepCover,
+    steps: &'a OffsetStepCover,
     /// Of the contacts.
     places: &'a [Place],
     dependences: &'a Dependences,
