@@ -406,7 +406,7 @@ pub(crate) fn encode(args: &EncodeArgs) -> anyhow::Result<()> {
 ///
 /// # Errors
 /// An [`InvalidConfig`]: the configuration does not match the log.
-pub(crate) fn check_columns(
+pub(crate) fn check_header(
     header: &[u8],
     log: &Path,
     config: &Path,
@@ -454,7 +454,7 @@ impl Configured {
                         --config` has its own\n";
             clap::Error::raw(ErrorKind::MissingRequiredArgument, text).exit();
         };
-        let (_, setup) = proprio_estimator::daemon::load(&config, |config| {
+        let (_, setup) = Setup::load(&config, |config| {
             // The command line overrides the configuration.
             if let Some(parameters) = parameters {
                 config.parameters = Some(parameters.to_owned());

@@ -10,7 +10,6 @@ use proprio_dynamics::model::{Frame, Limits, Model};
 use proprio_dynamics::regressor::identifiable::ParameterColumn;
 use proprio_dynamics::spatial::Pose;
 use proprio_estimator::config::{Base, Config, InvalidConfig};
-use proprio_estimator::daemon;
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::setup::{Setup, frame};
 use proprio_identification::forecast::SensorNoise;
@@ -71,7 +70,7 @@ pub(crate) struct ExciteArgs {
 
 /// Plans a motion.
 pub(crate) fn run(args: &ExciteArgs) -> anyhow::Result<()> {
-    let (config, mut setup) = daemon::load(&args.config, |config| {
+    let (config, mut setup) = Setup::load(&args.config, |config| {
         // What was identified earlier counts only if it is named.
         config.parameters = None;
         config.identification.enabled = false;

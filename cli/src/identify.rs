@@ -77,7 +77,7 @@ pub(crate) fn run(args: &IdentifyArgs) -> anyhow::Result<()> {
         );
     }
     let out = args.out.as_deref().unwrap_or_else(|| Path::new("."));
-    let (config, setup) = proprio_estimator::daemon::load(&args.config, |config| {
+    let (config, setup) = Setup::load(&args.config, |config| {
         // Identification starts from the URDF, not from parameters identified earlier.
         config.parameters = None;
         config.identification.enabled = false;

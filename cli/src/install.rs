@@ -5,6 +5,7 @@
 use crate::folder::{each_file, read};
 use anyhow::{Context as _, bail};
 use proprio_estimator::files;
+use proprio_estimator::setup::Setup;
 use proprio_gateway::plan::Plan;
 use std::collections::BTreeSet;
 use std::fmt;
@@ -208,7 +209,7 @@ fn check(folder: &Path) -> anyhow::Result<()> {
         Plan::load_live(&gateway)?;
     }
     if estimator.is_file() {
-        proprio_estimator::daemon::load(&estimator, |_| {})?;
+        Setup::load(&estimator, |_| {})?;
     }
     Ok(())
 }

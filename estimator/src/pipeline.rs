@@ -197,7 +197,7 @@ impl Pipeline {
         };
         let mut identification = identification;
         if let Some(identification) = &mut identification {
-            identification.install_initial_covariance(&mut uncertainty.parameters);
+            identification.install_initial_covariance(&mut uncertainty.propagation);
         }
         Self {
             buffers: setup
@@ -271,7 +271,7 @@ impl Pipeline {
             state,
             &self.setup,
             &mut self.parameters,
-            &mut self.uncertainty.parameters,
+            &mut self.uncertainty.propagation,
         )
     }
 
@@ -423,7 +423,7 @@ impl Pipeline {
             }
             let touched = self.residuals.touched(&self.structure);
             let (parameters, propagation) =
-                (&mut self.parameters, &mut self.uncertainty.parameters);
+                (&mut self.parameters, &mut self.uncertainty.propagation);
             if identification.apply(&self.setup, parameters, propagation, &touched) {
                 self.residuals.restart_means();
                 for (sensor, since) in self.new_zeros.iter_mut().enumerate() {

@@ -11,7 +11,7 @@ use self::contacts::{contacts, skins, stances, standing};
 use self::names::no_joint;
 pub(crate) use self::names::similar_name;
 use self::sensors::sensors;
-use crate::config::{Base, Config, ForceTorque, STANDARD_GRAVITY};
+use crate::config::{Base, Config, ForceTorque, InvalidConfig, STANDARD_GRAVITY};
 use crate::differentiate::Settings;
 use crate::drive::DriveModel;
 use crate::inertial::InertialState;
@@ -29,6 +29,7 @@ use proprio_identification::robot::{
     BaseMotion, Channel, ChannelRole, IdentificationInput, NamedContact,
 };
 use proprio_topics::{Kind, MAX_JOINTS, Nanos};
+use std::path::Path;
 
 /// Largest number of samples for an estimate of velocity and acceleration. The differentiator keeps
 /// 128; the difference is for samples that come while an instant waits for other channels.
@@ -72,6 +73,27 @@ pub struct Setup {
 }
 
 impl Setup {
+    /// Reads a configuration, applies `adjust` to it, then reads the files that it names (model,
+    /// identified parameters). Logs the warnings.
+    ///
+    /// # Errors
+    /// [`InvalidConfig`].
+    pub fn load(
+        file: &Path,
+        adjust: impl FnOnce(&mut Config),
+    ) -> Result<(Config, Self), InvalidConfig> {
+        let mut config = Config::load(file)?;
+        adjust(&mut config);
+        let setup = Self::new(&config).map_err(|problem| InvalidConfig {
+            file: file.to_owned(),
+            problem,
+        })?;
+        for warning in setup.warnings() {
+            tracing::warn!("{}: {warning}", file.display());
+        }
+        Ok((config, setup))
+    }
+
     /// Reads the model and resolves every name.
     ///
     /// # Errors

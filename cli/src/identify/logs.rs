@@ -1,6 +1,6 @@
 //! Opens and reads recorded logs, and names them.
 
-use crate::convert::check_columns;
+use crate::convert::check_header;
 use crate::samples;
 use anyhow::Context;
 use proprio_estimator::sample_log;
@@ -28,7 +28,7 @@ pub(super) fn open(
             break;
         }
     }
-    check_columns(&header, file, config, setup)?;
+    check_header(&header, file, config, setup)?;
     Ok(Cursor::new(header).chain(table))
 }
 

@@ -33,7 +33,7 @@ pub(super) fn run(
     as_json: bool,
 ) -> anyhow::Result<()> {
     let mut configured = None;
-    let (config, mut setup) = proprio_estimator::daemon::load(config_file, |config| {
+    let (config, mut setup) = Setup::load(config_file, |config| {
         configured = config.parameters.take();
         config.identification.enabled = false;
     })?;

@@ -395,7 +395,7 @@ pub(crate) fn sample<'a>(
     let mut measurement = measurement.clone();
     let mut appears = vec![0; measurement.unknowns().channels()];
     let mut count_channels = |instant: &Annotated, appears: &mut [usize]| -> bool {
-        let made = measurement.make(instant, &mut rows).is_ok();
+        let made = measurement.compute_rows(instant, &mut rows).is_ok();
         let mut lacked = false;
         for (channel, appears) in appears.iter_mut().enumerate() {
             if made && rows.has(channel) {

@@ -275,7 +275,7 @@ impl ConfigurationEvidence {
             MeasurementRows::new(&unknowns),
         ];
         for instant in stretch {
-            if measurement.make(instant, &mut rows).is_err() {
+            if measurement.compute_rows(instant, &mut rows).is_err() {
                 continue;
             }
             self.instants += 1;
@@ -501,7 +501,7 @@ fn gravity_columns(
     let mut right = |axis: Vec3| {
         let upright = MotionReading::Upright(axis);
         let other = instant.clone().map(|own| own.seen(upright));
-        let is_made = measurement.make(&other, rows).is_ok() && rows.count == lines.nrows();
+        let is_made = measurement.compute_rows(&other, rows).is_ok() && rows.count == lines.nrows();
         is_made.then(|| DVector::from_column_slice(&rows.r))
     };
     let without = right(Vec3::zeros());

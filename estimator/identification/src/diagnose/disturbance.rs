@@ -174,7 +174,7 @@ impl UnitPass<'_> {
         let (mut white, mut noise) = (Vec::new(), vec![0.0; channels]);
         let mut sums = vec![vec![(0.0, 0.0); channels]; self.units.len()];
         for instant in instants {
-            if measurement.make(instant, &mut rows).is_err() {
+            if measurement.compute_rows(instant, &mut rows).is_err() {
                 continue;
             }
             for (&unit, sums) in self.units.iter().zip(&mut sums) {

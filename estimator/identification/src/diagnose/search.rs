@@ -243,7 +243,7 @@ impl SegmentColumns<'_> {
             // change of the offset terms is ignored.
             let step = MotionReading::Encoder(dof, [STEP, 0.0]);
             let instant = instants[number].clone().map(|own| own.seen(step));
-            if measurement.make(&instant, moved).is_ok() && moved.count == rows.count {
+            if measurement.compute_rows(&instant, moved).is_ok() && moved.count == rows.count {
                 for row in 0..rows.count {
                     let change = moved.without_bodies(row, d) - rows.without_bodies(row, d);
                     out[row * width + joint] = change / STEP;

@@ -174,7 +174,7 @@ impl<'a> MeasurementModel<'a> {
         let mut nodes = AppearingNodes::new(first_channel + channels);
         let mut rows = MeasurementRows::new(&measurement.unknowns);
         for observation in observations {
-            measurement.make(observation, &mut rows)?;
+            measurement.compute_rows(observation, &mut rows)?;
             for row in 0..rows.count {
                 nodes.add(links, rows.a(row), rows.n(row));
             }
@@ -311,14 +311,14 @@ impl<'a> MeasurementModel<'a> {
     /// joint.
     ///
     /// # Errors
-    /// As for [`MeasurementModel::make`].
+    /// As for [`MeasurementModel::compute_rows`].
     pub(crate) fn torque_errors(
         &mut self,
         observation: &Annotated,
         d: &[f64],
     ) -> Result<Vec<f64>, DynamicsError> {
         let mut rows = MeasurementRows::new(&self.unknowns);
-        self.make(observation, &mut rows)?;
+        self.compute_rows(observation, &mut rows)?;
         self.tree.update(&self.robot.model, &self.kinematics)?;
         let blocked = self.blocked(observation);
         let error = |dof: usize| {
@@ -342,7 +342,7 @@ impl<'a> MeasurementModel<'a> {
     ///
     /// # Errors
     /// The observation is of another robot, or a position, velocity or acceleration is not finite.
-    pub(crate) fn make(
+    pub(crate) fn compute_rows(
         &mut self,
         observation: &Annotated,
         rows: &mut MeasurementRows,

@@ -149,7 +149,7 @@ impl SensorComparison {
                     for instant in &instants[ranges[block].clone()] {
                         let start = out.len();
                         out.resize(start + 6 * sensors, ComparedReading::NONE);
-                        if sensors > 0 && measurement.make(instant, rows).is_ok() {
+                        if sensors > 0 && measurement.compute_rows(instant, rows).is_ok() {
                             let sensors = &unknowns.sensors;
                             compare(
                                 instant,
@@ -245,7 +245,7 @@ pub(crate) fn predicted_deviations(
     let unknowns = measurement.unknowns().clone();
     let mut rows = MeasurementRows::new(&unknowns);
     let mut out = vec![f64::NAN; unknowns.channels()];
-    if measurement.make(instant, &mut rows).is_err() {
+    if measurement.compute_rows(instant, &mut rows).is_err() {
         return out;
     }
     let a = DMatrix::from_fn(rows.count, unknowns.parameters(), |i, j| rows.a(i)[j]) * root;

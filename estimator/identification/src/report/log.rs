@@ -402,7 +402,7 @@ pub(crate) fn two_route(
     for (range, block) in residuals.ranges.iter().zip(&residuals.nuisance) {
         let cases = cases(sets, &configured, block);
         for instant in &instants[range.clone()] {
-            if unknowns.sensors.len() < 2 || measurement.make(instant, &mut rows).is_err() {
+            if unknowns.sensors.len() < 2 || measurement.compute_rows(instant, &mut rows).is_err() {
                 continue;
             }
             for (dof, along) in measurement.two_routes(&rows) {

@@ -412,7 +412,7 @@ impl<'a> PredictionError<'a> {
                 let mut own = make();
                 let end = self.instants.len().min(BATCH * (part + 1));
                 for instant in &self.instants[BATCH * part..end] {
-                    if measurement.make(instant, rows).is_err() {
+                    if measurement.compute_rows(instant, rows).is_err() {
                         rows.clear();
                     }
                     let made = InstantRows {
@@ -607,7 +607,7 @@ pub(crate) fn friction<'b>(
             let mut sums = zero();
             let end = instants.len().min(BATCH * (part + 1));
             for instant in &instants[BATCH * part..end] {
-                if measurement.make(instant, rows).is_err() {
+                if measurement.compute_rows(instant, rows).is_err() {
                     continue;
                 }
                 for row in 0..rows.count {
