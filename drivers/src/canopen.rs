@@ -36,7 +36,7 @@ pub(crate) use recognise::{NO_PROFILE, Recognised, commands, questions, recognis
 pub(crate) use script::{READ, Script, ScriptStep, StartPlan};
 
 use crate::bytes::u16_le;
-use crate::family::Supervision;
+use crate::family::Session;
 use crate::objects::Objects;
 use crate::{Claim, Decoded, Frame, Spec, SpecError, bytes};
 use alloc::format;
@@ -242,7 +242,7 @@ impl NodeState {
         &mut self,
         node: u8,
         frame: &Frame,
-        link: &mut Supervision<Script<P>>,
+        session: &mut Session<Script<P>>,
         out: &mut Decoded,
     ) -> bool {
         let ids = [emcy(node), sdo_from(node), heartbeat(node), sdo_to(node)];
@@ -253,9 +253,9 @@ impl NodeState {
             return true;
         };
         if frame.id == sdo_from(node) {
-            link.questions.answer(data, frame, out);
+            session.questions.answer(data, frame, out);
         } else if frame.id == sdo_to(node) {
-            link.questions.overhear(data);
+            session.questions.overhear(data);
         } else if frame.id == emcy(node) {
             match data.len() {
                 8 => self.error = u16_le(data, 0),
@@ -268,9 +268,9 @@ impl NodeState {
                 [state] if state & 0x7F == OPERATIONAL => {}
                 [0] => {
                     self.error = 0;
-                    link.bringup.restart();
+                    session.bringup.restart();
                 }
-                [_] if link.bringup.is_watching() => link.bringup.restart(),
+                [_] if session.bringup.is_watching() => session.bringup.restart(),
                 [_] => {}
                 _ => out.fault(Counter::Length, 1, frame.id),
             }

@@ -11,7 +11,7 @@ use crate::canopen::{
     self, Cycle, NMT, NodeState, Object, Pdo, Rates, SYNC, Script, ScriptStep, StartPlan, is_free,
     nmt, node_of, object, tpdo,
 };
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::objects::Objects;
 use crate::signal::Bits;
 use crate::{
@@ -380,7 +380,7 @@ impl Encoder {
         at: usize,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<Script<EncoderStart>>,
+        session: &mut Session<Script<EncoderStart>>,
         out: &mut Decoded,
     ) {
         let Some(place) = self.places.get(at).copied() else {
@@ -389,8 +389,8 @@ impl Encoder {
         let Some(counts) = place.bits.of(data) else {
             return out.fault(Counter::Length, 1, frame.id);
         };
-        let Some(counts_per_turn) = link.questions.plan.known() else {
-            return link.questions.missed();
+        let Some(counts_per_turn) = session.questions.plan.known() else {
+            return session.questions.missed();
         };
         if !self.rates.is_first(at, |other| at < other) {
             return;
@@ -400,7 +400,7 @@ impl Encoder {
             _ => Some((frame.t, frame.stamp)),
         };
         let Some((acquired, stamp)) = measured else {
-            return link.lost(Counter::Unpaired, 1, frame, out);
+            return session.lost(Counter::Unpaired, 1, frame, out);
         };
         let mut quality = Quality::GOOD;
         if self.state.error != 0 {
@@ -415,7 +415,7 @@ impl Encoder {
             stamp,
             ..StampedReading::new(0, frame, quality, reading)
         };
-        link.give(stamped, frame, out);
+        session.give(stamped, frame, out);
     }
 }
 
@@ -425,10 +425,10 @@ impl Family for Encoder {
     fn on_frame(
         &mut self,
         frame: &Frame,
-        link: &mut Supervision<Script<EncoderStart>>,
+        session: &mut Session<Script<EncoderStart>>,
         out: &mut Decoded,
     ) {
-        if self.state.on_frame(self.node, frame, link, out) {
+        if self.state.on_frame(self.node, frame, session, out) {
             return;
         }
         let Some(data) = bytes::payload(frame, out) else {
@@ -437,7 +437,7 @@ impl Family for Encoder {
         if frame.id == SYNC {
             self.cycle.sync(frame);
         } else if let Some(at) = self.places.iter().position(|place| place.id == frame.id) {
-            self.position(at, data, frame, link, out);
+            self.position(at, data, frame, session, out);
         }
     }
 

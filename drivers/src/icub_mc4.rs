@@ -7,7 +7,7 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Supervised, Supervision, count_faults, quality_of};
+use crate::family::{Family, Session, Supervised, count_faults, quality_of};
 use crate::held::HeldValue;
 use crate::icub::{self, class};
 use crate::icub_motor::mode;
@@ -182,10 +182,10 @@ impl Mc4 {
         &self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<NoInquiry>,
+        session: &mut Session<NoInquiry>,
         out: &mut Decoded,
     ) {
-        let gap = link.bringup.reading(frame.t);
+        let gap = session.bringup.reading(frame.t);
         for (joint, output) in self.joints.iter().zip(0_u8..) {
             if !self.outputs.0.contains(&output) {
                 continue;
@@ -233,7 +233,7 @@ impl Mc4 {
 impl Family for Mc4 {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_MOTOR, self.address);
         let Some(kind @ (kind::POSITION | kind::STATUS | kind::VELOCITY)) = stream else {
             return;
@@ -242,7 +242,7 @@ impl Family for Mc4 {
             return;
         };
         match kind {
-            kind::POSITION => self.positions(data, frame, link, out),
+            kind::POSITION => self.positions(data, frame, session, out),
             kind::STATUS => self.status(data, frame, out),
             _ => {
                 for (joint, at) in self.joints.iter_mut().zip([0, 2]) {

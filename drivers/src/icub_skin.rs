@@ -7,7 +7,7 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::{
@@ -193,7 +193,7 @@ impl SkinPatch {
 impl Family for SkinPatch {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_SKIN, self.address);
         let Some(triangle) = stream else { return };
         let Some(data) = bytes::payload(frame, out) else {
@@ -222,7 +222,7 @@ impl Family for SkinPatch {
         let Paired::With(acquired, stamp, [first, second]) = paired else {
             return;
         };
-        if link.bringup.reading(frame.t) {
+        if session.bringup.reading(frame.t) {
             self.gap = self.seen;
         }
         let (skin, mut quality) = self.skin(triangle, first, second);

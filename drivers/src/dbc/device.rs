@@ -4,7 +4,7 @@
 use super::layout::{DbcLayout, ReadingLayout, SignalGroup, SignalRole, UsedSignal};
 use super::options::{DbcOptions, ReadingKeys};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::pairing::within;
 use crate::signal::Message;
 use crate::{
@@ -330,7 +330,7 @@ impl Driver for DbcOptions {
 impl Family for DbcDevice {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         // Who asks for a frame of the device says nothing of it.
         if matches!(frame.format, Format::Error | Format::Remote) {
             return;
@@ -358,7 +358,7 @@ impl Family for DbcDevice {
             if !has || !assembly.take(part, sender, frame, out) {
                 continue;
             }
-            let after_silence = link.bringup.reading(frame.t);
+            let after_silence = session.bringup.reading(frame.t);
             let number = u8::try_from(part.reading).unwrap_or(u8::MAX);
             if let Some(stamped) = assembly.finish(number, after_silence, frame, out) {
                 out.push(stamped, frame.id);

@@ -7,7 +7,7 @@ use super::frames::{
 };
 use super::options::{OpenImuKeys, OpenImuOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::group::FrameGroup;
 use crate::pairing::Limit;
 use crate::{
@@ -143,7 +143,7 @@ impl Driver for OpenImuOptions {
 impl Family for OpenImuSensor {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         let Some((pgn, source)) = group_and_source(frame.id) else {
             return;
         };
@@ -162,7 +162,7 @@ impl Family for OpenImuSensor {
         let mut dropped = 0;
         let add = |sample: &mut OpenImuSample| sample.add(quantity, part);
         let whole = (self.group).push(position, frame, OpenImuSample::EMPTY, add, &mut dropped);
-        link.lost(Counter::Unpaired, dropped, frame, out);
+        session.lost(Counter::Unpaired, dropped, frame, out);
         let Some(whole) = whole else { return };
         let OpenImuSample { imu, quality } = whole.content;
         let stamped = StampedReading {
@@ -170,7 +170,7 @@ impl Family for OpenImuSensor {
             stamp: whole.stamp,
             ..StampedReading::new(0, frame, quality, Reading::Imu(imu))
         };
-        link.give(stamped, frame, out);
+        session.give(stamped, frame, out);
     }
 
     fn reset(&mut self) {

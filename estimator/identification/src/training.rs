@@ -1,7 +1,7 @@
 //! The logs of an identification: the observations that can be used, why others are excluded, and
 //! the segments in which they are processed.
 
-use crate::dataset::observation::{Annotated, Observation, UnitSet};
+use crate::dataset::observation::{Annotated, Observation, SubtreeSet};
 use crate::dataset::{Dataset, LogRole};
 use crate::finding::{Finding, FindingCode, Severity};
 use crate::measurement::model::MeasurementModel;
@@ -67,10 +67,10 @@ pub(crate) struct PreparedLog {
     pub excluded: Vec<Excluded>,
     pub findings: Vec<Finding>,
     pub refused: bool,
-    /// Of a validation log: the units on which an undeclared disturbance acts, per instant; empty
-    /// if none was looked for. [`Annotated::disturbed`] stays empty there, because the figures of
+    /// Of a validation log: the sub-trees on which an undeclared disturbance acts, per instant;
+    /// empty if none was looked for. [`Annotated::disturbed`] stays empty there, because figures of
     /// such a log include all of its instants.
-    pub disturbed: Vec<UnitSet>,
+    pub disturbed: Vec<SubtreeSet>,
 }
 
 impl PreparedLog {

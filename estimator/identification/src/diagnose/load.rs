@@ -3,7 +3,7 @@
 //! Without it, .8 kg on the forearm in one of two logs raise the error on held-out torques from
 //! .7 % to several times that, and nothing names the cause.
 
-use crate::dataset::observation::{Annotated, Observation, UnitSet};
+use crate::dataset::observation::{Annotated, Observation, SubtreeSet};
 use crate::fit::NoiseAndMap;
 use crate::hypothesis::needed;
 use crate::linear::information::Information;
@@ -48,8 +48,8 @@ pub(crate) struct LoadChange {
     pub within: f64,
     /// Whether the excluded side is that after the change.
     pub is_after: bool,
-    /// The units whose equations contain it.
-    pub units: UnitSet,
+    /// The sub-trees whose equations contain it.
+    pub subtrees: SubtreeSet,
 }
 
 impl LoadChange {
@@ -248,7 +248,7 @@ pub(crate) fn find(
         clear: stamps(clear)?,
         within: segment_seconds(training[log]),
         is_after,
-        units: linked_units(measurement, place),
+        subtrees: linked_subtrees(measurement, place),
     })
 }
 
@@ -257,20 +257,20 @@ fn segment_seconds(log: &PreparedLog) -> f64 {
     ((log.span.1 - log.span.0).seconds() / SEGMENTS as f64).max(SEGMENT_SECONDS)
 }
 
-/// All units whose rows share links or channels with those of the link at this place.
-fn linked_units(measurement: &MeasurementModel<'_>, place: usize) -> UnitSet {
+/// All sub-trees whose rows share links or channels with those of the link at this place.
+fn linked_subtrees(measurement: &MeasurementModel<'_>, place: usize) -> SubtreeSet {
     let structure = &measurement.robot().structure;
     let (unknowns, groups) = (measurement.unknowns(), &measurement.groups().links);
-    let mut units = UnitSet::default();
+    let mut subtrees = SubtreeSet::default();
     for (other, group) in unknowns.links.iter().zip(groups) {
         if *group == groups[place] {
-            units.insert(structure.subtree_of(*other).unwrap_or(0));
+            subtrees.insert(structure.subtree_of(*other).unwrap_or(0));
             if !unknowns.joints.is_empty() {
-                units.insert(Observation::TORQUES);
+                subtrees.insert(Observation::TORQUES);
             }
         }
     }
-    units
+    subtrees
 }
 
 /// The search for a load that changes: what each segment tells, and all of them together.

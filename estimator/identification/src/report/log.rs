@@ -1,7 +1,7 @@
 //! The figures of one log: residuals, prediction errors, coverage, offsets, friction, findings.
 
 use crate::arithmetic::{dot, mean, rms};
-use crate::dataset::observation::{Annotated, UnitSet};
+use crate::dataset::observation::{Annotated, SubtreeSet};
 use crate::finding::{Finding, FindingCode};
 use crate::fit::Identified;
 use crate::measurement::channels::{channel_of, sensor_name};
@@ -272,12 +272,12 @@ pub(crate) fn undisturbed(
     identified: &Identified,
     sets: &[DVector<f64>; 2],
 ) -> Option<SensorComparison> {
-    if log.disturbed.iter().all(UnitSet::is_empty) {
+    if log.disturbed.iter().all(SubtreeSet::is_empty) {
         return None;
     }
     let mut instants = log.instants.clone();
-    for (instant, units) in instants.iter_mut().zip(&log.disturbed) {
-        instant.disturbed = *units;
+    for (instant, subtrees) in instants.iter_mut().zip(&log.disturbed) {
+        instant.disturbed = *subtrees;
     }
     let segment = LogSegment::alone(&instants);
     let residuals = residuals(measurement, segment, &identified.noise, sets);
