@@ -232,16 +232,16 @@ mod tests {
         };
         let mut estimator = estimator;
         estimator.header.published = NOW;
-        let of = |health: &GatewayHealth, estimator: &EstimatorHealth| {
+        let levels = |health: &GatewayHealth, estimator: &EstimatorHealth| {
             let all = of("arm", Some(health), Some(estimator), NOW);
             all.into_iter().map(|one| one.level).collect::<Vec<_>>()
         };
-        assert_eq!(of(&health, &estimator), [Level::Ok; 4]);
+        assert_eq!(levels(&health, &estimator), [Level::Ok; 4]);
         health.buses[0].interface.controller = Controller::Passive.in_memory();
         health.devices[0].state = DeviceState::Silent.in_memory();
         estimator.last_estimate = Nanos::from_millis(8_000);
         assert_eq!(
-            of(&health, &estimator),
+            levels(&health, &estimator),
             [Level::Ok, Level::Warn, Level::Error, Level::Error]
         );
         health.buses[0].link = LinkState::BusOff.in_memory();
@@ -249,7 +249,7 @@ mod tests {
         health.devices[0].frozen_axes = 1;
         estimator.last_estimate = Nanos::ZERO;
         assert_eq!(
-            of(&health, &estimator),
+            levels(&health, &estimator),
             [Level::Ok, Level::Error, Level::Warn, Level::Warn]
         );
     }

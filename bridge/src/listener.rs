@@ -327,11 +327,11 @@ impl Listener {
     /// their estimator, and are lost.
     #[must_use]
     pub fn lost_estimates(&self) -> u64 {
-        let of = |estimates: &Estimates| {
+        let lost = |estimates: &Estimates| {
             let drives = estimates.drives.as_ref().map_or(0, Reader::lost);
             estimates.torques.lost() + estimates.contacts.lost() + drives
         };
-        self.lost_estimates + self.estimates.as_ref().map_or(0, of)
+        self.lost_estimates + self.estimates.as_ref().map_or(0, lost)
     }
 
     /// Samples whose channel has no name: those of a gateway that has ended meanwhile.

@@ -80,12 +80,12 @@ pub(crate) fn run(args: &ExciteArgs) -> anyhow::Result<()> {
         None => None,
     };
     let at_work = setup.robot_as_identified();
-    let wrong = |problem: String| InvalidConfig {
+    let invalid = |problem: String| InvalidConfig {
         file: args.config.clone(),
         problem,
     };
-    let robot = without(&at_work, &args.absent).map_err(wrong)?;
-    let task = task(args, &config, &robot, known).map_err(wrong)?;
+    let robot = without(&at_work, &args.absent).map_err(invalid)?;
+    let task = task(args, &config, &robot, known).map_err(invalid)?;
     let wanted = task.wanted.clone();
     let file = || args.config.display().to_string();
     let planner = Planner::new(task, &at_work).with_context(file)?;

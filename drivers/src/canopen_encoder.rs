@@ -96,9 +96,9 @@ impl CanopenEncoderOptions {
     /// The counts per turn of this very encoder by its file: of 6001 if 6000 says that it is
     /// scaled.
     fn counts_of_file(&self) -> Option<f64> {
-        let own = |object: Object| self.objects.as_ref()?.own(object.index, object.sub);
-        let scaled = own(OPERATING).is_some_and(|parameters| parameters & SCALED != 0);
-        own(if scaled { SCALED_PER_TURN } else { PER_TURN }).map(f64::from)
+        let value = |object: Object| self.objects.as_ref()?.own(object.index, object.sub);
+        let scaled = value(OPERATING).is_some_and(|parameters| parameters & SCALED != 0);
+        value(if scaled { SCALED_PER_TURN } else { PER_TURN }).map(f64::from)
     }
 }
 

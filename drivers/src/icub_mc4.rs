@@ -88,22 +88,22 @@ struct StepSizes {
 
 impl IcubMc4Options {
     fn scales(&self) -> Result<[StepSizes; JOINTS], SpecError> {
-        let wrong = |key, value, expected| SpecError::Key {
+        let error = |key, value, expected| SpecError::Key {
             key,
             value,
             expected,
         };
         if !(1..=1000).contains(&self.hold_ms) {
-            return Err(wrong("hold_ms", f64::from(self.hold_ms), "1 to 1000"));
+            return Err(error("hold_ms", f64::from(self.hold_ms), "1 to 1000"));
         }
         for ticks in self.ticks_per_turn {
             if !(ticks > 0.0 && ticks.is_finite()) {
-                return Err(wrong("ticks_per_turn", ticks, "a number above 0"));
+                return Err(error("ticks_per_turn", ticks, "a number above 0"));
             }
         }
         for shift in self.velocity_shift {
             if shift > 15 {
-                return Err(wrong("velocity_shift", f64::from(shift), "0 to 15"));
+                return Err(error("velocity_shift", f64::from(shift), "0 to 15"));
             }
         }
         let [ticks0, ticks1] = self.ticks_per_turn;

@@ -60,11 +60,11 @@ pub fn check(
 ) -> anyhow::Result<Setup> {
     let (_, setup) = Setup::load(config, |_| {})?;
     let file = config.to_owned();
-    let wrong = |problem| InvalidConfig {
+    let invalid = |problem| InvalidConfig {
         file: file.clone(),
         problem,
     };
-    let posture = posture(&setup).map_err(wrong)?;
+    let posture = posture(&setup).map_err(invalid)?;
     let checked = Check::of(&setup, &posture).context("the configuration cannot be checked")?;
     // The reader of a pipe may close it early.
     let _ = write!(std::io::stdout(), "{setup}{checked}");

@@ -198,7 +198,7 @@ impl InertialState {
         let Some(parameters) = &self.identified else {
             return Vec::new();
         };
-        let of = |(place, offset): (usize, &Offset)| {
+        let deviation = |(place, offset): (usize, &Offset)| {
             let sensor = robot
                 .sensor(&offset.sensor)
                 .filter(|sensor| sensors.contains(sensor))?;
@@ -209,7 +209,7 @@ impl InertialState {
             .offsets()
             .iter()
             .enumerate()
-            .filter_map(of)
+            .filter_map(deviation)
             .collect()
     }
 

@@ -477,13 +477,13 @@ mod tests {
             ("nothing", String::new()),
         ];
         for (what, log) in cases {
-            let told = |read: Result<Recording, SampleLogError>| match read {
+            let outcome = |read: Result<Recording, SampleLogError>| match read {
                 Ok(recording) => format!("{recording:?}"),
                 Err(error) => error.to_string(),
             };
-            let expected = told(read_whole(&robot, &log));
+            let expected = outcome(read_whole(&robot, &log));
             for (block, segment) in [(700, 300), (5000, 1), (5000, 900), (BLOCK, SEGMENT)] {
-                let own = told(read_in_segments(&robot, log.as_bytes(), block, segment));
+                let own = outcome(read_in_segments(&robot, log.as_bytes(), block, segment));
                 assert!(
                     own == expected,
                     "{what}, {block}, {segment}: {own:.300} instead of {expected:.300}"

@@ -238,9 +238,9 @@ impl HealthLog {
             // One frame may report several causes: it is told once.
             let mut told: Vec<ErrorFrame> = Vec::new();
             for (cause, run) in BusError::ALL.into_iter().zip(&mut runs.errors) {
-                let of = |b: &BusHealth| b.errors.get(cause as usize).copied();
-                let count = of(bus).unwrap_or(0);
-                if run.begins(increase(count, before.and_then(of)) > 0)
+                let total = |b: &BusHealth| b.errors.get(cause as usize).copied();
+                let count = total(bus).unwrap_or(0);
+                if run.begins(increase(count, before.and_then(total)) > 0)
                     && let Some(frame) = statuses.get(i).and_then(|s| s.newest_error(cause))
                     && !told.contains(&frame)
                 {
@@ -280,9 +280,9 @@ impl HealthLog {
                 use Counter::{Frames, Frozen, OutOfRange, Readings, Starts};
                 !matches!(c, Frames | Frozen | OutOfRange | Readings | Starts)
             }) {
-                let of = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
-                let count = of(device).unwrap_or(0);
-                let new = increase(count, before.and_then(of));
+                let total = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
+                let count = total(device).unwrap_or(0);
+                let new = increase(count, before.and_then(total));
                 // Who joins a stream hears parts of groups that began before.
                 let joins = before.is_none_or(|b| b.state != DeviceState::Streaming);
                 if joins && counter == Counter::Unpaired {
@@ -367,8 +367,8 @@ fn log_doubts(device: &DeviceHealth, before: Option<&DeviceHealth>, runs: &mut D
         ),
     ];
     for ((counter, mask, what), doubted) in doubts.into_iter().zip(&mut runs.doubted) {
-        let of = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
-        let new = increase(of(device).unwrap_or(0), before.and_then(of));
+        let total = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
+        let new = increase(total(device).unwrap_or(0), before.and_then(total));
         let Some(run) = runs.faults.get_mut(counter as usize) else {
             continue;
         };

@@ -155,8 +155,8 @@ impl Operator {
             tracing::warn!(device = name, "not done: {error}");
             refusal(&format!("device {name:?}: {error}"))
         });
-        let own = |waiting: &PendingOrder| waiting.open.contains(&(bus, device));
-        if let Some(at) = self.waiting.iter().position(own) {
+        let waits_for_it = |waiting: &PendingOrder| waiting.open.contains(&(bus, device));
+        if let Some(at) = self.waiting.iter().position(waits_for_it) {
             let _ = self.waiting.swap_remove(at).answer.send(answer);
         }
     }

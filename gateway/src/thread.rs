@@ -350,7 +350,7 @@ mod tests {
             );
             Plan::parse(&text, Path::new(".")).unwrap()
         };
-        let told = |driver: &str, answer: Result<u32, Errno>| {
+        let check = |driver: &str, answer: Result<u32, Errno>| {
             let mut kernel = |_: &str| {
                 let health = |fd| InterfaceHealth {
                     fd,
@@ -360,14 +360,14 @@ mod tests {
             };
             check_fd(&plan(driver).buses[0], "can0", &mut kernel)
         };
-        let refused = told("moteus", Ok(0)).unwrap_err().to_string();
+        let refused = check("moteus", Ok(0)).unwrap_err().to_string();
         assert!(
             refused.contains("can0") && refused.contains("\"knee_drive\""),
             "{refused}"
         );
         assert!(refused.contains("fd on"), "{refused}");
-        assert!(told("moteus", Ok(1)).is_ok() && told("icub_motor", Ok(0)).is_ok());
-        assert!(told("moteus", Err(Errno::EPERM)).is_ok());
+        assert!(check("moteus", Ok(1)).is_ok() && check("icub_motor", Ok(0)).is_ok());
+        assert!(check("moteus", Err(Errno::EPERM)).is_ok());
     }
 
     /// The buses of one log begin at the instant that is common to all, not when each is opened.

@@ -33,11 +33,11 @@ pub fn wrong_urdf(
     relative: f64,
 ) -> Result<String, SimulatedRobotError> {
     let file = &robot.config.model;
-    let wrong = |cause| SimulatedRobotError::Model {
+    let error = |cause| SimulatedRobotError::Model {
         file: file.clone(),
         cause: Box::new(cause),
     };
-    let text = Model::read_text(file).map_err(wrong)?;
+    let text = Model::read_text(file).map_err(error)?;
     let truth = torques(robot, settings)?;
     let enough = ENOUGH.min(0.5 * relative);
     let mut best: Option<(f64, Model)> = None;
@@ -46,7 +46,7 @@ pub fn wrong_urdf(
         let mut other = robot.clone();
         for (link, inertia) in robot.model.inertias().iter().enumerate() {
             let body = another_body(inertia, relative, &mut random);
-            other.model.set_inertia(link, body).map_err(wrong)?;
+            other.model.set_inertia(link, body).map_err(error)?;
         }
         // The relative error of the joint with the smallest error.
         let least = torques(&other, settings)?
@@ -72,7 +72,7 @@ pub fn wrong_urdf(
         .map(|ft| ft.joint.as_str())
         .collect();
     let model = best.map_or_else(|| robot.model.clone(), |(_, model)| model);
-    Model::rewrite_urdf(&text, &keep, model.inertias()).map_err(wrong)
+    Model::rewrite_urdf(&text, &keep, model.inertias()).map_err(error)
 }
 
 /// Per joint, its torque at the instants compared, without pushes.

@@ -171,55 +171,55 @@ impl TorqueCase {
     fn withheld(&self, budget: &TorqueBudget, reason: Reason) -> Story {
         let channel = self.cause.as_deref().unwrap_or("a channel");
         let (likelier, residual) = (budget.likelier.as_str(), budget.unexplained.as_str());
-        let told = |head: String, because: &[&str], advice: &str| Story {
+        let story = |head: String, because: &[&str], advice: &str| Story {
             head,
             because: because.iter().map(|text| (*text).to_owned()).collect(),
             advice: advice.to_owned(),
         };
         let own = match reason {
             Reason::NeverSeen | Reason::Stale => return self.silent(channel),
-            Reason::Saturated => told(
+            Reason::Saturated => story(
                 format!("{channel} is saturated"),
                 &["a reading at the end of its range says only that the load is at least that"],
                 "lessen the load; if this load is usual, use a larger range of the sensor",
             ),
-            Reason::DeviceFault => told(
+            Reason::DeviceFault => story(
                 format!("the board of {channel} reports a fault"),
                 &[],
                 "its manual tells what its fault means and how to clear it; `proprio status` has \
                  its counters",
             ),
-            Reason::Frozen => told(
+            Reason::Frozen => story(
                 format!("{channel} is frozen: it repeats its readings instead of measuring"),
                 &[],
                 "switch its board off and on; if it freezes again, its firmware or its amplifier \
                  is at fault",
             ),
-            Reason::Implausible => told(
+            Reason::Implausible => story(
                 format!("{channel} sends readings that contradict the ones before and after"),
                 &[],
                 "look for loose connectors at the sensor, and for error frames on its bus \
                  (`proprio status`)",
             ),
-            Reason::Starting => told(
+            Reason::Starting => story(
                 format!(
                     "{channel} has too few samples without a gap for velocity and acceleration"
                 ),
                 &[],
                 "wait for some tens of samples; if it lasts, the channel loses samples or is slow",
             ),
-            Reason::NoStance => told(
+            Reason::NoStance => story(
                 "no link is known to stand still".to_owned(),
                 &["the base moves, and no IMU measures how"],
                 "declare the foot that stands (<robot>/contact/declared), or configure an IMU",
             ),
-            Reason::NotFinite => told(
+            Reason::NotFinite => story(
                 "the result is no finite number".to_owned(),
                 &[],
                 "look for readings or parameters without sense: `proprio echo`, `proprio \
                  estimator --check`",
             ),
-            Reason::Undetermined => told(
+            Reason::Undetermined => story(
                 format!(
                     "the contacts that are present have more unknowns than the F/T sensors have \
                      equations: {}",
@@ -231,7 +231,7 @@ impl TorqueCase {
                  those that can not exert a torque",
             ),
             Reason::Uncertain => self.uncertain(budget),
-            Reason::Unexplained => told(
+            Reason::Unexplained => story(
                 format!(
                     "an undeclared contact or load, another F/T offset, or F/T readings that are \
                      late: {residual}"
@@ -240,12 +240,12 @@ impl TorqueCase {
                 "let go of the robot; if something may touch it there, configure a [[contact]]; \
                  if nothing does, tare the sensor or identify again",
             ),
-            Reason::Contradicted if !likelier.is_empty() => told(
+            Reason::Contradicted if !likelier.is_empty() => story(
                 format!("the readings contradict the configuration: {likelier}"),
                 &["this explains them far better than what is configured"],
                 "correct the configuration or the wiring, and restart the estimator",
             ),
-            Reason::Contradicted => told(
+            Reason::Contradicted => story(
                 format!(
                     "the readings have contradicted the configuration since the start: {residual}"
                 ),
@@ -256,7 +256,7 @@ impl TorqueCase {
                 "move the robot without a contact for some seconds; if it stays, check the F/T \
                  offset, then base and mounting in estimator.toml",
             ),
-            Reason::Absent | Reason::None => told(reason.word().to_owned(), &[], ""),
+            Reason::Absent | Reason::None => story(reason.word().to_owned(), &[], ""),
         };
         self.with_board(own)
     }

@@ -32,10 +32,10 @@ impl Ranges {
 
     /// The end of range `place`, if it is known.
     fn end(&self, place: usize) -> Option<f64> {
-        let of = |ends: &[Option<f64>; 3]| ends.get(place).copied().flatten();
-        of(&self.keys.stated)
-            .or_else(|| of(&self.told))
-            .or_else(|| of(&self.keys.of_model))
+        let end = |ends: &[Option<f64>; 3]| ends.get(place).copied().flatten();
+        end(&self.keys.stated)
+            .or_else(|| end(&self.told))
+            .or_else(|| end(&self.keys.of_model))
     }
 
     /// Position, velocity and torque, if all are known.

@@ -255,13 +255,13 @@ fn residuals_of_folds<'a>(
     for block in blocks {
         folds[block.range.clone()].fill(block.fold);
     }
-    let own = |channel: usize| {
+    let channel_noise = |channel: usize| {
         (0..count)
             .map(|i| residuals.noise[folds[i]][channel][i])
             .collect()
     };
-    let own: Vec<Vec<f64>> = (0..residuals.measured.len()).map(own).collect();
-    residuals.noise = vec![own];
+    let noise: Vec<Vec<f64>> = (0..residuals.measured.len()).map(channel_noise).collect();
+    residuals.noise = vec![noise];
     for (range, block) in residuals.ranges.iter().zip(&mut residuals.nuisance) {
         let set = folds.get(range.start).copied().unwrap_or(0);
         block.x = block.x.columns(set, 1).into_owned();

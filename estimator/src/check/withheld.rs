@@ -257,8 +257,8 @@ fn trial(setup: &Setup, still: &Still) -> TrialEnd {
 
 /// What sensor number `sensor` sends: its load and offset before calibration.
 fn raw(setup: &Setup, still: &Still, sensor: usize) -> proprio_topics::Wrench {
-    let of = |wrenches: &[Wrench]| wrenches.get(sensor).copied().unwrap_or(Wrench::zero());
-    let corrected = of(&still.loads) + of(&setup.initial.offsets);
+    let wrench = |wrenches: &[Wrench]| wrenches.get(sensor).copied().unwrap_or(Wrench::zero());
+    let corrected = wrench(&still.loads) + wrench(&setup.initial.offsets);
     let gain = setup.initial.calibrations.get(sensor).map(|c| *c.gain());
     let inverse = gain.and_then(Matrix6::try_inverse);
     let corrected = Vector6::from(corrected.torque_first());

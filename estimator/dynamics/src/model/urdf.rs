@@ -543,7 +543,7 @@ impl Coordinates {
                 let Some((follows, multiplier, shift)) = leader.mimic else {
                     break;
                 };
-                let wrong = |reason| ModelError::Mimic {
+                let error = |reason| ModelError::Mimic {
                     place: leader.node.child("mimic").map_or_else(
                         || place(leader.node, leader.node),
                         |mimic| place(mimic, leader.node),
@@ -555,13 +555,13 @@ impl Coordinates {
                     break;
                 };
                 if next.kind.is_none() {
-                    return Err(wrong(
+                    return Err(error(
                         "is the motion of the whole robot; name a joint of the robot, or remove \
                          the <mimic>",
                     ));
                 }
                 if steps == joints.len() {
-                    return Err(wrong(
+                    return Err(error(
                         "leads back to the joint itself; one of these joints must follow none",
                     ));
                 }

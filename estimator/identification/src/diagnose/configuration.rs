@@ -366,8 +366,8 @@ impl ConfigurationEvidence {
                 [(0, torque, LEVER * weight), (1, force, weight)].map(|(kind, noise, most)| {
                     let reading = self.readings(|other| {
                         let is_own = |i: usize| other == sensor && i / 3 == kind;
-                        let own = |i: usize, _| if is_own(i) { 1.0 } else { 0.0 };
-                        Matrix6::from_diagonal(&Vector6::from_fn(own))
+                        let weight = |i: usize, _| if is_own(i) { 1.0 } else { 0.0 };
+                        Matrix6::from_diagonal(&Vector6::from_fn(weight))
                     });
                     let group = &self.groups[1 + 2 * sensor + kind];
                     let compared = TorqueComparison::new(&group.gram, group.rows, &reading)?;

@@ -324,10 +324,10 @@ impl<'a> Search<'a> {
         }
         let (r, z) = sum.to_triangle();
         let each = (0..logs).filter(|_| logs > 1).map(Some);
-        let zeros = [None].into_iter().chain(each).flat_map(|log| {
-            let of = move |joint| SetupError::Zero { joint, log };
-            (0..joints).map(of)
-        });
+        let zeros = [None]
+            .into_iter()
+            .chain(each)
+            .flat_map(|log| (0..joints).map(move |joint| SetupError::Zero { joint, log }));
         let mut search = Self {
             measurement,
             training,

@@ -373,7 +373,7 @@ mod tests {
 
     #[test]
     fn two_findings_of_one_load_change_are_merged() {
-        let of = |loads: &[LoadChange]| {
+        let merged = |loads: &[LoadChange]| {
             let mut undeclared = Undeclared::none(std::iter::empty());
             loads
                 .iter()
@@ -383,7 +383,7 @@ mod tests {
         };
         let first = load(0, 3, 23, 1.0);
         for sooner in [22, 24] {
-            let [one] = of(&[first.clone(), load(0, 3, sooner, 1.0)])
+            let [one] = merged(&[first.clone(), load(0, 3, sooner, 1.0)])
                 .try_into()
                 .unwrap();
             // All instants that may have the load are excluded; those that surely have it give its
@@ -392,13 +392,16 @@ mod tests {
             assert_eq!(one.clear, load(0, 3, sooner.max(23), 1.0).clear);
         }
         // In a long log the time of a change is known to a longer segment.
-        assert_eq!(of(&[load(0, 3, 40, 9.4), load(0, 3, 31, 9.4)]).len(), 1);
+        assert_eq!(merged(&[load(0, 3, 40, 9.4), load(0, 3, 31, 9.4)]).len(), 1);
         for other in [
             load(1, 3, 22, 1.0),
             load(0, 4, 22, 1.0),
             load(0, 3, 18, 1.0),
         ] {
-            assert_eq!(of(&[first.clone(), other.clone()]), [first.clone(), other]);
+            assert_eq!(
+                merged(&[first.clone(), other.clone()]),
+                [first.clone(), other]
+            );
         }
     }
 }

@@ -433,7 +433,7 @@ pub(crate) mod tests {
             seconds: Seconds::default(),
         };
         let far = [[9.0, 9.0], [5.0, 7.0]].map(noise);
-        let of = |rounds: &[[f64; 2]]| {
+        let cycle_end = |rounds: &[[f64; 2]]| {
             let rounds: Vec<NoiseModel> = far
                 .iter()
                 .cloned()
@@ -441,12 +441,12 @@ pub(crate) mod tests {
                 .collect();
             NoiseModel::end_limit_cycle(&rounds, 0.03)
         };
-        assert_eq!(of(&[[1.0, 2.0], [1.2, 2.0], [1.5, 2.0]]), None);
+        assert_eq!(cycle_end(&[[1.0, 2.0], [1.2, 2.0], [1.5, 2.0]]), None);
         assert_eq!(
-            of(&[[1.0, 2.0], [1.2, 2.0], [1.201, 2.0]]),
+            cycle_end(&[[1.0, 2.0], [1.2, 2.0], [1.201, 2.0]]),
             Some(noise([1.201, 2.0]))
         );
-        let found = of(&[
+        let found = cycle_end(&[
             [3.0, 3.0],
             [1.0, 2.2],
             [1.3, 2.0],
