@@ -245,16 +245,16 @@ impl Listener {
         stop: &AtomicBool,
         mut say: impl FnMut(&str),
     ) -> Result<Option<Self>, ListenError> {
-        let mut told = String::new();
+        let mut last_why = String::new();
         while !stop.load(Relaxed) {
             match Self::open(config, robot) {
                 Ok(listener) => return Ok(Some(listener)),
                 Err(error @ ListenError::Several { .. }) => return Err(error),
                 Err(error) => {
                     let why = error.to_string();
-                    if why != told {
+                    if why != last_why {
                         say(&why);
-                        told = why;
+                        last_why = why;
                     }
                 }
             }

@@ -204,16 +204,16 @@ fn limits(
     given: &[String],
 ) -> Result<Vec<Option<JointLimits>>, String> {
     let model = &robot.model;
-    let mut own: Vec<KnownLimits> = (0..model.dof_count())
+    let mut limits: Vec<KnownLimits> = (0..model.dof_count())
         .map(|dof| urdf_limits(model, dof))
         .collect();
     for text in given {
         let (dof, values) = given_limits(model, dofs, text)?;
-        for (place, value) in own[dof].iter_mut().zip(values) {
+        for (place, value) in limits[dof].iter_mut().zip(values) {
             *place = Some(value);
         }
     }
-    let is_free = |dof: &&usize| own[**dof].iter().take(3).any(Option::is_none);
+    let is_free = |dof: &&usize| limits[**dof].iter().take(3).any(Option::is_none);
     let free: Vec<&str> = dofs
         .iter()
         .filter(is_free)
@@ -227,7 +227,7 @@ fn limits(
         ));
     }
     let complete = |dof: usize| {
-        let [lower, upper, velocity, acceleration] = own[dof];
+        let [lower, upper, velocity, acceleration] = limits[dof];
         let (lower, upper, velocity) = (lower?, upper?, velocity?);
         dofs.contains(&dof).then_some(JointLimits {
             range: Limits { lower, upper },

@@ -159,20 +159,20 @@ impl Cycle {
     /// When the node measured what `frame` holds: at its SYNC; at its own stamp if it measures by
     /// itself, or no SYNC is heard. `None` if it is not known which SYNC was its.
     pub(crate) fn measured(&mut self, frame: &Frame) -> Option<(Nanos, StampKind)> {
-        let own = (frame.t, frame.stamp);
+        let stamp = (frame.t, frame.stamp);
         let (Some(last), 1..) = (self.last, self.every) else {
-            return Some(own);
+            return Some(stamp);
         };
         let is_late = last.1 != StampKind::None && frame.t < last.0;
         if self.every > 1 {
             return if is_late { self.before } else { self.last };
         }
         match self.open {
-            0 => Some(own),
+            0 => Some(stamp),
             1 => {
                 self.open = 0;
                 // The host may have noted its own SYNC late.
-                Some(if is_late { own } else { last })
+                Some(if is_late { stamp } else { last })
             }
             _ => {
                 self.open -= 1;

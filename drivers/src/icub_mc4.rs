@@ -210,8 +210,8 @@ impl Mc4 {
         let &[faults0, mode0, faults1, mode1, _, shared, ..] = data else {
             return;
         };
-        let told = [(faults0, mode0), (faults1, mode1)];
-        let joints = self.joints.iter_mut().zip(told).zip(fault::BOARD);
+        let reports = [(faults0, mode0), (faults1, mode1)];
+        let joints = self.joints.iter_mut().zip(reports).zip(fault::BOARD);
         for (((joint, (faults, mode)), mask), output) in joints.zip(0_u8..) {
             let faults = u32::from(faults) | u32::from(shared) << 8 & mask;
             let mode = u32::from(mode);

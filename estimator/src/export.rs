@@ -60,8 +60,8 @@ pub fn parameters(
             rows.extend(own);
             let calibrations = outcome.covariance.calibrations.iter();
             let calibrations = calibrations.zip(outcome.covariance.columns.len()..);
-            let own = calibrations.filter(|((other, _), _)| *other == sensor);
-            of_calibrations.extend(own.map(|(_, row)| row));
+            let calibrated = calibrations.filter(|((other, _), _)| *other == sensor);
+            of_calibrations.extend(calibrated.map(|(_, row)| row));
         }
     }
     rows.extend(of_calibrations);

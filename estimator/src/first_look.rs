@@ -250,7 +250,7 @@ mod tests {
         let (mut look, full, empty) = {
             let (full, windows) = mpsc::sync_channel(1);
             let (returned, empty) = mpsc::sync_channel(1);
-            let look = FirstLook {
+            let first_look = FirstLook {
                 buffer: Some(Vec::with_capacity(100_000)),
                 began: None,
                 last: vec![Nanos::MIN; 2],
@@ -258,7 +258,7 @@ mod tests {
                 full,
                 empty,
             };
-            (look, windows, returned)
+            (first_look, windows, returned)
         };
         let reading = Reading::Wrench(proprio_topics::Wrench {
             force: [0.0; 3],

@@ -341,17 +341,17 @@ fn with_gains(
         row.columns_mut(columns + 6 * number, 6).fill(GAIN);
         for (place, (other, offset)) in group.sensors.iter().zip(group.offsets).enumerate() {
             if *other == sensor {
-                let own = offset.torque_first().map(|channel| GAIN * channel);
+                let values = offset.torque_first().map(|channel| GAIN * channel);
                 let first = 10 * group.links.len() + 6 * place;
-                row.columns_mut(first, 6).copy_from_slice(&own);
+                row.columns_mut(first, 6).copy_from_slice(&values);
             }
         }
         for (place, (&link, body)) in group.links.iter().zip(group.bodies).enumerate() {
             let subtree = robot.structure.subtree_of(link);
             let subtree = subtree.and_then(|number| robot.structure.subtrees().get(number));
             if subtree.is_some_and(|own| own.sensors.iter().eq([sensor])) {
-                let own = body.parameters().map(|parameter| GAIN * parameter);
-                row.columns_mut(10 * place, 10).copy_from_slice(&own);
+                let values = body.parameters().map(|parameter| GAIN * parameter);
+                row.columns_mut(10 * place, 10).copy_from_slice(&values);
             }
         }
     }

@@ -297,11 +297,11 @@ impl Parameters {
         for (number, inertia) in inertias {
             let link = new.links.get_mut(*number);
             let link = link.filter(|link| link.identified.is_none());
-            let wrong = ParametersError::Link {
+            let error = ParametersError::Link {
                 number: *number,
                 count,
             };
-            link.ok_or(wrong)?.identified = Some(inertia.parameters());
+            link.ok_or(error)?.identified = Some(inertia.parameters());
         }
         // In the file links are in the order of the model.
         let mut order: Vec<usize> = (0..inertias.len()).collect();

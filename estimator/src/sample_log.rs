@@ -483,10 +483,10 @@ mod tests {
             };
             let expected = outcome(read_whole(&robot, &log));
             for (block, segment) in [(700, 300), (5000, 1), (5000, 900), (BLOCK, SEGMENT)] {
-                let own = outcome(read_in_segments(&robot, log.as_bytes(), block, segment));
+                let found = outcome(read_in_segments(&robot, log.as_bytes(), block, segment));
                 assert!(
-                    own == expected,
-                    "{what}, {block}, {segment}: {own:.300} instead of {expected:.300}"
+                    found == expected,
+                    "{what}, {block}, {segment}: {found:.300} instead of {expected:.300}"
                 );
             }
         }

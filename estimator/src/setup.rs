@@ -544,9 +544,9 @@ pub(crate) fn gravity_loads(model: &Model) -> Vec<f64> {
         let (mass, moment) = (mass + more, moment + moment_of_more);
         if let Some(load) = joint.dof.and_then(|dof| loads.get_mut(dof)) {
             let is_prismatic = matches!(joint.kind, JointKind::Prismatic(_));
-            let own = STANDARD_GRAVITY * if is_prismatic { mass } else { moment };
+            let effort = STANDARD_GRAVITY * if is_prismatic { mass } else { moment };
             // Joints that follow add what they carry.
-            *load += own * joint.ratio.abs();
+            *load += effort * joint.ratio.abs();
         }
         if let Some((sum, moments)) = beyond.get_mut(joint.parent) {
             *sum += mass;

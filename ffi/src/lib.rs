@@ -118,13 +118,13 @@ unsafe fn text(pointer: *const c_char) -> Option<String> {
 /// `to` is null or has room for `size` bytes.
 unsafe fn put_at(text: &str, to: *mut c_char, size: usize) {
     if !to.is_null() {
-        let mut own = [0; 512];
-        let size = size.min(own.len());
-        if let Some(part) = own.get_mut(..size) {
+        let mut buffer = [0; 512];
+        let size = size.min(buffer.len());
+        if let Some(part) = buffer.get_mut(..size) {
             put(text, part);
         }
-        // SAFETY: the caller's promise; `own` has as many.
-        unsafe { to.copy_from_nonoverlapping(own.as_ptr(), size) };
+        // SAFETY: the caller's promise; `buffer` has as many.
+        unsafe { to.copy_from_nonoverlapping(buffer.as_ptr(), size) };
     }
 }
 

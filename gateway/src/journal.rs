@@ -180,8 +180,8 @@ mod tests {
         (0..10_000).for_each(|_| log());
         let taken = std::iter::from_fn(read).count();
         log();
-        let told = format!("LOST_LINES={}\n", 10_000 - taken);
-        assert!(taken > 0 && read().unwrap().ends_with(&told));
+        let expected = format!("LOST_LINES={}\n", 10_000 - taken);
+        assert!(taken > 0 && read().unwrap().ends_with(&expected));
         log();
         assert!(!read().unwrap().contains("LOST"));
     }

@@ -350,13 +350,13 @@ impl Operator {
 
 /// The answer to a tare, which is told in the log.
 fn tared(name: &str, added: Option<Wrench>) -> Json {
-    let told = match added {
+    let text = match added {
         Some(Wrench { force, torque }) => format!("the board adds {force:?} N, {torque:?} Nm"),
         None => "the present load is its zero".to_owned(),
     };
     tracing::warn!(
         device = name,
-        "tared: {told} from now on; offsets identified before no longer hold"
+        "tared: {text} from now on; offsets identified before no longer hold"
     );
     let added = added.map(|added| json!({ "force_n": added.force, "torque_nm": added.torque }));
     json!({ "ok": true, "device": name, "added": added })

@@ -330,13 +330,13 @@ mod tests {
 
     #[test]
     fn an_interface_is_claimed_by_one_gateway_at_a_time() {
-        let own = Adapter::Interface(format!("none{}", std::process::id()));
+        let adapter = Adapter::Interface(format!("none{}", std::process::id()));
         let other = Adapter::Interface(format!("other{}", std::process::id()));
-        let first = claim_interface(&own);
-        assert!(first.is_some() && claim_interface(&own).is_none());
+        let first = claim_interface(&adapter);
+        assert!(first.is_some() && claim_interface(&adapter).is_none());
         assert!(claim_interface(&other).is_some());
         drop(first);
-        assert!(claim_interface(&own).is_some());
+        assert!(claim_interface(&adapter).is_some());
     }
 
     #[test]

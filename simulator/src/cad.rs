@@ -146,15 +146,15 @@ mod tests {
     fn the_wrong_urdf_is_of_bodies_that_exist_and_is_as_wrong_as_asked() {
         let robot = SimulatedRobot::open("icub_left_arm").unwrap();
         let text = wrong_urdf(&robot, &SimulationSettings::default(), 0.2).unwrap();
-        let wrong = model(&robot, &text);
-        assert_eq!(wrong.link_count(), robot.model.link_count());
-        for (link, (body, truth)) in wrong
+        let wrong_model = model(&robot, &text);
+        assert_eq!(wrong_model.link_count(), robot.model.link_count());
+        for (link, (body, truth)) in wrong_model
             .inertias()
             .iter()
             .zip(robot.model.inertias())
             .enumerate()
         {
-            let name = wrong.link_name(link);
+            let name = wrong_model.link_name(link);
             if truth.mass == 0.0 {
                 assert_eq!(body, truth, "{name}");
                 continue;
@@ -177,7 +177,7 @@ mod tests {
             );
         }
         // Everything else is unchanged: geometry, limits, sensors.
-        assert_eq!(wrong.joints(), robot.model.joints());
+        assert_eq!(wrong_model.joints(), robot.model.joints());
     }
 
     #[test]

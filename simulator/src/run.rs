@@ -401,9 +401,9 @@ fn sources(
         return Err(RunOptionsError::Seconds(seconds));
     }
     let plans = &robot.plan.buses;
-    let own: Vec<FrameSource> = plans.iter().map(|b| b.source.clone()).collect();
+    let sources: Vec<FrameSource> = plans.iter().map(|b| b.source.clone()).collect();
     let sources = if options.buses.is_empty() {
-        own
+        sources
     } else {
         options.buses.clone()
     };

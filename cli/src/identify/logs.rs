@@ -65,8 +65,8 @@ pub(super) fn names(files: &[(&PathBuf, LogRole)]) -> Vec<String> {
                     .count()
                     == 1
             };
-            let told = (1..=most).find(alone).map(|parts| short(file, parts));
-            told.unwrap_or_else(|| file.display().to_string())
+            let name = (1..=most).find(alone).map(|parts| short(file, parts));
+            name.unwrap_or_else(|| file.display().to_string())
         })
         .collect()
 }

@@ -58,11 +58,11 @@ impl Ranges {
             return out.fault(Counter::Value, 1, frame.id);
         }
         let value = f64::from(value);
-        let told = self
+        let before = self
             .told
             .get_mut(place)
             .and_then(|told| told.replace(value));
-        if told.is_some_and(|told| told != value) {
+        if before.is_some_and(|told| told != value) {
             out.fault(Counter::Changed, 1, frame.id);
         }
         if place == self.next && self.mode == Mode::Supervise {

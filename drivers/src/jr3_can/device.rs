@@ -172,7 +172,7 @@ impl Driver for Jr3CanOptions {
         let [p0, p1, p2, p3] = ((period.0 / 1000) as u32).to_le_bytes();
         bringup.start_with(id(op::START, node), &[c0, c1, p0, p1, p2, p3]);
         bringup.stop_with(id(op::STOP, node), &[]);
-        let own = [op::FORCE, op::MOMENT, op::ACKNOWLEDGE, op::BOOT_UP];
+        let codes = [op::FORCE, op::MOMENT, op::ACKNOWLEDGE, op::BOOT_UP];
         let heard = [
             op::START_SYNC,
             op::START,
@@ -180,7 +180,7 @@ impl Driver for Jr3CanOptions {
             op::GET_FORCE_SCALES,
             op::GET_MOMENT_SCALES,
         ];
-        let own = own.map(|op| Claim::exclusive(id(op, node)));
+        let exclusive = codes.map(|op| Claim::exclusive(id(op, node)));
         let heard = heard.map(|op| Claim::shared(id(op, node)));
         let this = Jr3 {
             node,
@@ -192,7 +192,7 @@ impl Driver for Jr3CanOptions {
             tare: TareCommand::default(),
             outcome: None,
         };
-        let claims = own.into_iter().chain(heard);
+        let claims = exclusive.into_iter().chain(heard);
         Ok(Supervised::boxed(claims, bringup, scales, this))
     }
 }

@@ -46,17 +46,17 @@ impl OpenImuSample {
         let merits = data[6];
         let is_wrong = |bit: &u8| merits >> bit & 3 == merit::ERROR;
         let counts = [0, 2, 4].map(|at| u32::from(bytes::u16_le(data, at)));
-        let mut wrong = false;
+        let mut any_wrong = false;
         match quantity {
             OpenImuQuantity::Orientation => {
                 let angle = |at| ANGLE.value(bytes::u32_le(data, at) & 0xFF_FFFF);
                 this.imu.orientation = quaternion(angle(0)?, angle(3)?);
-                wrong = merit::OF_ANGLES.iter().any(is_wrong);
+                any_wrong = merit::OF_ANGLES.iter().any(is_wrong);
             }
             OpenImuQuantity::Acceleration => {
                 let values = all(counts.map(|count| ACCELERATION.value(count)))?;
                 this.imu.proper_acceleration = plan.upright.turn(plan.axes.exchange(values));
-                wrong = merit::OF_AXES.iter().any(is_wrong);
+                any_wrong = merit::OF_AXES.iter().any(is_wrong);
             }
             OpenImuQuantity::AngularVelocity => {
                 let values = all(counts.map(|count| RATE.value(count)))?;
@@ -70,11 +70,11 @@ impl OpenImuSample {
                         _ => Saturation::None,
                     };
                     this.quality = this.quality.with_saturation(axis, end);
-                    wrong |= end == Saturation::None && is_wrong(bit);
+                    any_wrong |= end == Saturation::None && is_wrong(bit);
                 }
             }
         }
-        if wrong {
+        if any_wrong {
             this.quality |= Quality::DEVICE_FAULT;
         }
         Some(this)

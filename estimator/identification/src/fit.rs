@@ -117,13 +117,13 @@ pub(crate) fn parameters_without_cad(
     let (r, z) = information.to_triangle();
     let (rows, precision) = (r.nrows(), &unknowns.precision);
     while !columns.is_empty() {
-        let mut own = r
+        let mut system = r
             .select_columns(&columns)
             .resize_vertically(rows + columns.len(), 0.0);
         for (place, &column) in columns.iter().enumerate() {
-            own[(rows + place, place)] = precision[column - unknowns.inertial()].sqrt();
+            system[(rows + place, place)] = precision[column - unknowns.inertial()].sqrt();
         }
-        let qr = own.qr();
+        let qr = system.qr();
         let right = qr
             .q()
             .tr_mul(&z.clone().resize_vertically(rows + columns.len(), 0.0));
@@ -172,7 +172,7 @@ pub(crate) fn without_negative_rotors(
         let precision: Vec<f64> = of_kept
             .map(|column| precision[column - unknowns.inertial()])
             .collect();
-        let own = Posterior::new(
+        let refit = Posterior::new(
             prior,
             &unknowns.links,
             &r.select_columns(&keep),
@@ -181,7 +181,7 @@ pub(crate) fn without_negative_rotors(
         )?
         .fit(fit.tau)?;
         x = DVector::zeros(unknowns.parameters());
-        for (&column, value) in keep.iter().zip(&own.x) {
+        for (&column, value) in keep.iter().zip(&refit.x) {
             x[column] = *value;
         }
     }

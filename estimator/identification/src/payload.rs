@@ -172,12 +172,12 @@ fn precision(known: &KnownParameters, links: &[usize]) -> Option<DMatrix<f64>> {
     }
     // Scaled by the deviations, since kilograms and kg m^2 differ by decades.
     let of_known: Vec<usize> = columns.iter().map(|(_, column)| *column).collect();
-    let mut own = known.root.select_columns(&of_known);
-    let deviations: Vec<f64> = own.column_iter().map(|column| column.norm()).collect();
-    for (mut column, deviation) in own.column_iter_mut().zip(&deviations) {
+    let mut root = known.root.select_columns(&of_known);
+    let deviations: Vec<f64> = root.column_iter().map(|column| column.norm()).collect();
+    for (mut column, deviation) in root.column_iter_mut().zip(&deviations) {
         column /= *deviation;
     }
-    let inverse = own.tr_mul(&own).cholesky()?.inverse();
+    let inverse = root.tr_mul(&root).cholesky()?.inverse();
     let size = LINK_PARAMETERS * links.len();
     let mut precision = DMatrix::zeros(size, size);
     for (i, (row, _)) in columns.iter().enumerate() {

@@ -223,8 +223,8 @@ fn trial(setup: &Setup, still: &Still) -> TrialEnd {
     let calibrations = setup.initial.calibrations.iter().enumerate();
     let temperatures: Vec<(usize, Reading)> = calibrations
         .filter_map(|(number, calibration)| {
-            let own = ChannelRole::Sensor(number);
-            let channel = robot.channels.iter().position(|c| c.role == own)?;
+            let role = ChannelRole::Sensor(number);
+            let channel = robot.channels.iter().position(|c| c.role == role)?;
             let celsius = calibration.reference()?;
             Some((channel, Reading::Temperature(Temperature { celsius })))
         })

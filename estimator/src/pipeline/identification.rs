@@ -443,9 +443,10 @@ impl OnlineIdentification {
             // Separate statistics: angular acceleration may be absent at times.
             let mut none = [SignalStatistics::default(); 3];
             let of_axis = first + 3 * axis..first + 3 * axis + 3;
-            let own = self.statistics.get_mut(of_axis);
-            let [of_rate, of_angular, of_linear]: &mut [SignalStatistics; 3] =
-                own.and_then(|own| own.try_into().ok()).unwrap_or(&mut none);
+            let statistics = self.statistics.get_mut(of_axis);
+            let [of_rate, of_angular, of_linear]: &mut [SignalStatistics; 3] = statistics
+                .and_then(|own| own.try_into().ok())
+                .unwrap_or(&mut none);
             let gyro = self.differentiator.fit(3 + axis, of_rate, (sigma, 1));
             let alpha = match self.differentiator.is_complete(6 + axis) {
                 true => self.differentiator.fit(6 + axis, of_angular, (f64::NAN, 0))[0],

@@ -191,16 +191,16 @@ impl OffsetStepCover {
             let Some(change) = step.change() else {
                 continue;
             };
-            let own = structure.subtrees()[number]
+            let lingering_here = structure.subtrees()[number]
                 .contacts
                 .intersection(lingering);
-            self.contacts = self.contacts.union(&own);
+            self.contacts = self.contacts.union(&lingering_here);
             self.readings.copy_from_slice(readings);
             let Some(reading) = self.readings.get_mut(step.sensor) else {
                 continue;
             };
             *reading += change;
-            let active = known.union(&lingering.difference(&own));
+            let active = known.union(&lingering.difference(&lingering_here));
             let solved =
                 self.solver
                     .solve(model, structure, kinematics, &self.readings, &active, &[]);

@@ -126,11 +126,11 @@ impl Wiring {
     /// The number of the channel `name`, if it is a joint's.
     pub(super) fn channel(&self, name: &str) -> Option<u32> {
         let shaft = self.plan.shafts.iter().find(|shaft| shaft.name == name);
-        let own = shaft.and_then(|shaft| match shaft.role {
+        let channel = shaft.and_then(|shaft| match shaft.role {
             ShaftRole::Joint(channel) => Some(channel),
             ShaftRole::Motor(..) => None,
         });
-        own.or_else(|| {
+        channel.or_else(|| {
             let couplings = self.couplings.iter().zip(&self.channels);
             let mut joints = couplings.flat_map(|((raw, _), known)| raw.joints.iter().zip(known));
             joints.find_map(|(joint, channel)| channel.filter(|_| joint == name))

@@ -106,8 +106,8 @@ fn inspect_sensor(
         return;
     }
     let marked = |reason| {
-        let of = stream.faulty.iter().filter(|(_, r)| *r == reason);
-        let mut stamps = of.map(|(t, _)| *t);
+        let samples = stream.faulty.iter().filter(|(_, r)| *r == reason);
+        let mut stamps = samples.map(|(t, _)| *t);
         let first = stamps.next()?;
         Some((first, 1 + stamps.count()))
     };

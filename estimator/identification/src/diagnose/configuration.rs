@@ -117,24 +117,24 @@ pub(crate) fn check(
         }
         alone.push((evidence.change(), evidence.wrong_frames(robot)));
     }
-    let wrong = all.wrong_frames(robot);
-    if !wrong.is_empty() {
-        let names: Vec<&str> = wrong.iter().map(|f| f.subject.as_str()).collect();
+    let wrong_frames = all.wrong_frames(robot);
+    if !wrong_frames.is_empty() {
+        let names: Vec<&str> = wrong_frames.iter().map(|f| f.subject.as_str()).collect();
         let reason = format!(
             "{}: wrong measurement frame or direction; nothing was identified",
             names.join(", ")
         );
-        return Ok(ControlFlow::Break((reason, wrong)));
+        return Ok(ControlFlow::Break((reason, wrong_frames)));
     }
     let with_torques = inputs.contains(&IdentificationInput::Torque);
     if let Some(wrong) = all.wrong_gravity(robot, with_torques) {
         return Ok(ControlFlow::Break((wrong.text.clone(), vec![wrong])));
     }
     // A sensor that was mounted differently in a minority of the logs.
-    for (log, (change, wrong)) in logs.iter_mut().zip(alone) {
+    for (log, (change, wrong_frames)) in logs.iter_mut().zip(alone) {
         let is_all = log.role == LogRole::Train && trained == 1;
         if !log.refused && !is_all && change >= ENOUGH_ALONE * all.change() {
-            log.add_findings(wrong);
+            log.add_findings(wrong_frames);
         }
     }
     Ok(ControlFlow::Continue(()))
@@ -244,12 +244,12 @@ impl ConfigurationEvidence {
             stretches.len(),
             || measurement.clone(),
             |measurement, number| {
-                let mut own = Self {
+                let mut part = Self {
                     base: self.base,
                     ..Self::new(robot)
                 };
-                own.add_stretch(measurement, stretches[number]);
-                own
+                part.add_stretch(measurement, stretches[number]);
+                part
             },
         );
         parts.iter().for_each(|part| self.add(part));
@@ -321,14 +321,14 @@ impl ConfigurationEvidence {
 
     /// Coefficients of the columns of readings: these multiples of the readings of each sensor.
     fn readings(&self, of: impl Fn(usize) -> Matrix6<f64>) -> DVector<f64> {
-        let mut own = DVector::zeros(self.width());
+        let mut vector = DVector::zeros(self.width());
         for sensor in 0..self.sensors {
-            let of = of(sensor);
+            let matrix = of(sensor);
             for (i, j) in (0..6).flat_map(|i| (0..6).map(move |j| (i, j))) {
-                own[entry(sensor, i, j)] = of[(i, j)];
+                vector[entry(sensor, i, j)] = matrix[(i, j)];
             }
         }
-        own
+        vector
     }
 
     /// Mean square of the sensors' readings per instant.
@@ -398,8 +398,8 @@ impl ConfigurationEvidence {
         let without = squares(gram, &self.readings(|_| Matrix6::identity()));
         let remains = |chosen: &[(usize, Mounting)]| {
             let mut changed = self.readings(|sensor| {
-                let own = chosen.iter().find(|(own, _)| *own == sensor);
-                own.map_or_else(Matrix6::zeros, |(_, own)| own.change - Matrix6::identity())
+                let correction = chosen.iter().find(|(own, _)| *own == sensor);
+                correction.map_or_else(Matrix6::zeros, |(_, own)| own.change - Matrix6::identity())
             });
             changed[self.width() - 1] = 1.0;
             squares(gram, &changed)

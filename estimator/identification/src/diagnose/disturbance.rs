@@ -83,11 +83,11 @@ pub(crate) fn contacts(
         }
     }
     let found = map_segments(measurement, &segments, |measurement, number, segment| {
-        let own: Vec<&LoadChange> = loads
+        let log_loads: Vec<&LoadChange> = loads
             .iter()
             .filter(|load| load.log == logs[number])
             .collect();
-        of_segment(measurement, segment, &own, noise, d)
+        of_segment(measurement, segment, &log_loads, noise, d)
     });
     let mut out = vec![Vec::new(); all.len()];
     for (log, found) in logs.into_iter().zip(found) {
@@ -132,9 +132,9 @@ fn of_segment(
     for (number, &subtree) in pass.subtrees.iter().enumerate() {
         let (mut series, mut least) = (Vec::new(), Vec::new());
         for (channel, channel_least) in noise.least.iter().enumerate() {
-            let own: Vec<f64> = means.iter().map(|mean| mean[number][channel]).collect();
-            if own.iter().any(|x| x.is_finite()) {
-                series.push(own);
+            let channel_means: Vec<f64> = means.iter().map(|mean| mean[number][channel]).collect();
+            if channel_means.iter().any(|x| x.is_finite()) {
+                series.push(channel_means);
                 least.push(*channel_least);
             }
         }
@@ -170,7 +170,7 @@ impl SubtreePass<'_> {
     ) -> Vec<Vec<f64>> {
         let channels = self.variances.len();
         let mut rows = MeasurementRows::new(measurement.unknowns());
-        let mut own = rows.clone();
+        let mut own_rows = rows.clone();
         let (mut white, mut noise) = (Vec::new(), vec![0.0; channels]);
         let mut sums = vec![vec![(0.0, 0.0); channels]; self.subtrees.len()];
         for instant in instants {
@@ -183,16 +183,16 @@ impl SubtreePass<'_> {
                 if self.loads.iter().any(carries) {
                     continue;
                 }
-                rows.copy_unit(subtree, &mut own);
-                if own.count == 0 {
+                rows.copy_unit(subtree, &mut own_rows);
+                if own_rows.count == 0 {
                     continue;
                 }
                 let (d, nuisance) = (self.d.as_slice(), self.nuisance.as_slice());
                 white.clear();
-                white.extend((0..own.count).map(|row| own.residual(row, d, nuisance)));
-                own.whiten_with(&self.variances, &mut white, 1);
-                own.channel_noise(&self.variances, &mut white, &mut noise);
-                for channel in (0..channels).filter(|&channel| own.has(channel)) {
+                white.extend((0..own_rows.count).map(|row| own_rows.residual(row, d, nuisance)));
+                own_rows.whiten_with(&self.variances, &mut white, 1);
+                own_rows.channel_noise(&self.variances, &mut white, &mut noise);
+                for channel in (0..channels).filter(|&channel| own_rows.has(channel)) {
                     sums[channel].0 += noise[channel];
                     sums[channel].1 += 1.0;
                 }
@@ -285,9 +285,9 @@ fn usual(squares: &[f64], seen: &[bool], motion: &[f64]) -> Vec<f64> {
     let stride = order.len().div_ceil(STATIONS).max(1);
     let last = order.len() - width;
     for start in (0..last).step_by(stride).chain([last]) {
-        let own = &order[start..start + width];
-        let near = usual(own);
-        own.iter().for_each(|&k| out[k] = out[k].max(near));
+        let window = &order[start..start + width];
+        let near = usual(window);
+        window.iter().for_each(|&k| out[k] = out[k].max(near));
     }
     out
 }
@@ -299,8 +299,8 @@ fn medians(series: &[f64]) -> Vec<f64> {
     for start in (0..series.len()).step_by(STRIDE) {
         let end = (start + STRIDE).min(series.len());
         let around = &series[start.saturating_sub(WINDOW)..(end + WINDOW).min(series.len())];
-        let own = around.iter().copied().filter(|x| x.is_finite()).collect();
-        out.resize(end, quantile(own, 0.5));
+        let values = around.iter().copied().filter(|x| x.is_finite()).collect();
+        out.resize(end, quantile(values, 0.5));
     }
     out
 }

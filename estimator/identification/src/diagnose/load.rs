@@ -105,13 +105,13 @@ impl Normal {
     ) {
         let unknown = unknowns.links.iter().copied().enumerate();
         for (place, link) in unknown.filter(|(_, link)| !is_known(*link)) {
-            let mut own = self
+            let mut block = self
                 .matrix
                 .fixed_view_mut::<LINK_PARAMETERS, LINK_PARAMETERS>(
                     LINK_PARAMETERS * place,
                     LINK_PARAMETERS * place,
                 );
-            own += prior.metric(link) / (2.0 * tau * tau);
+            block += prior.metric(link) / (2.0 * tau * tau);
         }
         for (precision, column) in unknowns.precision.iter().zip(unknowns.inertial()..) {
             self.matrix[(column, column)] += precision;
@@ -139,10 +139,10 @@ pub(crate) fn body(
         .matrix
         .fixed_columns::<LINK_PARAMETERS>(LINK_PARAMETERS * place)
         .into_owned();
-    let own = cross
+    let block = cross
         .fixed_rows::<LINK_PARAMETERS>(LINK_PARAMETERS * place)
         .into_owned();
-    let rest = own + weak - cross.transpose() * factor.solve(&cross);
+    let rest = block + weak - cross.transpose() * factor.solve(&cross);
     let misfit = some
         .right
         .fixed_rows::<LINK_PARAMETERS>(LINK_PARAMETERS * place)

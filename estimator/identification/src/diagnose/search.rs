@@ -354,26 +354,27 @@ impl<'a> Search<'a> {
 
     fn column(&self, error: &SetupError) -> DVector<f64> {
         let (joints, logs) = (self.dofs.len(), self.training.len());
-        let own: Vec<usize> = match error {
+        let columns: Vec<usize> = match error {
             SetupError::Zero { joint, log } => {
                 let logs = log.map_or(0..logs, |log| log..log + 1);
                 logs.map(|log| joints * log + joint).collect()
             }
             SetupError::Delay(streams) => streams.clone().map(|own| joints * logs + own).collect(),
         };
-        self.r.select_columns(&own).column_sum()
+        self.r.select_columns(&columns).column_sum()
     }
 
     /// The parameters' columns, then those of these errors. (Other errors are zero: their columns
     /// are omitted.)
     fn columns(&self, errors: &[SetupError]) -> DMatrix<f64> {
         let parameters = self.identified.unknowns.parameters();
-        let own = self.r.columns(self.r.ncols() - parameters, parameters);
-        let mut own = (own.into_owned()).resize_horizontally(parameters + errors.len(), 0.0);
+        let columns = self.r.columns(self.r.ncols() - parameters, parameters);
+        let mut columns =
+            (columns.into_owned()).resize_horizontally(parameters + errors.len(), 0.0);
         for (place, error) in errors.iter().enumerate() {
-            own.set_column(parameters + place, &self.column(error));
+            columns.set_column(parameters + place, &self.column(error));
         }
-        own
+        columns
     }
 
     /// The MAP parameters and these errors, and their cost.
@@ -391,8 +392,8 @@ impl<'a> Search<'a> {
     fn estimates(&self, errors: &[SetupError]) -> Option<Vec<Estimate>> {
         let (_, fit) = self.fit(errors)?;
         let (root, first) = (fit.covariance_root(), self.identified.unknowns.parameters());
-        let own = (first..first + errors.len()).map(|k| (fit.x[k], root.row(k).norm()));
-        Some(own.collect())
+        let estimates = (first..first + errors.len()).map(|k| (fit.x[k], root.row(k).norm()));
+        Some(estimates.collect())
     }
 
     /// The most likely candidates beside these errors: those with the largest gain if the prior
@@ -401,11 +402,11 @@ impl<'a> Search<'a> {
         let Some((_, fit)) = self.fit(errors) else {
             return Vec::new();
         };
-        let own = self.columns(errors);
-        let (residuals, root) = (&self.z - &own * &fit.x, fit.covariance_root());
+        let columns = self.columns(errors);
+        let (residuals, root) = (&self.z - &columns * &fit.x, fit.covariance_root());
         let gain = |error: &SetupError| {
             let column = self.column(error);
-            let known = root.tr_mul(&own.tr_mul(&column)).norm_squared();
+            let known = root.tr_mul(&columns.tr_mul(&column)).norm_squared();
             let precision = error.precision();
             column.dot(&residuals).powi(2)
                 / (column.norm_squared() - known + precision).max(precision)
@@ -453,9 +454,9 @@ impl<'a> Search<'a> {
         let SetupError::Zero { log, .. } = &errors[place] else {
             return false;
         };
-        let own = cost_in(None);
+        let cost = cost_in(None);
         let mut others = (0..self.training.len()).filter(|other| Some(*other) != *log);
-        others.any(|other| cost_in(Some(other)) < own + self.gain)
+        others.any(|other| cost_in(Some(other)) < cost + self.gain)
     }
 
     /// Findings about zeros and delays, and the delays of all streams.
@@ -518,7 +519,7 @@ impl<'a> Search<'a> {
         let file = |log: usize| self.training[log].file.as_str();
         let mut findings = Vec::new();
         for (number, &dof) in self.dofs.iter().enumerate() {
-            let own: Vec<(usize, Option<usize>, f64)> = (zeros.iter().zip(estimates).enumerate())
+            let found: Vec<(usize, Option<usize>, f64)> = (zeros.iter().zip(estimates).enumerate())
                 .filter_map(|(place, (error, (angle, _)))| match error {
                     SetupError::Zero { joint, log } if *joint == number => {
                         Some((place, *log, *angle))
@@ -539,14 +540,14 @@ impl<'a> Search<'a> {
             } else {
                 MIN_ZERO_BEFORE_SENSORS
             };
-            if own.iter().all(|(_, _, angle)| angle.abs() <= least) {
+            if found.iter().all(|(_, _, angle)| angle.abs() <= least) {
                 continue;
             }
-            let each = own.iter().map(|(_, log, angle)| {
+            let each = found.iter().map(|(_, log, angle)| {
                 format!("{angle:.4} rad in {}", log.map_or("all logs", file))
             });
             let mut what = format!("encoder offset of {}", each.collect::<Vec<_>>().join(", "));
-            let rest = match *own {
+            let rest = match *found {
                 [(_, None, _)] => "",
                 [(place, Some(_), _)] if self.is_exchangeable(zeros, place) => {
                     what += ", or the opposite in all other logs";

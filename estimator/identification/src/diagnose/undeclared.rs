@@ -113,9 +113,9 @@ impl Undeclared {
         let bodies: Vec<Option<(usize, load::AddedBody)>> = loads.iter().map(body).collect();
         let training = training_logs_mut(logs);
         for (number, (log, contacts)) in training.zip(contacts).enumerate() {
-            let own = loads.iter().zip(&bodies);
-            let own = own.filter(|(load, _)| load.log == number);
-            let loads: Vec<&LoadChange> = own.clone().map(|(load, _)| load).collect();
+            let log_loads = loads.iter().zip(&bodies);
+            let log_loads = log_loads.filter(|(load, _)| load.log == number);
+            let loads: Vec<&LoadChange> = log_loads.clone().map(|(load, _)| load).collect();
             let apparent = apparent_contacts(log, contacts, &loads);
             for (part, excluded, when) in suspected(robot, log, &apparent) {
                 log.excluded.push(excluded);
@@ -126,7 +126,7 @@ impl Undeclared {
                 log.findings
                     .push(Finding::warning(FindingCode::Disturbance, part, text));
             }
-            for (place, (load, body)) in own.enumerate() {
+            for (place, (load, body)) in log_loads.enumerate() {
                 let handovers = apparent.iter().filter(|own| own.load == Some(place));
                 report_load(measurement, log, load, body.as_ref(), handovers);
             }

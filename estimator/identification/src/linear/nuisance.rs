@@ -66,17 +66,17 @@ impl NuisanceFilter {
     fn add(&mut self, mut weight: f64, last: usize) {
         let n = self.count;
         for j in (0..=last).rev() {
-            let own = self.work[j];
-            if own == 0.0 {
+            let value = self.work[j];
+            if value == 0.0 {
                 continue;
             }
             let before = self.d[j];
-            let after = before + weight * own * own;
-            let share = weight * own / after;
+            let after = before + weight * value * value;
+            let share = weight * value / after;
             self.d[j] = after;
             weight *= before / after;
             for (u, w) in self.u[j * n..][..j].iter_mut().zip(&mut self.work) {
-                *w -= own * *u;
+                *w -= value * *u;
                 *u += share * *w;
             }
         }
@@ -248,8 +248,8 @@ mod tests {
         assert!((&d - all.rows(0, p)).amax() < 1e-6, "{d} {all}");
         let last = nuisance.estimates();
         for i in 0..s {
-            let own = last[(i, p)] - last.row(i).columns(0, p).transpose().dot(&d);
-            assert!((own - all[p + s * (count - 1) + i]).abs() < 1e-6);
+            let value = last[(i, p)] - last.row(i).columns(0, p).transpose().dot(&d);
+            assert!((value - all[p + s * (count - 1) + i]).abs() < 1e-6);
         }
 
         // With d known, all offsets.
@@ -377,8 +377,8 @@ mod tests {
         assert!(off < 1e-10, "{off:e}");
         let last = nuisance.estimates();
         for i in 0..s {
-            let own = last[(i, p)] - last.row(i).columns(0, p).transpose().dot(&d);
-            let off = (own - all[place[count - 1][i]]).abs() / all.amax();
+            let value = last[(i, p)] - last.row(i).columns(0, p).transpose().dot(&d);
+            let off = (value - all[place[count - 1][i]]).abs() / all.amax();
             assert!(off < 1e-10, "offset {i}: {off:e}");
         }
     }

@@ -332,8 +332,8 @@ impl<'a> PredictionError<'a> {
         });
         let values: Vec<f64> = values.concat();
         let column = |at: usize| -> Vec<f64> {
-            let own = values.iter().skip(at).step_by(candidates.len() * width);
-            own.copied().collect()
+            let series = values.iter().skip(at).step_by(candidates.len() * width);
+            series.copied().collect()
         };
         let columns = |which: usize, places: Range<usize>| -> Vec<Vec<f64>> {
             places.map(|place| column(which * width + place)).collect()
@@ -409,7 +409,7 @@ impl<'a> PredictionError<'a> {
                 )
             },
             |(measurement, rows), part| {
-                let mut own = make();
+                let mut state = make();
                 let end = self.instants.len().min(BATCH * (part + 1));
                 for instant in &self.instants[BATCH * part..end] {
                     if measurement.compute_rows(instant, rows).is_err() {
@@ -422,9 +422,9 @@ impl<'a> PredictionError<'a> {
                         rows,
                         trusted: &trusted,
                     };
-                    each(&mut own, &made);
+                    each(&mut state, &made);
                 }
-                own
+                state
             },
         )
     }
@@ -535,12 +535,12 @@ fn line(h: &[f64], late: f64, drifts: usize) -> Vec<f64> {
 
 /// Least-squares solution for the first `count` offsets. Unobserved ones are zero.
 fn solved(normal: &DMatrix<f64>, right: &DVector<f64>, count: usize) -> DVector<f64> {
-    let mut own = normal.view((0, 0), (count, count)).into_owned();
+    let mut matrix = normal.view((0, 0), (count, count)).into_owned();
     for i in 0..count {
-        own[(i, i)] += 1.0 / OFFSET_VARIANCE;
+        matrix[(i, i)] += 1.0 / OFFSET_VARIANCE;
     }
     let right = right.rows(0, count).into_owned();
-    let solution = own.cholesky().map(|factor| factor.solve(&right));
+    let solution = matrix.cholesky().map(|factor| factor.solve(&right));
     solution.unwrap_or_else(|| DVector::zeros(count))
 }
 

@@ -196,8 +196,8 @@ pub(crate) fn cad_root(
     if fitted.is_empty() {
         return root;
     }
-    let own = r.select_columns(&fitted);
-    let mut square = own.tr_mul(&own);
+    let columns = r.select_columns(&fitted);
+    let mut square = columns.tr_mul(&columns);
     for (place, &column) in fitted.iter().enumerate() {
         square[(place, place)] += precision[column - unknowns.inertial()];
         root[(column, column)] = 0.0;
@@ -207,7 +207,8 @@ pub(crate) fn cad_root(
     };
     // (R_f^T R_f + prior)^-1 [-R_f^T R_c (error of c) + noise], the noise of covariance R_f^T R_f +
     // prior.
-    let moved = factor.solve(&own.tr_mul(&(r.select_columns(&given) * root.select_rows(&given))));
+    let moved =
+        factor.solve(&columns.tr_mul(&(r.select_columns(&given) * root.select_rows(&given))));
     let noise = factor.l().transpose().try_inverse();
     for (place, &column) in fitted.iter().enumerate() {
         root.row_mut(column).copy_from(&-moved.row(place));
@@ -256,8 +257,8 @@ pub(crate) fn links(
     let inverses: Vec<DMatrix<f64>> = spread.iter().map(inverse).collect();
     // Of the rows of a link, in units of the prior's spread.
     let scaled = |matrix: &DMatrix<f64>, place: usize| {
-        let own = matrix.rows(LINK_PARAMETERS * place, LINK_PARAMETERS);
-        &inverses[place] * own.into_owned()
+        let block = matrix.rows(LINK_PARAMETERS * place, LINK_PARAMETERS);
+        &inverses[place] * block.into_owned()
     };
     // Covariance of the estimate if CAD were right: P - P (prior's precision) P.
     let mut weighted = root.clone();
@@ -372,18 +373,18 @@ pub(crate) fn covariance(
     };
     let sources: Vec<usize> = (0..unknowns.sensors.len()).map(source).collect();
     for (number, reduced) in logs.iter().enumerate() {
-        let own = (0..s).filter(|unknown| sources[unknown / 6] == number);
-        let own: Vec<usize> = own.collect();
-        if own.is_empty() {
+        let rows = (0..s).filter(|unknown| sources[unknown / 6] == number);
+        let rows: Vec<usize> = rows.collect();
+        if rows.is_empty() {
             continue;
         }
-        let moved = reduced.slope.select_rows(&own) * root;
-        let covariance = reduced.covariance.select_rows(&own).select_columns(&own);
+        let moved = reduced.slope.select_rows(&rows) * root;
+        let covariance = reduced.covariance.select_rows(&rows).select_columns(&rows);
         let factor = covariance.cholesky();
-        for (i, unknown) in own.iter().enumerate() {
+        for (i, unknown) in rows.iter().enumerate() {
             let mut row = joint.view_mut((p + unknown, 0), (1, wide));
             row.copy_from(&-moved.row(i));
-            for (j, column) in own[..=i].iter().enumerate() {
+            for (j, column) in rows[..=i].iter().enumerate() {
                 let entry = factor.as_ref().map_or(0.0, |f| f.l_dirty()[(i, j)]);
                 joint[(p + unknown, wide + column)] = entry;
             }
@@ -434,8 +435,8 @@ pub(crate) fn expression(
         let Some(inverse) = spread.clone().try_inverse() else {
             continue;
         };
-        let own = direction.rows(LINK_PARAMETERS * place, LINK_PARAMETERS);
-        let factors = inverse.tr_mul(&own.into_owned());
+        let rows = direction.rows(LINK_PARAMETERS * place, LINK_PARAMETERS);
+        let factors = inverse.tr_mul(&rows.into_owned());
         for (k, factor) in factors.iter().enumerate() {
             let size = (factor * spread.row(k).norm()).abs();
             parts.push((LINK_PARAMETERS * place + k, *factor, size));
@@ -606,8 +607,8 @@ mod tests {
                     .scale_mut(10.0_f64.powi(column as i32 % 5 - 4));
             }
             for (sum, a, b) in [(3, 0, 7), (9, 1, 3), (12, 4, 9)] {
-                let own = 2.0 * matrix.column(a) - matrix.column(b);
-                matrix.set_column(sum, &own);
+                let combined = 2.0 * matrix.column(a) - matrix.column(b);
+                matrix.set_column(sum, &combined);
             }
             [5, 17]
                 .into_iter()
@@ -692,8 +693,8 @@ mod tests {
         // Two links without common rows.
         let mut narrow = DMatrix::zeros(20, 20);
         for place in [0, 10] {
-            let own = DMatrix::from_fn(10, 10, |_, _| 0.01 * next());
-            narrow.view_mut((place, place), (10, 10)).copy_from(&own);
+            let block = DMatrix::from_fn(10, 10, |_, _| 0.01 * next());
+            narrow.view_mut((place, place), (10, 10)).copy_from(&block);
         }
         let spread: Vec<DMatrix<f64>> = (0..2)
             .map(|_| DMatrix::from_fn(10, 10, |_, _| next()))
@@ -764,8 +765,12 @@ mod tests {
             found.view((10, 0), (2, 10)).into_owned(),
             -(&slope * &bodies),
         );
-        let own = &slope * &bodies * slope.transpose() + inverse;
-        close("rotors", found.view((10, 10), (2, 2)).into_owned(), own);
+        let expected = &slope * &bodies * slope.transpose() + inverse;
+        close(
+            "rotors",
+            found.view((10, 10), (2, 2)).into_owned(),
+            expected,
+        );
     }
 
     #[test]

@@ -107,14 +107,14 @@ impl SubtreeRoot {
                     .map(|(column, factor)| factor * with_rows(column.as_flattened()))
                     .sum::<f64>()
             };
-            let own = product(&block.columns);
+            let variance = product(&block.columns);
             match (block.what, &block.calibration) {
-                (Member::Link(link), _) => share(Source::Link, link, own),
-                (Member::Sensor(sensor, _), None) => share(Source::Offset, sensor, own),
+                (Member::Link(link), _) => share(Source::Link, link, variance),
+                (Member::Sensor(sensor, _), None) => share(Source::Offset, sensor, variance),
                 (Member::Sensor(sensor, _), Some(calibration)) => {
                     let offset = product(&calibration.offset);
                     share(Source::Offset, sensor, offset);
-                    share(Source::Gain, sensor, own - offset);
+                    share(Source::Gain, sensor, variance - offset);
                 }
                 (Member::Calibration, _) => {}
             }

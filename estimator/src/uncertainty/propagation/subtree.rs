@@ -91,8 +91,8 @@ impl SubtreeRoot {
                         0.0
                     }
                 };
-                let own = std::array::from_fn(|i| std::array::from_fn(|j| at(i, j)));
-                independent.push((*number, place_of(*link), Box::new(own)));
+                let matrix = std::array::from_fn(|i| std::array::from_fn(|j| at(i, j)));
+                independent.push((*number, place_of(*link), Box::new(matrix)));
                 continue;
             }
             column_blocks.extend(blocks_of(block, members, &root, rows, place_of));
@@ -220,12 +220,12 @@ impl SubtreeRoot {
             return 0.0;
         };
         let (s, h) = (numbers(axis), numbers(response));
-        let own = times(below, &s);
+        let product = times(below, &s);
         if *response == Motion::zero() {
-            return dot(&s, &own);
+            return dot(&s, &product);
         }
         // If one side has no links, rounding errors of either sign remain.
-        (dot(&s, &own) - 2.0 * dot(&h, &own) + dot(&h, &times(all, &h))).max(0.0)
+        (dot(&s, &product) - 2.0 * dot(&h, &product) + dot(&h, &times(all, &h))).max(0.0)
     }
 
     /// The part of [`Self::variance`] from correlated links and sensors.
