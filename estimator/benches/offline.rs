@@ -125,17 +125,17 @@ fn log(setup: &Setup, samples: usize) -> String {
         .for_each(|axis| text += &format!(",wrench/ft/{axis}"));
     for i in 0..samples {
         let t = i as f64 * 1e-3;
-        let of = |f: fn(f64, f64, f64) -> f64| -> Vec<f64> {
+        let joints = |f: fn(f64, f64, f64) -> f64| -> Vec<f64> {
             let sum = |waves: &[(f64, f64); 4]| {
                 waves.iter().map(|(w, phase)| 0.25 * f(*w, *phase, t)).sum()
             };
             waves.iter().map(sum).collect()
         };
-        let position = of(|w, phase, t| (w * t + phase).sin());
+        let position = joints(|w, phase, t| (w * t + phase).sin());
         let state = JointState {
             position: &position,
-            velocity: &of(|w, phase, t| w * (w * t + phase).cos()),
-            acceleration: &of(|w, phase, t| -w * w * (w * t + phase).sin()),
+            velocity: &joints(|w, phase, t| w * (w * t + phase).cos()),
+            acceleration: &joints(|w, phase, t| -w * w * (w * t + phase).sin()),
         };
         kinematics.update(&model, state, &base).expect("a state");
         dynamics.update(&model, &kinematics, &[]).expect("a state");

@@ -442,8 +442,8 @@ fn a_replaced_device_stops_its_board_before_the_new_one_starts_it() {
     rig.pass(Nanos::from_millis(70));
     rig.turns(2);
     let silences = |rig: &Rig| -> Vec<u64> {
-        let of = |d: proprio_topics::DeviceHealth| d.counters[Counter::Silences as usize];
-        rig.status.devices().map(of).collect()
+        let silences = |d: proprio_topics::DeviceHealth| d.counters[Counter::Silences as usize];
+        rig.status.devices().map(silences).collect()
     };
     assert_eq!(silences(&rig), [0, 0]);
     rig.pass(Nanos::from_millis(8));

@@ -249,8 +249,8 @@ impl Chain {
             let target = device_of(plan, family.kind, &mut random.clone());
             let name = |(bus, device): (usize, usize)| plan.buses[bus].devices[device].name.clone();
             let faults = target.map(name).into_iter().flat_map(|device| {
-                let own = |trouble| board_fault(trouble, device.clone());
-                troubles.iter().filter_map(own).collect::<Vec<_>>()
+                let fault = |trouble| board_fault(trouble, device.clone());
+                troubles.iter().filter_map(fault).collect::<Vec<_>>()
             });
             SimulationSettings {
                 seed,

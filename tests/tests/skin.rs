@@ -227,15 +227,15 @@ fn a_touch_on_the_bus_becomes_a_wrench_where_it_is() {
             "{}",
             seconds(row)
         );
-        let of = |part: &str| number(skin, &format!("contact/forearm/{part}"), row);
-        farthest = farthest.max(away([of("px"), of("py"), of("pz")]));
+        let value = |part: &str| number(skin, &format!("contact/forearm/{part}"), row);
+        farthest = farthest.max(away([value("px"), value("py"), value("pz")]));
         for (part, truth) in parts.iter().zip(truth()) {
-            let std = of(&format!("{part}_std"));
+            let std = value(&format!("{part}_std"));
             compared += 1;
-            beyond += usize::from((of(part) - truth).abs() > 3.0 * std);
+            beyond += usize::from((value(part) - truth).abs() > 3.0 * std);
             if part.starts_with('f') {
                 stated = stated.max(std);
-                worst = worst.max((of(part) - truth).abs());
+                worst = worst.max((value(part) - truth).abs());
                 let blind = number(blind, &format!("contact/forearm/{part}"), row);
                 blind_worst = blind_worst.max((blind - truth).abs());
             }

@@ -72,12 +72,12 @@ fn log(unit: &str) -> String {
 /// Waits until `condition` holds.
 fn eventually(what: &str, limit: Nanos, mut condition: impl FnMut() -> bool) {
     // Each look starts processes, of which every one costs the services time.
-    let mut look = || {
+    let mut check = || {
         let holds = condition();
         std::thread::sleep(std::time::Duration::from_millis(200));
         holds.then_some(())
     };
-    let holds = until(limit, &mut look).is_some();
+    let holds = until(limit, &mut check).is_some();
     let logs = || UNITS.map(log).join("\n");
     assert!(holds, "not within {limit} s: {what}\n{}", logs());
 }

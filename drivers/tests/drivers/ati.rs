@@ -427,7 +427,7 @@ fn a_sensor_that_does_not_tell_its_calibration_is_refused_by_name() {
     assert_eq!(silent.device.state(), State::Streaming);
 
     // Zero counts, a row of zeros, a row that is not a number; the state names the channel.
-    let told = |frames: &[&str]| {
+    let state = |frames: &[&str]| {
         let mut device = session_listener("");
         let frames: Vec<Frame> = frames.iter().map(|text| frame(text, 0.0)).collect();
         let (_, faults) = decode(&mut *device, &frames);
@@ -435,24 +435,24 @@ fn a_sensor_that_does_not_tell_its_calibration_is_refused_by_name() {
         device.state()
     };
     let bad = |channel| State::Refused(Refusal::BadCalibration { channel });
-    assert_eq!(told(&["3F7#00000000000007D0"]), bad(0));
-    assert_eq!(told(&["3F7#000007D000000000"]), bad(3));
-    assert_eq!(told(&["3F8#0007"]), bad(0));
-    assert_eq!(told(&["3F8#0200"]), bad(3));
+    assert_eq!(state(&["3F7#00000000000007D0"]), bad(0));
+    assert_eq!(state(&["3F7#000007D000000000"]), bad(3));
+    assert_eq!(state(&["3F8#0007"]), bad(0));
+    assert_eq!(state(&["3F8#0200"]), bad(3));
     let zeros = [
         "3F2#04",
         "3F2#0000000000000000",
         "3F3#0000000000000000",
         "3F4#0000000000000000",
     ];
-    assert_eq!(told(&zeros), bad(4));
+    assert_eq!(state(&zeros), bad(4));
     let nan = [
         "3F2#05",
         "3F2#FFFFFFFFFFFFFFFF",
         "3F3#3F80000000000000",
         "3F4#0000000000000000",
     ];
-    assert_eq!(told(&nan), bad(5));
+    assert_eq!(state(&nan), bad(5));
 }
 
 #[test]

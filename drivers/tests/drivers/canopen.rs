@@ -748,19 +748,19 @@ fn a_simulated_node_refuses_as_the_standard_says() {
         node.on_frame(&frame(text, 0.0), &mut out);
         out.first().map(ToString::to_string)
     };
-    let told = |text: &str| Some(text.to_owned());
-    assert_eq!(ask("601#4000100000000000"), told("581#4300100096010200"));
-    assert_eq!(ask("601#4019100000000000"), told("581#8019100000000206"));
-    assert_eq!(ask("601#2319100000000000"), told("581#8019100000000206"));
+    let some = |text: &str| Some(text.to_owned());
+    assert_eq!(ask("601#4000100000000000"), some("581#4300100096010200"));
+    assert_eq!(ask("601#4019100000000000"), some("581#8019100000000206"));
+    assert_eq!(ask("601#2319100000000000"), some("581#8019100000000206"));
     // Its identity: how many entries, and the serial number.
-    assert_eq!(ask("601#4018100000000000"), told("581#4F18100004000000"));
-    assert_eq!(ask("601#4018100400000000"), told("581#4318100401000000"));
-    assert_eq!(ask("601#2F00180500000000"), told("581#8000180510000706"));
-    assert_eq!(ask("601#E000100000000000"), told("581#8000100001000405"));
-    assert_eq!(ask("601#2B001805E8030000"), told("581#6000180500000000"));
-    assert_eq!(ask("601#4000180500000000"), told("581#4B001805E8030000"));
-    assert_eq!(ask("000#8101"), told("701#00"));
-    assert_eq!(ask("601#4000180500000000"), told("581#4B0018050A000000"));
+    assert_eq!(ask("601#4018100000000000"), some("581#4F18100004000000"));
+    assert_eq!(ask("601#4018100400000000"), some("581#4318100401000000"));
+    assert_eq!(ask("601#2F00180500000000"), some("581#8000180510000706"));
+    assert_eq!(ask("601#E000100000000000"), some("581#8000100001000405"));
+    assert_eq!(ask("601#2B001805E8030000"), some("581#6000180500000000"));
+    assert_eq!(ask("601#4000180500000000"), some("581#4B001805E8030000"));
+    assert_eq!(ask("000#8101"), some("701#00"));
+    assert_eq!(ask("601#4000180500000000"), some("581#4B0018050A000000"));
     assert_eq!((ask("602#4000100000000000"), ask("000#8102")), (None, None));
 }
 

@@ -56,7 +56,7 @@ fn the_key_names_the_file() {
 #[test]
 fn the_file_of_another_node_is_refused() {
     for driver in ["canopen_encoder", "canopen_drive"] {
-        let of = |node| {
+        let build = |node| {
             let file = Objects {
                 node: Some(node),
                 ..file(&[(0x6501, 0, 4096)])
@@ -64,8 +64,8 @@ fn the_file_of_another_node_is_refused() {
             let spec = spec(5, Mode::Listen, &[0]);
             described(driver, "", file).device(&spec).map(|_| ())
         };
-        assert_eq!(of(5), Ok(()));
-        assert!(matches!(of(6), Err(SpecError::Description(_))));
+        assert_eq!(build(5), Ok(()));
+        assert!(matches!(build(6), Err(SpecError::Description(_))));
     }
 }
 
@@ -671,7 +671,7 @@ fn positions_and_velocities_are_in_the_units_that_the_drive_states() {
 /// A value that is no number is told to a driver that needs it.
 #[test]
 fn what_is_wrong_in_a_file_harms_only_where_it_is_needed() {
-    let told = |driver: &str, keys: &str, at: (u16, u8), mode| {
+    let build = |driver: &str, keys: &str, at: (u16, u8), mode| {
         let mut objects = file(&[
             (0x608F, 1, 1000),
             (0x6501, 0, 1000),
@@ -721,7 +721,7 @@ fn what_is_wrong_in_a_file_harms_only_where_it_is_needed() {
             false,
         ),
     ] {
-        let problem = told(driver, keys, at, mode);
+        let problem = build(driver, keys, at, mode);
         assert_eq!(
             problem.is_err(),
             is_needed,

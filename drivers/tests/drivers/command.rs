@@ -54,7 +54,7 @@ fn outcome(rig: &mut Rig) -> (Result<CommandOutcome, CommandFailed>, u32) {
 }
 
 fn values(rig: &Rig) -> Vec<([f64; 6], bool)> {
-    let of = |reading: &Reading| match reading {
+    let values = |reading: &Reading| match reading {
         Reading::Wrench(w) => {
             let ([a, b, c], [d, e, f]) = (w.force, w.torque);
             [a, b, c, d, e, f]
@@ -63,7 +63,12 @@ fn values(rig: &Rig) -> Vec<([f64; 6], bool)> {
     };
     let readings = rig.readings.iter();
     readings
-        .map(|r| (of(&r.reading), r.quality.contains(Quality::ZERO_CHANGED)))
+        .map(|r| {
+            (
+                values(&r.reading),
+                r.quality.contains(Quality::ZERO_CHANGED),
+            )
+        })
         .collect()
 }
 

@@ -128,11 +128,11 @@ fn half(second: bool, n: u8, ms: f64) -> Frame {
 /// The numbers of force and torque in each reading.
 fn numbers(readings: &[StampedReading]) -> Vec<(u32, u32)> {
     let number = |value: f64| (value * 100.0).round() as u32;
-    let of = |stamped: &StampedReading| match stamped.reading {
+    let counts = |stamped: &StampedReading| match stamped.reading {
         Reading::Wrench(w) => (number(w.force[0]), number(w.torque[2])),
         _ => panic!("{stamped:?}"),
     };
-    readings.iter().map(of).collect()
+    readings.iter().map(counts).collect()
 }
 
 #[test]
@@ -423,7 +423,7 @@ fn values_that_are_not_available_are_none() {
                 fields = { position = \"G.Byte\", velocity = \"G.Word\", current = \"G.Bits\", \
                 torque = \"G.Two\" }\n\
                 hold_ms = { current = 1000.0, torque = 1000.0 }\nfault = \"G.Flag\"\n";
-    let told = |j1939: bool, raw: Raw, flag: u64, data: [u8; 6]| {
+    let decoded = |j1939: bool, raw: Raw, flag: u64, data: [u8; 6]| {
         let message = Message {
             name: "G".to_owned(),
             id: Ok(Id::extended(0x18FF_1023)),
@@ -470,7 +470,7 @@ fn values_that_are_not_available_are_none() {
         ([0x01, 0x00, 0xFE, 0x01, 0, 0], [1.0, NONE, 1.0, 0.0], false),
         ([0x01, 0x34, 0xFF, 0x01, 2, 2], [1.0, NONE, 1.0, NONE], true),
     ] {
-        let (found, is_faulty) = told(true, Raw::Unsigned, 2, data);
+        let (found, is_faulty) = decoded(true, Raw::Unsigned, 2, data);
         assert!(same(found, right), "{data:?} {found:?}");
         assert_eq!(is_faulty, fault, "{data:?}");
     }
@@ -481,14 +481,14 @@ fn values_that_are_not_available_are_none() {
         (8, 0xFF, false),
         (1, 1, true),
     ] {
-        let (_, is_faulty) = told(true, Raw::Unsigned, flag, [1, 1, 1, 1, raw, 1]);
+        let (_, is_faulty) = decoded(true, Raw::Unsigned, flag, [1, 1, 1, 1, raw, 1]);
         assert_eq!(is_faulty, fault, "{flag} {raw:x}");
     }
     let all = [0xFF; 6];
-    assert_eq!(told(true, Raw::Unsigned, 2, all), (None, false));
-    let found = told(false, Raw::Unsigned, 2, all);
+    assert_eq!(decoded(true, Raw::Unsigned, 2, all), (None, false));
+    let found = decoded(false, Raw::Unsigned, 2, all);
     assert_eq!(found, (Some([255.0, 65535.0, 15.0, 3.0]), true));
-    assert_eq!(told(true, Raw::Signed, 2, all), (Some([-1.0; 4]), true));
+    assert_eq!(decoded(true, Raw::Signed, 2, all), (Some([-1.0; 4]), true));
 }
 
 #[test]

@@ -60,7 +60,7 @@ fn certainty_follows_from_the_bits() {
         (20.0, Some(Certainty::Certain)),
         (500.0, Some(Certainty::Certain)),
     ] {
-        let of = |guess| {
+        let certainty_if = |guess| {
             Finding {
                 bits,
                 guess,
@@ -68,8 +68,12 @@ fn certainty_follows_from_the_bits() {
             }
             .certainty()
         };
-        assert_eq!(of(false), certainty, "{bits}");
-        assert_eq!(of(true), certainty.map(|_| Certainty::Possible), "{bits}");
+        assert_eq!(certainty_if(false), certainty, "{bits}");
+        assert_eq!(
+            certainty_if(true),
+            certainty.map(|_| Certainty::Possible),
+            "{bits}"
+        );
     }
     // The words are probabilities, and are printed as such.
     for (bits, percent) in [
@@ -369,7 +373,7 @@ fn a_jr3_board_is_known_by_its_counter_or_its_scales() {
         );
     }
     // 20 readings: the moments of `others` have a counter that no forces have.
-    let of = |others: u16| {
+    let bits = |others: u16| {
         let reading = |n: u16| {
             let other = n + if n < others { 100 } else { 0 };
             let text = |id, counter: u16| format!("{id}#000000000000{counter:02X}00");
@@ -378,7 +382,7 @@ fn a_jr3_board_is_known_by_its_counter_or_its_scales() {
         bits("jr3_can", &(0..20).flat_map(reading).collect::<Vec<_>>())
     };
     for (others, more) in [(0, 10.0), (2, 10.0), (3, 0.0), (15, 0.0)] {
-        assert!((of(others) - of(20) - more).abs() < 1e-9, "{others}");
+        assert!((bits(others) - bits(20) - more).abs() < 1e-9, "{others}");
     }
 }
 

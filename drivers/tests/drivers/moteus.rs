@@ -254,14 +254,14 @@ fn a_simulated_controller_answers_any_query() {
         Quality::GOOD,
     );
     let mut ask = |query: &str| one_reply(&mut *board, query);
-    let told = |text: &str| Some(format!("100##1{text}"));
-    assert_eq!(ask("1301"), told("2301191480"));
-    assert_eq!(ask("1701"), told("2701C409401F0080"));
-    assert_eq!(ask("1B01"), told("2B01A8610000400D0300000000805050"));
-    assert_eq!(ask("110E5050"), told("210E1F"));
-    assert_eq!(ask("10040D"), told("20040D301F0000"));
+    let some = |text: &str| Some(format!("100##1{text}"));
+    assert_eq!(ask("1301"), some("2301191480"));
+    assert_eq!(ask("1701"), some("2701C409401F0080"));
+    assert_eq!(ask("1B01"), some("2B01A8610000400D0300000000805050"));
+    assert_eq!(ask("110E5050"), some("210E1F"));
+    assert_eq!(ask("10040D"), some("20040D301F0000"));
     // A register that it does not have is 0; it answers nothing about those above 127.
-    assert_eq!(ask("117F"), told("217F00"));
+    assert_eq!(ask("117F"), some("217F00"));
     // No query, cut off, too long, a write, register 128.
     for wrong in [
         "", "50", "11", "1F", "01000A", "14FF01", "2004000A", "118001",

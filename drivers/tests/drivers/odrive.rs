@@ -89,8 +89,8 @@ fn frames_of_the_makers_description_are_read() {
             ("temperature", &[fet, motor]) => {
                 let read: Vec<(u8, Reading)> =
                     readings.iter().map(|r| (r.output, r.reading)).collect();
-                let of = |celsius| Reading::Temperature(Temperature { celsius });
-                assert_eq!(read, [(2, of(fet)), (1, of(motor))]);
+                let temp = |celsius| Reading::Temperature(Temperature { celsius });
+                assert_eq!(read, [(2, temp(fet)), (1, temp(motor))]);
                 seen[3] += 1;
             }
             ("heartbeat", &[errors, state, motor, encoder, controller, doubtful, drive]) => {
@@ -496,11 +496,11 @@ fn a_simulated_axis_sends_what_it_is_given() {
     let good = Quality::GOOD;
     assert_eq!(send(0, &joint, good), [alone]);
     // Both temperatures once both are new, the inverter's first.
-    let of = |celsius| Reading::Temperature(Temperature { celsius });
-    assert_eq!(send(1, &of(1.0), good), [""; 0]);
-    assert_eq!(send(1, &of(2.0), good), [""; 0]);
-    assert_eq!(send(2, &of(1.0), good), ["035#0000803F00000040"]);
-    assert_eq!(send(2, &of(2.0), good), [""; 0]);
+    let temp = |celsius| Reading::Temperature(Temperature { celsius });
+    assert_eq!(send(1, &temp(1.0), good), [""; 0]);
+    assert_eq!(send(1, &temp(2.0), good), [""; 0]);
+    assert_eq!(send(2, &temp(1.0), good), ["035#0000803F00000040"]);
+    assert_eq!(send(2, &temp(2.0), good), [""; 0]);
     // A heartbeat when the faults change.
     let fault = send(0, &joint, Quality::DEVICE_FAULT | Quality::SATURATED);
     assert_eq!(fault, ["021#0800000008000000", alone]);
@@ -551,8 +551,8 @@ fn a_simulated_axis_sends_what_it_is_given() {
     let absent = Reading::Joint(JointState::ABSENT);
     for (output, reading, error) in [
         (0, absent, EncodeError::NotFinite),
-        (1, of(1.0), EncodeError::Kind),
-        (0, of(1.0), EncodeError::Kind),
+        (1, temp(1.0), EncodeError::Kind),
+        (0, temp(1.0), EncodeError::Kind),
         (3, torque, EncodeError::Output(3)),
     ] {
         let refused = old.encode(output, &reading, quality, &mut out);

@@ -30,7 +30,7 @@ fn paired(driver: &str, keys: &str, halves: &[(&str, f64)]) -> (Vec<(u16, bool)>
         })
         .collect();
     let (readings, faults) = decode(&mut *listener(driver, keys, &[]), &frames);
-    let of = |stamped: &StampedReading| {
+    let counted = |stamped: &StampedReading| {
         let Wrench { force, torque } = wrench(&stamped.reading);
         let number = (torque[2] * 100.0).round();
         for k in 0..3 {
@@ -40,7 +40,7 @@ fn paired(driver: &str, keys: &str, halves: &[(&str, f64)]) -> (Vec<(u16, bool)>
         let gap = stamped.quality.contains(Quality::GAP_BEFORE);
         (number as u16, gap)
     };
-    let numbers = readings.iter().map(of).collect();
+    let numbers = readings.iter().map(counted).collect();
     (numbers, count(&faults, Counter::Unpaired))
 }
 
@@ -449,8 +449,8 @@ fn two_rfts_do_not_disturb_each_other() {
     let frames = RFT.map(|text| frame(&text.replacen("00", "0F", 1), 0.0));
     assert_eq!(decode(&mut *one, &frames).0.len(), 1);
     let claims = |device: &dyn Device| {
-        let of = |claim: &proprio_drivers::Claim| (claim.id, claim.exclusive);
-        device.claims().iter().map(of).collect::<Vec<_>>()
+        let key = |claim: &proprio_drivers::Claim| (claim.id, claim.exclusive);
+        device.claims().iter().map(key).collect::<Vec<_>>()
     };
     let ids = [0xF1, 0xF2].map(|id| (Id::standard(id), true));
     assert_eq!(claims(&*one), ids);

@@ -97,8 +97,8 @@ fn triangles_are_paired_apart() {
 fn a_gap_is_that_of_its_triangle() {
     let mut device = listener("icub_skin", "", &[]);
     let both = |triangle: u8, ms: f64| {
-        let of = |text: &str, ms| frame(&text.replace("415", &format!("41{triangle:X}")), ms);
-        [of(FIRST, ms), of(SECOND, ms + 0.2)]
+        let part = |text: &str, ms| frame(&text.replace("415", &format!("41{triangle:X}")), ms);
+        [part(FIRST, ms), part(SECOND, ms + 0.2)]
     };
     let mut frames: Vec<Frame> = Vec::new();
     for (ms, used) in [

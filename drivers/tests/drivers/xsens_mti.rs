@@ -359,25 +359,25 @@ fn a_message_that_is_missing_costs_its_sample_and_the_next() {
 
 #[test]
 fn a_pair_without_a_counter_is_never_of_two_samples() {
-    let of = |without: &[&str], late| {
+    let read_without = |without: &[&str], late| {
         let mut frames = disturbed(without, late);
         frames.retain(|frame| frame.id != Id::standard(6));
         numbers(UNCOUNTED, &frames)
     };
-    let (read, _, dropped, lost) = of(&[], None);
+    let (read, _, dropped, lost) = read_without(&[], None);
     assert_eq!((read.len(), dropped, lost), (9, 0, 0));
-    let (read, _, dropped, _) = of(&["G4"], None);
+    let (read, _, dropped, _) = read_without(&["G4"], None);
     assert_eq!(
         (read.as_slice(), dropped),
         (&[1, 2, 3, 5, 6, 7, 8, 9][..], 1)
     );
-    let (read, gaps, dropped, _) = of(&["A4"], None);
+    let (read, gaps, dropped, _) = read_without(&["A4"], None);
     assert_eq!((read.as_slice(), dropped), (&[1, 2, 3, 6, 7, 8, 9][..], 2));
     assert_eq!(gaps, [false, false, false, true, false, false, false]);
     // Acceleration 4 after angular velocity 5, and after both of sample 5.
-    let (read, _, dropped, _) = of(&[], Some(("A4", 5.015)));
+    let (read, _, dropped, _) = read_without(&[], Some(("A4", 5.015)));
     assert_eq!((read.as_slice(), dropped), (&[1, 2, 3, 6, 7, 8, 9][..], 2));
-    let (read, _, _, _) = of(&["A5"], Some(("A4", 5.015)));
+    let (read, _, _, _) = read_without(&["A5"], Some(("A4", 5.015)));
     assert_eq!(read, [1, 2, 3, 6, 7, 8, 9]);
 }
 

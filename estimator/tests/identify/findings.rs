@@ -112,12 +112,12 @@ fn what_can_show_counts_torques_beside_wrenches() {
         &simulate(&setup, &truth, 6.0, 0.01, 6),
         &simulate_torques(&setup, &truth, 6.0, 0.05, 6, |_, _| true),
     );
-    let of = |inputs: &[IdentificationInput]| {
+    let ranks = |inputs: &[IdentificationInput]| {
         let outcome = run(&setup, &[("log", LogRole::Train, &log)], inputs);
         (outcome.rank, outcome.structural_rank)
     };
     let (wrench, torque) = (IdentificationInput::Wrench, IdentificationInput::Torque);
-    let (own, both) = (of(&[wrench]), of(&[wrench, torque]));
+    let (own, both) = (ranks(&[wrench]), ranks(&[wrench, torque]));
     assert_eq!(own.0, own.1);
     assert!(both.1 > own.1 && both.0 <= both.1, "{own:?} {both:?}");
 }
@@ -133,7 +133,7 @@ fn joint_whose_zero_is_elsewhere_in_some_logs_is_named() {
     let clean: Vec<String> = (0..3)
         .map(|i| simulate(&setup, &real(&setup, 3), 12.0, motion[i], 3 + i as u64))
         .collect();
-    let told = |count: usize, joint: &str, by: [f64; 3]| -> Vec<(String, String)> {
+    let found = |count: usize, joint: &str, by: [f64; 3]| -> Vec<(String, String)> {
         let off = |i: usize| change(&clean[i], &format!("joint/{joint}/position"), |q| q + by[i]);
         let off: Vec<String> = (0..count).map(off).collect();
         let logs: Vec<_> = off
@@ -145,11 +145,11 @@ fn joint_whose_zero_is_elsewhere_in_some_logs_is_named() {
         let own = findings.filter(|f| f.code == FindingCode::EncoderOffset);
         own.map(|f| (f.subject, f.text)).collect()
     };
-    assert_eq!(told(3, "j4", [0.0; 3]), []);
+    assert_eq!(found(3, "j4", [0.0; 3]), []);
     let told = |count: usize, joint: &str, by: [f64; 3]| {
-        let told = told(count, joint, by);
-        let [(subject, text)] = told.as_slice() else {
-            panic!("{joint} {by:?}: {told:?}")
+        let found = found(count, joint, by);
+        let [(subject, text)] = found.as_slice() else {
+            panic!("{joint} {by:?}: {found:?}")
         };
         println!("{count} logs, {by:?}: {text}");
         assert_eq!(subject, joint, "{text}");

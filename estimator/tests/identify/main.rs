@@ -879,8 +879,8 @@ fn before_the_sensor(
     let mut dynamics = InverseDynamics::new(truth);
     let (mut square, mut inside, mut sum, mut count) = (0.0, 0.0, 0.0, 0.0);
     for row in 0..log["t"].len() {
-        let of = |what: &str| ARM_JOINTS.map(|joint| log[&format!("joint/{joint}/{what}")][row]);
-        let (q, dq, ddq) = (of("position"), of("velocity"), of("acceleration"));
+        let arm = |what: &str| ARM_JOINTS.map(|joint| log[&format!("joint/{joint}/{what}")][row]);
+        let (q, dq, ddq) = (arm("position"), arm("velocity"), arm("acceleration"));
         move_to(&mut kinematics, truth, &(q, dq, ddq));
         dynamics.update(truth, &kinematics, &[]).expect("a state");
         let error = got["torque/j2"][row] - dynamics.torque()[1];
@@ -952,7 +952,7 @@ fn judged_alike(setup: &Setup, parameters: &Parameters, log: &str, predicted: &P
         .expect("estimates");
     let assessment = assessor.finish();
     assert_eq!(assessment.changes, 0);
-    let of = |p: &Predicted| {
+    let errors = |p: &Predicted| {
         let [once, drifting] = [&p.relative_error, &p.relative_error_with_drift];
         let each = p
             .sensors
@@ -961,7 +961,7 @@ fn judged_alike(setup: &Setup, parameters: &Parameters, log: &str, predicted: &P
         let whole = [once.cad, once.identified, drifting.cad, drifting.identified];
         whole.into_iter().chain(each).collect::<Vec<f64>>()
     };
-    let (own, other) = (of(&assessment.predicted), of(predicted));
+    let (own, other) = (errors(&assessment.predicted), errors(predicted));
     assert_eq!((own.len(), other.len()), (16, 16));
     for (own, other) in own.iter().zip(&other) {
         assert!((own / other - 1.0).abs() < 1e-6, "{own} {other}");

@@ -154,7 +154,7 @@ fn noise_of_a_torque_that_was_seldom_measured_is_known() {
         joint != 5 || (1080..1240).contains(&i)
     });
     let outcome = run(&setup, &[("long", LogRole::Train, &log)], &TORQUE);
-    let of = |joint: &str| {
+    let deviation = |joint: &str| {
         let name = format!("joint/{joint}/torque");
         outcome
             .channels
@@ -165,9 +165,9 @@ fn noise_of_a_torque_that_was_seldom_measured_is_known() {
     };
     for joint in ["j5", "j6"] {
         assert!(
-            (of(joint) / 0.02 - 1.0).abs() < 0.3,
+            (deviation(joint) / 0.02 - 1.0).abs() < 0.3,
             "{joint}: {}",
-            of(joint)
+            deviation(joint)
         );
     }
 }
@@ -263,16 +263,16 @@ fn a_negative_rotor_is_named() {
         &[("log", LogRole::Train, &at_the_motors(&log, &rotors, 0.5))],
         &TORQUE,
     );
-    let of = |joint: &str| {
+    let rotor = |joint: &str| {
         outcome
             .rotors
             .iter()
             .find(|r| r.joint == joint)
             .expect("a rotor")
     };
-    assert_eq!(of("j4").inertia, 0.0);
+    assert_eq!(rotor("j4").inertia, 0.0);
     // A rotor that does not exist is negative by chance only.
-    let none = of("j6");
+    let none = rotor("j6");
     assert!(
         (0.0..3.0 * none.deviation).contains(&none.inertia),
         "{none:?}"

@@ -149,9 +149,9 @@ fn an_unexplained_residual_withholds_the_torques_of_its_sub_tree() {
                 );
             }
         }
-        let told = |number: usize| found["residual/l_upper_arm/reason"][number].as_str();
+        let reason = |number: usize| found["residual/l_upper_arm/reason"][number].as_str();
         let expected = |n: usize| if push(n) > 0.0 { "unexplained" } else { "" };
-        assert!((0..201).all(|n| matches!(n, 50 | 100) || told(n) == expected(n)));
+        assert!((0..201).all(|n| matches!(n, 50 | 100) || reason(n) == expected(n)));
         // The residual is the added wrench, with opposite sign: it acts from parent to child.
         let force: f64 = ["fx", "fy", "fz"]
             .map(|axis| {

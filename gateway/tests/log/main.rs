@@ -106,11 +106,11 @@ fn kept(format: LogFormat, mut entry: Entry) -> Option<Entry> {
 
 /// Asserts that the files in `folder` have the messages of its candump log.
 fn assert_same_messages(folder: &Path) -> usize {
-    let of = |name: &str| read(&std::fs::read(folder.join(name)).unwrap());
-    let truth = of("bus.log");
+    let frames = |name: &str| read(&std::fs::read(folder.join(name)).unwrap());
+    let truth = frames("bus.log");
     assert_eq!(truth.report.bad, 0);
     for (name, format) in FILES {
-        let found = of(name);
+        let found = frames(name);
         assert_eq!(found.format, Some(format), "{name}");
         assert_eq!(found.report.bad, 0, "{name}: {:?}", found.report);
         let expected = truth.entries.iter().cloned();

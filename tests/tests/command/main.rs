@@ -701,12 +701,12 @@ fn demo_of(joints: usize, place: &Place, seconds: f64, more: &[&str]) -> Json {
 fn reasons(place: &Place) -> BTreeMap<String, usize> {
     let text = place.read("d/estimates.csv");
     let names: Vec<&str> = text.lines().next().unwrap().split(',').collect();
-    let of = |part: &str| {
+    let columns = |part: &str| {
         (0..names.len())
             .filter(|i| names[*i].starts_with(part))
             .collect::<Vec<_>>()
     };
-    let (valid, reason, torque) = (of("valid/"), of("reason/"), of("torque/"));
+    let (valid, reason, torque) = (columns("valid/"), columns("reason/"), columns("torque/"));
     let mut counts = BTreeMap::new();
     for line in text.lines().skip(1) {
         let cells: Vec<&str> = line.split(',').collect();

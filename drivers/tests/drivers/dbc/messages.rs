@@ -93,7 +93,7 @@ fn the_file_is_that_of_the_keys() {
 /// Identifiers of 29 bits are shifted too, up to the largest one.
 #[test]
 fn the_address_shifts_long_identifiers() {
-    let of = |id: u32, address| {
+    let most = |id: u32, address| {
         let mut messages = messages();
         messages[0].id = Ok(Id::extended(id));
         let mut options = options("dbc", WRENCH);
@@ -102,9 +102,9 @@ fn the_address_shifts_long_identifiers() {
         let ids = device.claims().iter().map(|claim| claim.id);
         ids.max()
     };
-    assert_eq!(of(0x18FF_0000, 0x21), Some(Id::extended(0x18FF_0021)));
-    assert_eq!(of(0x1FFF_FFF0, 0xF), Some(Id::extended(0x1FFF_FFFF)));
-    assert_eq!(of(0x1FFF_FFF0, 0x10), None);
+    assert_eq!(most(0x18FF_0000, 0x21), Some(Id::extended(0x18FF_0021)));
+    assert_eq!(most(0x1FFF_FFF0, 0xF), Some(Id::extended(0x1FFF_FFFF)));
+    assert_eq!(most(0x1FFF_FFF0, 0x10), None);
 }
 
 /// A simulated device sends the number that is read back as the value: less its offset, in steps

@@ -60,13 +60,13 @@ fn jr3(keys: &str, halves: &[(&str, f64)]) -> Found {
     let keys = format!("full_scale_n = [16384, 1, 1]\nfull_scale_nm = [16384, 1, 1]\n{keys}");
     let frames: Vec<Frame> = halves.iter().map(|(name, ms)| half(name, *ms)).collect();
     let (readings, faults) = decode(&mut *listener("jr3_can", &keys, &[]), &frames);
-    let of = |stamped: &StampedReading| {
+    let counter = |stamped: &StampedReading| {
         let read = wrench(&stamped.reading);
         let counter = f64::from((stamped.device_counter as u16).cast_signed());
         assert_eq!([read.force[0], read.torque[0]], [counter; 2], "{stamped:?}");
         (stamped.device_counter, stamped.quality)
     };
-    (readings.iter().map(of).collect(), faults_of(&faults))
+    (readings.iter().map(counter).collect(), faults_of(&faults))
 }
 
 #[test]
@@ -657,12 +657,12 @@ fn two_jr3s_do_not_disturb_each_other() {
         device.claims().to_vec()
     };
     let (one, two) = (claims(1), claims(0x7F));
-    let own = |claims: &[proprio_drivers::Claim]| {
+    let exclusive = |claims: &[proprio_drivers::Claim]| {
         let own = claims.iter().filter(|claim| claim.exclusive);
         own.map(|claim| claim.id.raw()).collect::<Vec<_>>()
     };
-    assert_eq!(own(&one), [0x601, 0x681, 0x101, 0x701]);
-    assert_eq!(own(&two), [0x67F, 0x6FF, 0x17F, 0x77F]);
+    assert_eq!(exclusive(&one), [0x601, 0x681, 0x101, 0x701]);
+    assert_eq!(exclusive(&two), [0x67F, 0x6FF, 0x17F, 0x77F]);
     assert!(!one.iter().any(|a| two.iter().any(|b| a.overlaps(b))));
 }
 

@@ -90,13 +90,13 @@ fn opto(halves: &[&str]) -> Found {
     let frames: Vec<Frame> = halves.iter().map(|name| opto_half(name, 0.0)).collect();
     let mut device = listener("optoforce_daq", "counts_per_newton = [1, 1, 1]", &[]);
     let (readings, faults) = decode(&mut *device, &frames);
-    let of = |stamped: &StampedReading| {
+    let counted = |stamped: &StampedReading| {
         let force = wrench(&stamped.reading).force[0];
         let counter = f64::from((stamped.device_counter as u16).cast_signed());
         assert_eq!(force, counter, "halves of two: {stamped:?}");
         (stamped.device_counter, stamped.quality)
     };
-    (readings.iter().map(of).collect(), faults_of(&faults))
+    (readings.iter().map(counted).collect(), faults_of(&faults))
 }
 
 #[test]
@@ -175,15 +175,15 @@ fn an_optoforce_force_may_look_like_a_header() {
 fn the_status_of_an_optoforce_marks_its_readings() {
     let low = Saturation::Low;
     let high = Saturation::High;
-    let of = |axis, end| GOOD.with_saturation(axis, end);
+    let at = |axis, end| GOOD.with_saturation(axis, end);
     let fault = GOOD | Quality::DEVICE_FAULT;
     for (status, expected) in [
-        (1 << 9, of(0, low)),
-        (1 << 8, of(1, low)),
-        (1 << 7, of(2, high)),
-        (1 << 6, of(3, high)),
-        (1 << 5, of(4, high)),
-        (1 << 4, of(5, high)),
+        (1 << 9, at(0, low)),
+        (1 << 8, at(1, low)),
+        (1 << 7, at(2, high)),
+        (1 << 6, at(3, high)),
+        (1 << 5, at(4, high)),
+        (1 << 4, at(5, high)),
         (0b1111, GOOD),
         (1 << 10, fault),
         (2 << 10, fault),

@@ -575,8 +575,8 @@ proptest! {
         let mut stated = PlaceErrors::new(&structure);
         let kinematics = scene.kinematics();
         for std in kinds {
-            let of = |contact: usize| if contact == which { std } else { PlaceStd::default() };
-            stated.update(&structure, &before, &kinematics, of).expect("solved");
+            let std_of = |contact: usize| if contact == which { std } else { PlaceStd::default() };
+            stated.update(&structure, &before, &kinematics, std_of).expect("solved");
             let mut squares = vec![0.0; scene.torque.len() + 6 * scene.contacts.len()];
             for axis in 0..3 {
                 let mut unit = Vec3::zeros();
