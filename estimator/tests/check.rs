@@ -265,13 +265,13 @@ fn what_will_be_withheld_is_told_with_its_cause() {
             .map(|(why, _)| why)
             .collect::<Vec<_>>()
     };
-    let told = whys(&bound("0.15")).join("; ");
+    let why = whys(&bound("0.15")).join("; ");
     assert!(
-        told.contains("known to 20.0 % only (identification.urdf_relative_std)"),
-        "{told}"
+        why.contains("known to 20.0 % only (identification.urdf_relative_std)"),
+        "{why}"
     );
-    let told = whys(&bound("1e-5")).join("; ");
-    assert!(told.contains("because of the noise"), "{told}");
+    let why = whys(&bound("1e-5")).join("; ");
+    assert!(why.contains("because of the noise"), "{why}");
 
     // On-line identification does not use the offsets that are stated.
     let identifies = (
@@ -295,12 +295,12 @@ fn what_will_be_withheld_is_told_with_its_cause() {
     // What hides a torque at any time is withheld for that reason.
     let both = format!("{hand}[[contact]]\nlink = \"arm\"\n");
     let hidden = setup_with(&both, 50.0, "", &[known]);
-    let told = reasons(&hidden);
-    let (_, names) = told
+    let groups = reasons(&hidden);
+    let (_, names) = groups
         .iter()
         .find(|(why, _)| why.starts_with("undetermined"))
         .expect("it");
-    assert!(names.contains(&"wrist".to_owned()), "{told:?}");
+    assert!(names.contains(&"wrist".to_owned()), "{groups:?}");
 }
 
 /// A chain of `moving` joints, of which the last `locked` are locked.

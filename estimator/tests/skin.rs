@@ -787,9 +787,9 @@ fn the_plan_states_what_a_skin_shows() {
     let setup = setup(&config(ContactModel::Force));
     let plan = setup.to_string();
     // 6 mm / sqrt(12); 3.65 standard deviations of 1 count.
-    let told = "reads skin l_forearm_skin: 160 taxels, pressed above 3.6; touches of forearm \
+    let line = "reads skin l_forearm_skin: 160 taxels, pressed above 3.6; touches of forearm \
                 within 1.7 mm";
-    assert!(plan.contains(told), "{plan}");
+    assert!(plan.contains(line), "{plan}");
     let description = setup.description();
     let index = description
         .index(proprio_topics::Role::Channel, "l_forearm_skin")

@@ -242,13 +242,13 @@ fn frames_that_find_no_place_in_the_queue_are_refused_and_told() {
     let surplus = (devices - QUEUE) as u64;
     assert_eq!(rig.unsent(), (surplus, surplus));
     // Of the last devices, not of those that have a place.
-    let told: Vec<u64> = rig
+    let unsent: Vec<u64> = rig
         .status
         .devices()
         .map(|d| d.counters[Counter::Unsent as usize])
         .collect();
     let expected = (0..devices).map(|number| u64::from(number >= QUEUE));
-    assert_eq!(told, expected.collect::<Vec<_>>());
+    assert_eq!(unsent, expected.collect::<Vec<_>>());
     assert_eq!(rig.sent(), []);
     for _ in 0..100 {
         rig.pass(RETRY);
@@ -452,8 +452,9 @@ fn a_replaced_device_stops_its_board_before_the_new_one_starts_it() {
 
     let memory = rig.bus.into_sink();
     let gaps = |channel: u32| -> Vec<bool> {
-        let of = memory.samples.iter().filter(|s| s.channel == channel);
-        of.map(|s| s.header.quality.contains(Quality::GAP_BEFORE))
+        let samples = memory.samples.iter().filter(|s| s.channel == channel);
+        samples
+            .map(|s| s.header.quality.contains(Quality::GAP_BEFORE))
             .collect()
     };
     assert_eq!(gaps(0), [false, true, false, false]);

@@ -92,8 +92,8 @@ fn the_keys_of_each_page_load() {
             "{driver} says how certain it is"
         );
         plan(driver, block, folder.path()).unwrap_or_else(|problem| panic!("{driver}: {problem}"));
-        let wrong = plan(driver, &format!("no_such_key = 1\n{block}"), folder.path());
-        assert!(wrong.unwrap_err().contains("no_such_key"), "{driver}");
+        let planned = plan(driver, &format!("no_such_key = 1\n{block}"), folder.path());
+        assert!(planned.unwrap_err().contains("no_such_key"), "{driver}");
     }
 }
 

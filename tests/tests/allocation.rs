@@ -776,13 +776,13 @@ fn the_dynamics_allocate_nothing_after_construction() {
     );
 
     let unknown = [f64::NAN; 64];
-    let wrong = JointState {
+    let too_short = JointState {
         velocity: &unknown[..velocity.len()],
         ..state
     };
     let refused = counted(|| {
         assert!(stacked.update(&kinematics, &[], &all, &[]).is_err());
-        assert!(kinematics.update(model, wrong, motion).is_err());
+        assert!(kinematics.update(model, too_short, motion).is_err());
         assert!(kinematics.set_base(model, model.link_count()).is_err());
         assert!(
             solver

@@ -251,7 +251,7 @@ impl Sources {
             seen
         };
         let reached: Vec<BTreeSet<usize>> = (0..self.files.len()).map(reach).collect();
-        let mut told = BTreeSet::new();
+        let mut found = BTreeSet::new();
         for file in 0..self.files.len() {
             let circle: Vec<usize> = reached[file]
                 .iter()
@@ -271,10 +271,10 @@ impl Sources {
                 let arrows: Vec<String> = arrows
                     .map(|(a, b)| format!("{} -> {}", name(a), name(b)))
                     .collect();
-                told.insert(arrows.join("\n"));
+                found.insert(arrows.join("\n"));
             }
         }
-        told.into_iter().collect()
+        found.into_iter().collect()
     }
 }
 
@@ -361,9 +361,10 @@ fn written(files: &[(&str, &str)]) -> tempfile::TempDir {
 /// The circles of a crate of these files.
 fn example(files: &[(&str, &str)]) -> Vec<String> {
     let folder = written(files);
-    let told = Sources::read(&folder.path().join("lib.rs")).circles();
+    let circles = Sources::read(&folder.path().join("lib.rs")).circles();
     let place = format!("{}/", folder.path().display());
-    told.into_iter()
+    circles
+        .into_iter()
         .map(|circle| circle.replace(&place, ""))
         .collect()
 }

@@ -179,7 +179,7 @@ fn found(arm: &Arm, parameters: &Parameters, summary: &Json) {
         ];
         for (number, found) in own.parameters.into_iter().enumerate() {
             let deviation = own.deviations()[number];
-            let told = format!(
+            let what = format!(
                 "{} {number}: {found} +- {deviation}, {expected:?}",
                 own.joint
             );
@@ -187,7 +187,7 @@ fn found(arm: &Arm, parameters: &Parameters, summary: &Json) {
             assert!(
                 (found - expected[number]).abs() < 4.0 * deviation
                     || own.parameters[3] == 0.0 && (1..5).contains(&number),
-                "{told}"
+                "{what}"
             );
         }
         let relative = |i: usize| own.parameters[i] / expected[i] - 1.0;
@@ -206,9 +206,9 @@ fn found(arm: &Arm, parameters: &Parameters, summary: &Json) {
             own.joint,
             own.noise
         );
-        let told = &summary["drives"][&own.joint];
-        assert_eq!(told["constant"].as_f64(), Some(own.parameters[0]));
-        assert_eq!(told["signal"], "current");
+        let listed = &summary["drives"][&own.joint];
+        assert_eq!(listed["constant"].as_f64(), Some(own.parameters[0]));
+        assert_eq!(listed["signal"], "current");
     }
     let file = arm.rig.path("again.toml");
     parameters.save(&file).unwrap();
@@ -263,8 +263,8 @@ fn pushed(arm: &Arm, parameters: &Parameters) {
         let is_on = joints.iter().any(|joint| joint == "l_shoulder_pitch");
         if first.is_infinite() && (is_on || t > FROM + 0.5) {
             first = t;
-            let wrong = torque.torque - truth.at(t).joints[0].torque;
-            error = wrong.abs() / torque.standard_deviation;
+            let off = torque.torque - truth.at(t).joints[0].torque;
+            error = off.abs() / torque.standard_deviation;
         }
         if joints.is_empty() {
             return;

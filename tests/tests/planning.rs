@@ -518,8 +518,8 @@ fn a_written_motion_keeps_limits_and_box() {
     ];
     let (is_good, told, error) = proprio(&[&args[..], &limits[..], &["--json"]].concat());
     assert!(is_good, "{error}");
-    let told: serde_json::Value = serde_json::from_str(&told).unwrap();
-    for torque in told["torques"].as_array().unwrap() {
+    let report: serde_json::Value = serde_json::from_str(&told).unwrap();
+    for torque in report["torques"].as_array().unwrap() {
         let [before, after] = ["before", "after"].map(|key| torque[key].as_f64().unwrap());
         assert!(torque["wanted"] == true && after < before / 5.0, "{torque}");
     }
@@ -653,8 +653,8 @@ fn what_is_identifiable_is_told() {
     ];
     let (is_good, told, error) = proprio(&args);
     assert!(is_good, "{error}");
-    let told: serde_json::Value = serde_json::from_str(&told).unwrap();
-    let set = &told["sets"][0];
+    let report: serde_json::Value = serde_json::from_str(&told).unwrap();
+    let set = &report["sets"][0];
     assert_eq!(
         (set["rank"].as_u64(), set["unknowns"].as_u64()),
         (Some(44), Some(96))
@@ -686,8 +686,8 @@ fn what_is_identifiable_is_told() {
         ] {
             args.extend(["--sensors", sensors]);
         }
-        let told: serde_json::Value = serde_json::from_str(&proprio(&args).1).unwrap();
-        let ranks = told["sets"]
+        let report: serde_json::Value = serde_json::from_str(&proprio(&args).1).unwrap();
+        let ranks = report["sets"]
             .as_array()
             .unwrap()
             .iter()

@@ -412,17 +412,17 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
         .sum();
     assert_eq!(received, frames, "every frame that was played");
     health.fresh();
-    let told = health.fresh();
+    let last = health.fresh();
     assert_eq!(
-        (recorder.lost(), told.lost),
+        (recorder.lost(), last.lost),
         (0, 0),
         "nothing lost on the way here or to the estimator"
     );
     gateway.end();
     estimator.end();
     // User-mode Linux often stalls for longer than half the wait.
-    if told.late > 0 && !uml() {
-        println!("{} samples were late: trying again", told.late);
+    if last.late > 0 && !uml() {
+        println!("{} samples were late: trying again", last.late);
         return false;
     }
 
@@ -454,7 +454,7 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
         .count();
     assert!(
         before * 10 < offline.len()
-            && live.len() + before + 5 + told.late as usize >= offline.len(),
+            && live.len() + before + 5 + last.late as usize >= offline.len(),
         "{} live, {} offline, {before} of them before the first that is live",
         live.len(),
         offline.len()
@@ -473,11 +473,11 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
     println!(
         "{different} of {} live estimates differ, {} samples were late",
         live.len(),
-        told.late
+        last.late
     );
     // Late samples change the estimates around them. Beyond the longest window the estimates agree
     // again.
-    let may_differ = if told.late > 0 { live.len() * 2 / 3 } else { 0 };
+    let may_differ = if last.late > 0 { live.len() * 2 / 3 } else { 0 };
     assert!(
         different <= may_differ,
         "{different} of {} live estimates",

@@ -197,11 +197,11 @@ fn a_touch_on_the_bus_becomes_a_wrench_where_it_is() {
     };
     let (touched, detected) = (first(skin, "located"), first(blind, "detected"));
     let explains = |row: &usize| {
-        let told = blind
+        let reasons = blind
             .iter()
             .filter(|(name, _)| name.starts_with("residual/"));
-        let mut told = told.filter(|(name, _)| name.ends_with("/reason"));
-        seconds(*row) > FROM && told.any(|(_, cells)| !cells[*row].is_empty())
+        let mut reasons = reasons.filter(|(name, _)| name.ends_with("/reason"));
+        seconds(*row) > FROM && reasons.any(|(_, cells)| !cells[*row].is_empty())
     };
     let unexplained = (0..rows).find(explains).map(|row| seconds(row) - FROM);
     let hand = (0..rows).filter(|&row| (FROM..FROM + 2.0).contains(&seconds(row)));

@@ -225,9 +225,9 @@ fn halves_that_are_far_apart_are_not_paired() {
 fn faults_and_saturation_are_told() {
     let fault = |status| {
         let (readings, faults) = decode_keys(&halves(7, status, 0.0));
-        let told = readings[0].quality.contains(Quality::DEVICE_FAULT);
-        assert_eq!(count(&faults, Counter::DeviceFault), u32::from(told));
-        told
+        let is_faulty = readings[0].quality.contains(Quality::DEVICE_FAULT);
+        assert_eq!(count(&faults, Counter::DeviceFault), u32::from(is_faulty));
+        is_faulty
     };
     for bit in 0..16 {
         let concerns = matches!(bit, 0..=8 | 11 | 12 | 15);
@@ -797,8 +797,8 @@ fn a_stray_row_does_not_void_a_configured_matrix() {
     let mut device = session_listener(parts()[2]);
     let stray = faults_of(&mut *device, "3F2#3F8000003F800000", 0.0);
     assert_eq!(stray, [Counter::Unexpected]);
-    let told = ["3F7#", "3F7#00000064000003E8", "3F8#", "3F8#0203"];
-    let (_, faults) = decode(&mut *device, &told.map(|text| frame(text, 1.0)));
+    let answers = ["3F7#", "3F7#00000064000003E8", "3F8#", "3F8#0203"];
+    let (_, faults) = decode(&mut *device, &answers.map(|text| frame(text, 1.0)));
     assert!(faults.is_empty(), "{faults:?}");
     let (readings, _) = decode(&mut *device, &halves_at_3f(2.0));
     assert_eq!(numbers(&readings), [(5, false)]);

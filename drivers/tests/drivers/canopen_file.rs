@@ -598,10 +598,10 @@ fn a_rated_torque_that_can_not_be_is_refused() {
         assert!(rated("rated_torque = 1.0", None, &entries).is_ok());
         assert!(rated("rated_torque_unit = \"mNm\"", None, &entries).is_ok());
     }
-    let told = Refusal::Implausible { object: 0x6076 }.to_string();
+    let text = Refusal::Implausible { object: 0x6076 }.to_string();
     assert!(
-        told.contains("object 6076") && told.contains("rated_torque_unit"),
-        "{told}"
+        text.contains("object 6076") && text.contains("rated_torque_unit"),
+        "{text}"
     );
 }
 

@@ -25,7 +25,7 @@ fn motor(keys: &str, number: u32) -> Box<dyn Device> {
 
 /// Errors and temperatures told.
 fn told(readings: &[StampedReading]) -> Vec<(u32, f64)> {
-    let mut told = Vec::new();
+    let mut all = Vec::new();
     for pair in readings.windows(2) {
         if let (Reading::Actuator(actuator), Reading::Temperature(temperature)) =
             (pair[0].reading, pair[1].reading)
@@ -33,10 +33,10 @@ fn told(readings: &[StampedReading]) -> Vec<(u32, f64)> {
             assert_eq!((pair[0].output, pair[1].output), (0, 1));
             assert!(actuator.duty.is_nan() && actuator.mode == 0);
             assert_eq!(actuator.encoder, u32::from(actuator.faults == 5));
-            told.push((actuator.faults, temperature.celsius));
+            all.push((actuator.faults, temperature.celsius));
         }
     }
-    told
+    all
 }
 
 #[test]

@@ -28,7 +28,7 @@ fn motor(keys: &str, address: u32, mode: Mode) -> Box<dyn Device> {
 
 /// Mode and faults, temperatures of FET and motor.
 fn told(readings: &[StampedReading]) -> Vec<(u32, u32, f64, f64)> {
-    let told = readings.windows(3).filter_map(|three| {
+    let states = readings.windows(3).filter_map(|three| {
         let [a, b, c] = [0, 1, 2].map(|place| (three[place].output, three[place].reading));
         match (a, b, c) {
             (
@@ -43,7 +43,7 @@ fn told(readings: &[StampedReading]) -> Vec<(u32, u32, f64, f64)> {
             _ => None,
         }
     });
-    told.collect()
+    states.collect()
 }
 
 #[test]

@@ -388,8 +388,8 @@ fn stamps_and_their_kinds_belong_together() {
             .map(|(frame, kind)| frame.at(frame.t, kind))
             .collect();
         for stamped in read(&mut *device(row, Mode::Listen), &frames) {
-            let of = frames.iter().filter(|frame| frame.t == stamped.acquired);
-            let kinds: Vec<StampKind> = of.map(|frame| frame.stamp).collect();
+            let measured = frames.iter().filter(|frame| frame.t == stamped.acquired);
+            let kinds: Vec<StampKind> = measured.map(|frame| frame.stamp).collect();
             assert!(
                 kinds.contains(&stamped.stamp),
                 "{row:?}: {stamped:?}, {kinds:?}"
@@ -424,8 +424,8 @@ fn a_gap_is_told_once() {
             outputs.sort_unstable();
             outputs.dedup();
             assert!(!outputs.is_empty());
-            let told = (gaps(&steady), gaps(&resumed));
-            assert_eq!(told, (0, outputs.len()), "{row:?} {cut}");
+            let counted = (gaps(&steady), gaps(&resumed));
+            assert_eq!(counted, (0, outputs.len()), "{row:?} {cut}");
             assert!(
                 resumed[0].quality.contains(Quality::GAP_BEFORE),
                 "{row:?} {cut}"

@@ -171,16 +171,16 @@ fn a_counter_is_evidence() {
 /// A board that may have a skin, or encoders, or not, is found as such only if it sends them.
 #[test]
 fn an_mtb4_is_what_it_sends() {
-    let told = "730#FF0B010203";
+    let answer = "730#FF0B010203";
     let drivers = |frames: &[&str]| {
         let findings = recognise(&traffic(&unstamped(frames)));
         let mut drivers: Vec<&str> = findings.iter().map(|found| found.driver).collect();
         drivers.sort_unstable();
         drivers
     };
-    assert_eq!(drivers(&[told]), ["icub_imu"]);
+    assert_eq!(drivers(&[answer]), ["icub_imu"]);
     assert_eq!(
-        drivers(&[told, "432#4000000000000000"]),
+        drivers(&[answer, "432#4000000000000000"]),
         ["icub_imu", "icub_skin"]
     );
 }
@@ -223,10 +223,10 @@ fn a_moteus_is_a_controller_that_replies_to_a_host() {
         (Id::extended(0x1_0100), None),
     ] {
         let found = found("moteus", &[reply(id)]);
-        let told = found
+        let named = found
             .as_ref()
             .map(|found| (found.address, key(found, "host")));
-        assert_eq!(told, controller, "{id}");
+        assert_eq!(named, controller, "{id}");
     }
     // Its host asks, and tells no errors.
     let seen = |query: &[u8]| {
@@ -275,8 +275,8 @@ fn an_ati_board_is_known_by_its_answers() {
     ] {
         let found = found(&["208#0203", "205#", serial]);
         let what = found.map(|found| found.what);
-        let told = letters.map(|l| format!("ATI sensor at a NETCANOEM board, serial {l}"));
-        assert_eq!(what, told, "{serial}");
+        let expected = letters.map(|l| format!("ATI sensor at a NETCANOEM board, serial {l}"));
+        assert_eq!(what, expected, "{serial}");
     }
 }
 
@@ -310,8 +310,8 @@ fn a_cubemars_motor_is_known_by_its_replies() {
         ("00002968#00010203040506", None),
     ] {
         let found = found("cubemars", &periodic(&[text], 10.0, 8));
-        let told = found.as_ref().map(|found| key(found, "mode").unwrap());
-        assert_eq!(told, mode, "{text}");
+        let found_mode = found.as_ref().map(|found| key(found, "mode").unwrap());
+        assert_eq!(found_mode, mode, "{text}");
         let host = found.as_ref().and_then(|found| key(found, "host_id"));
         assert_eq!(
             host,
@@ -416,10 +416,10 @@ fn an_odrive_is_known_by_its_heartbeat_or_its_estimates() {
     }
     // A byte that is 0, one of two others, and an identifier next to one that it has.
     let least = bits("odrive", &unstamped(&[BEAT]));
-    let told = bits("odrive", &unstamped(&[BEAT, "0A0#0204043A00060800"]));
+    let with_beat = bits("odrive", &unstamped(&[BEAT, "0A0#0204043A00060800"]));
     assert!(
-        (told - least - 8.0 - 7.0 - 1.0).abs() < 1e-9,
-        "{told} {least}"
+        (with_beat - least - 8.0 - 7.0 - 1.0).abs() < 1e-9,
+        "{with_beat} {least}"
     );
     assert_eq!(found("odrive", &unstamped(&["0B4#0000803F00000000"])), None);
     // Who has a heartbeat is asked for its version: not who is asked for one, or sends another.
@@ -533,8 +533,8 @@ fn an_xsens_sensor_is_known_by_two_quantities() {
         ),
     ] {
         let found = found("xsens_mti", &unstamped(texts));
-        let told = found.as_ref().and_then(|found| key(found, "quantities"));
-        assert_eq!(told, quantities, "{texts:?}");
+        let named = found.as_ref().and_then(|found| key(found, "quantities"));
+        assert_eq!(named, quantities, "{texts:?}");
     }
 }
 

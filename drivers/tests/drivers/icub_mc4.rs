@@ -325,13 +325,13 @@ fn a_simulated_board_sends_what_it_is_given() {
     assert_eq!(send(0, &first, doubt | Quality::SATURATED), [""; 0]);
     assert_eq!(send(0, &first, drive | zero), ["113#0460000100000000"]);
     assert_eq!(send(0, &first, good), ["113#0001000100000000"]);
-    let told = Reading::Actuator(Actuator {
+    let actuator = Reading::Actuator(Actuator {
         duty: 0.0,
         mode: 0x50,
         encoder: 0,
         faults: 0x48,
     });
-    assert_eq!(send(1, &told, good), ["113#0001485000000000"]);
+    assert_eq!(send(1, &actuator, good), ["113#0001485000000000"]);
     let positions = send(1, &second, doubt | drive);
     assert_eq!(positions, both);
     // One joint in use does not wait for the other.

@@ -158,7 +158,7 @@ fn a_controller_is_asked_as_by_the_makers_package() {
 fn states_are_told_on_change_and_once_a_second() {
     let mut device = listener("moteus", "", &[0]);
     // Mode 10 for 2.5 s; then mode 1 with fault 35, and again mode 10.
-    let mut told = Vec::new();
+    let mut states = Vec::new();
     for ms in 0..2520 {
         let (mode, fault) = if (2510..2515).contains(&ms) {
             (1, 35)
@@ -170,8 +170,8 @@ fn states_are_told_on_change_and_once_a_second() {
         let (readings, _) = decode(&mut *device, &[reply.at(t, StampKind::Software)]);
         for stamped in readings {
             match stamped.reading {
-                Reading::Actuator(state) => told.push((ms, state.mode, state.faults)),
-                Reading::Temperature(warmth) => told.push((ms, 0, warmth.celsius as u32)),
+                Reading::Actuator(state) => states.push((ms, state.mode, state.faults)),
+                Reading::Temperature(warmth) => states.push((ms, 0, warmth.celsius as u32)),
                 _ => {}
             }
         }
@@ -186,7 +186,7 @@ fn states_are_told_on_change_and_once_a_second() {
         (2510, 1, 35),
         (2515, 10, 0),
     ];
-    assert_eq!(told, expected);
+    assert_eq!(states, expected);
     // A fault alone, in the answer to another program's question.
     let (readings, _) = decode(&mut *device, &[reply("210F2A50")]);
     let Reading::Actuator(state) = readings[0].reading else {
@@ -377,8 +377,8 @@ fn a_restart_forgets_the_fault() {
     let mut device = listener("moteus", "", &[0]);
     let fault = reply("210001210F2321010A");
     let (readings, _) = decode(&mut *device, &[fault]);
-    let told = Quality::DRIVE_FAULT | Quality::DEVICE_FAULT;
-    assert_eq!(readings[1].quality, told);
+    let faults = Quality::DRIVE_FAULT | Quality::DEVICE_FAULT;
+    assert_eq!(readings[1].quality, faults);
     device.restart(Nanos::ZERO);
     let (readings, _) = decode(&mut *device, &[reply("21010A")]);
     assert_eq!(readings[0].quality, Quality::GAP_BEFORE);

@@ -587,16 +587,16 @@ proptest! {
         prop_assert!(near(back.position, position) && near(back.velocity, velocity));
         prop_assert!(near(back.current, current));
         prop_assert!(back.torque.is_nan() == old && (old || near(back.torque, torque)));
-        let told = Reading::Actuator(Actuator {
+        let reading = Reading::Actuator(Actuator {
             duty: 0.0, mode: u32::from(state), encoder: 0, faults: errors,
         });
-        let (readings, _) = decode(&mut *host, &encode(&mut *axis, 0, &told, Quality::GOOD));
+        let (readings, _) = decode(&mut *host, &encode(&mut *axis, 0, &reading, Quality::GOOD));
         let back = actuator(&readings[0].reading);
         prop_assert_eq!((back.mode, back.faults), (u32::from(state), errors));
         if !old {
-            let told = Reading::Temperature(Temperature { celsius });
-            encode(&mut *axis, 1, &told, Quality::GOOD);
-            let frames = encode(&mut *axis, 2, &told, Quality::GOOD);
+            let reading = Reading::Temperature(Temperature { celsius });
+            encode(&mut *axis, 1, &reading, Quality::GOOD);
+            let frames = encode(&mut *axis, 2, &reading, Quality::GOOD);
             let (readings, _) = decode(&mut *host, &frames);
             for stamped in &readings {
                 let Reading::Temperature(back) = stamped.reading else { panic!("{stamped:?}") };

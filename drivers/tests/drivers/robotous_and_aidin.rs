@@ -387,8 +387,8 @@ fn an_rft_that_streams_takes_no_other_command() {
     let done = |first: &str| vec![first.to_owned(), zeros.clone()];
     let set = answer("064#0F08000000000000");
     assert_eq!(set, (done("001#0F01000000000000"), None));
-    let wrong = answer("064#0F09000000000000");
-    assert_eq!(wrong, (done("001#0F00020000000000"), None));
+    let answered = answer("064#0F09000000000000");
+    assert_eq!(answered, (done("001#0F00020000000000"), None));
     let get = answer("064#1000000000000000");
     assert_eq!(get, (done("001#1008000000000000"), None));
     let ms = Some(Nanos::from_millis(1));
@@ -427,12 +427,12 @@ fn wrong_keys_of_an_rft_are_refused() {
     }
     for address in [0, 256] {
         let (least, most) = (1, 255);
-        let wrong = SpecError::Address {
+        let refused = SpecError::Address {
             address,
             least,
             most,
         };
-        assert_eq!(refused_at("robotous_rft", "", address), wrong);
+        assert_eq!(refused_at("robotous_rft", "", address), refused);
     }
     assert_eq!(options("robotous_rft", "").default_address(), Some(0x64));
 }
@@ -649,23 +649,23 @@ fn wrong_keys_of_an_aft_are_refused() {
         ("id_force = 0x800", "id_force", 2048.0, "from 0 to 0x7FF"),
         ("id_torque = 0x800", "id_torque", 2048.0, "from 0 to 0x7FF"),
     ] {
-        let wrong = SpecError::Key {
+        let refused = SpecError::Key {
             key,
             value,
             expected,
         };
-        assert_eq!(refused_at("aidin_aft200", keys, 1), wrong);
+        assert_eq!(refused_at("aidin_aft200", keys, 1), refused);
     }
     let same = refused_at("aidin_aft200", "id_force = 2", 1);
     assert!(matches!(same, SpecError::Keys { .. }), "{same:?}");
     for address in [0, 255] {
         let (least, most) = (1, 254);
-        let wrong = SpecError::Address {
+        let refused = SpecError::Address {
             address,
             least,
             most,
         };
-        assert_eq!(refused_at("aidin_aft200", "", address), wrong);
+        assert_eq!(refused_at("aidin_aft200", "", address), refused);
     }
     let shown = shown_keys(include_str!(
         "../../../docs/book/src/devices/aidin_aft200.md"

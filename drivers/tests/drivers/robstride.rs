@@ -424,8 +424,8 @@ fn a_simulated_motor_sends_what_it_is_given() {
     );
     assert_eq!(send(0, &low, both), ["028C01FD#00000000000000FA"]);
     // A fault of that kind stays as it was told.
-    let told = ["150001FD#0001000000000000"];
-    assert_eq!(send(0, &actuator(1, 0x0100_0100), good), told);
+    let report = ["150001FD#0001000000000000"];
+    assert_eq!(send(0, &actuator(1, 0x0100_0100), good), report);
     assert_eq!(
         send(0, &low, Quality::DRIVE_FAULT),
         ["024101FD#00000000000000FA"]

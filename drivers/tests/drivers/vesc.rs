@@ -68,11 +68,11 @@ fn frames_of_the_firmware_are_read() {
                 panic!("{line}: {readings:?}");
             };
             assert!(near(told.duty, duty, 1e-3) && told.faults == 0, "{line}");
-            let told = temperatures(&readings);
-            assert!(told[0].0 == 2 && near(told[0].1, fet, 0.1), "{line}");
+            let warmth = temperatures(&readings);
+            assert!(warmth[0].0 == 2 && near(warmth[0].1, fet, 0.1), "{line}");
             // Motor -87.1: a thermometer that is not there.
-            assert_eq!(told.len(), if motor < -40.0 { 1 } else { 2 }, "{line}");
-            if let Some(&(output, celsius)) = told.get(1) {
+            assert_eq!(warmth.len(), if motor < -40.0 { 1 } else { 2 }, "{line}");
+            if let Some(&(output, celsius)) = warmth.get(1) {
                 assert!(output == 1 && near(celsius, motor, 0.1), "{line}");
             }
         }
@@ -293,8 +293,8 @@ proptest! {
                 position: p, velocity: v, current: i, ..JointState::ABSENT
             };
             let mut board = board("vesc", keys, &[0]);
-            let told = Actuator { duty, mode: 0, encoder: 0, faults: 0 };
-            encode(&mut *board, 0, &Reading::Actuator(told), Quality::GOOD);
+            let actuator = Actuator { duty, mode: 0, encoder: 0, faults: 0 };
+            encode(&mut *board, 0, &Reading::Actuator(actuator), Quality::GOOD);
             let frames = encode(&mut *board, 0, &Reading::Joint(state), Quality::GOOD);
             let (readings, faults) = decode(&mut *listener("vesc", keys, &[0]), &frames);
             prop_assert!(faults.is_empty());

@@ -491,13 +491,13 @@ fn the_logs_of_a_real_kuka_are_clean() {
 fn a_wrong_model_and_a_late_start_are_no_defects() {
     let robot = robot("");
     // Every mass is a third too large, every centre of mass is displaced.
-    let mut wrong = robot.clone();
+    let mut altered = robot.clone();
     for (link, inertia) in robot.model.inertias().iter().enumerate() {
         let mut parameters = inertia.parameters().map(|p| 1.33 * p);
         parameters[1] += 0.02 * parameters[0];
         parameters[2] -= 0.03 * parameters[0];
         let changed = RigidInertia::from_parameters(&parameters);
-        wrong.model.set_inertia(link, changed).unwrap();
+        altered.model.set_inertia(link, changed).unwrap();
     }
     // At rest for six seconds; then the motion starts, within one second.
     let begin = |joint: usize, t: f64| {
@@ -521,7 +521,7 @@ fn a_wrong_model_and_a_late_start_are_no_defects() {
             ] {
                 alarms.extend(
                     table
-                        .findings(&wrong)
+                        .findings(&altered)
                         .into_iter()
                         .map(|own| format!("{seed}, {rate} Hz: {}", own.text)),
                 );

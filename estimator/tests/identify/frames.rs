@@ -270,13 +270,13 @@ fn of_two_sensors_the_turned_one_is_named() {
     let setup = arm_with(&["ft", "wrist"]);
     let log = simulate(&setup, &real(&setup, 3), 10.0, 0.01, 3);
     for turned in [vec!["ft"], vec!["wrist"], vec!["ft", "wrist"]] {
-        let mut wrong = log.clone();
+        let mut text = log.clone();
         for sensor in &turned {
             for axis in AXES {
-                wrong = change(&wrong, &format!("wrench/{sensor}/{axis}"), |x| -x);
+                text = change(&text, &format!("wrench/{sensor}/{axis}"), |x| -x);
             }
         }
-        let outcome = run(&setup, &[("turned", LogRole::Train, &wrong)], &[]);
+        let outcome = run(&setup, &[("turned", LogRole::Train, &text)], &[]);
         assert!(
             matches!(outcome.verdict, Verdict::Nothing(_)),
             "{:?}",

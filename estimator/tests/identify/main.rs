@@ -821,12 +821,12 @@ fn miscalibrated(log: &str, right: &Calibration) -> String {
             cells[place] = sent[axis].to_string();
         }
         // Once a second.
-        let told = if number % 100 == 0 {
+        let cell = if number % 100 == 0 {
             celsius.to_string()
         } else {
             String::new()
         };
-        text += &format!("{},{told}\n", cells.join(","));
+        text += &format!("{},{cell}\n", cells.join(","));
     }
     text
 }

@@ -206,7 +206,7 @@ fn a_touch_in_held_out_data_is_told() {
         ("touched", LogRole::Validate, &touched),
     ];
     let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
-    let told: Vec<Vec<&Finding>> = (outcome.logs.iter())
+    let disturbances: Vec<Vec<&Finding>> = (outcome.logs.iter())
         .map(|log| {
             log.findings
                 .iter()
@@ -214,9 +214,12 @@ fn a_touch_in_held_out_data_is_told() {
                 .collect()
         })
         .collect();
-    assert!(told[0].is_empty() && told[1].is_empty(), "{told:?}");
-    let [note] = told[2].as_slice() else {
-        panic!("{told:?}")
+    assert!(
+        disturbances[0].is_empty() && disturbances[1].is_empty(),
+        "{disturbances:?}"
+    );
+    let [note] = disturbances[2].as_slice() else {
+        panic!("{disturbances:?}")
     };
     assert_eq!(
         (note.severity, &*note.subject),

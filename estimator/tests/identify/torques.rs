@@ -432,14 +432,14 @@ fn late_readings_are_found_with_their_deviation() {
             off.abs() < 4.0 * deviation + 0.03 * 0.01 * late.abs() && deviation < 2e-3,
             "{offset:?}"
         );
-        let told = outcome
+        let offsets = outcome
             .findings
             .iter()
             .filter(|f| f.code == FindingCode::TimeOffset);
-        let told: Vec<&str> = told.map(|f| f.text.as_str()).collect();
-        assert_eq!(told.len(), usize::from(late != 0.0), "{told:?}");
+        let texts: Vec<&str> = offsets.map(|f| f.text.as_str()).collect();
+        assert_eq!(texts.len(), usize::from(late != 0.0), "{texts:?}");
         let word = if late > 0.0 { "behind" } else { "ahead of" };
-        assert!(told.iter().all(|text| text.contains(word)), "{told:?}");
+        assert!(texts.iter().all(|text| text.contains(word)), "{texts:?}");
     }
 }
 

@@ -222,8 +222,8 @@ fn torques_agree_with_the_truth() {
     simulator.wait();
     recorder.take();
 
-    let told: serde_json::Value = serde_json::from_str(&simulator.output()).expect("a summary");
-    let sent = told["sent"].as_u64().expect("a number");
+    let summary: serde_json::Value = serde_json::from_str(&simulator.output()).expect("a summary");
+    let sent = summary["sent"].as_u64().expect("a number");
     let health = health.fresh();
     let frames: u64 = health.buses().iter().map(|b| b.frames).sum();
     let dropped: u64 = health

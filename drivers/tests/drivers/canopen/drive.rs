@@ -458,12 +458,12 @@ fn scales_that_a_drive_does_not_tell_are_those_of_its_file() {
             continue;
         }
         // A quarter of the 4096 counts of a turn, half of 0.5 Nm, and all of 4 A.
-        let told = joint(&readings[0].reading);
+        let state = joint(&readings[0].reading);
         assert!(
-            near(told.position, TAU / 4.0) && near(told.torque, 0.25),
-            "{told:?}"
+            near(state.position, TAU / 4.0) && near(state.torque, 0.25),
+            "{state:?}"
         );
-        assert!(near(told.current, 4.0), "{told:?}");
+        assert!(near(state.current, 4.0), "{state:?}");
         let right = [
             "001000", "A86000", "8F6001", "8F6002", "181001", "766000", "756000", "806000",
         ];

@@ -604,12 +604,12 @@ fn wrong_keys_of_a_jr3_are_refused() {
             "above 0 and at most 65535",
         ),
     ] {
-        let wrong = SpecError::Key {
+        let refused = SpecError::Key {
             key,
             value,
             expected,
         };
-        assert_eq!(refused_at("jr3_can", keys, 1), wrong);
+        assert_eq!(refused_at("jr3_can", keys, 1), refused);
     }
     // The key that is named is the one of the wrong number, and 65535 is the most that fits.
     for (at, key) in (0..6).zip([["full_scale_n"; 3], ["full_scale_nm"; 3]].concat()) {
@@ -618,12 +618,12 @@ fn wrong_keys_of_a_jr3_are_refused() {
             all[at] = value;
             let (force, torque) = all.split_at(3);
             let keys = format!("full_scale_n = {force:?}\nfull_scale_nm = {torque:?}");
-            let wrong = SpecError::Key {
+            let refused = SpecError::Key {
                 key,
                 value,
                 expected: "above 0 and at most 65535",
             };
-            assert_eq!(refused_at("jr3_can", &keys, 1), wrong);
+            assert_eq!(refused_at("jr3_can", &keys, 1), refused);
         }
     }
     let most = "full_scale_n = [65535, 65535, 65535]\nfull_scale_nm = [65535, 65535, 65535]";
@@ -636,12 +636,12 @@ fn wrong_keys_of_a_jr3_are_refused() {
     assert_eq!(half, SpecError::Incomplete { given, missing });
     for address in [0, 128] {
         let (least, most) = (1, 127);
-        let wrong = SpecError::Address {
+        let refused = SpecError::Address {
             address,
             least,
             most,
         };
-        assert_eq!(refused_at("jr3_can", "", address), wrong);
+        assert_eq!(refused_at("jr3_can", "", address), refused);
     }
     let shown = shown_keys(include_str!("../../../../docs/book/src/devices/jr3_can.md"));
     assert_eq!(options("jr3_can", shown), options("jr3_can", JR3));

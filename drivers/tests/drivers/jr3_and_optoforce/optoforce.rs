@@ -410,7 +410,7 @@ fn wrong_keys_of_an_optoforce_are_refused() {
         ),
         ("id_config = 0x800", "id_config", 2048.0, "from 0 to 0x7FF"),
     ] {
-        let wrong = SpecError::Key {
+        let refused = SpecError::Key {
             key,
             value,
             expected,
@@ -419,7 +419,7 @@ fn wrong_keys_of_an_optoforce_are_refused() {
             "counts_per_newton" => keys.to_owned(),
             _ => format!("{OPTO}{keys}"),
         };
-        assert_eq!(refused_at("optoforce_daq", &keys, 0x100), wrong);
+        assert_eq!(refused_at("optoforce_daq", &keys, 0x100), refused);
     }
     for (keys, given) in [("filter_hz = 15", "filter_hz"), ("zero = true", "zero")] {
         let missing = "rate_hz";
@@ -429,12 +429,12 @@ fn wrong_keys_of_an_optoforce_are_refused() {
     let same = refused_at("optoforce_daq", &format!("{OPTO}id_config = 0x100"), 0x100);
     assert!(matches!(same, SpecError::Keys { .. }), "{same:?}");
     let (address, least, most) = (0x800, 0, 0x7FF);
-    let wrong = SpecError::Address {
+    let refused = SpecError::Address {
         address,
         least,
         most,
     };
-    assert_eq!(refused_at("optoforce_daq", OPTO, address), wrong);
+    assert_eq!(refused_at("optoforce_daq", OPTO, address), refused);
     let shown = shown_keys(include_str!(
         "../../../../docs/book/src/devices/optoforce_daq.md"
     ));
