@@ -100,8 +100,8 @@ impl Setup {
         if !others.is_empty() {
             writeln!(f, "  the URDF's, {known}: {}", others.join(", "))?;
         }
-        for (place, offset) in parameters.offsets().iter().enumerate() {
-            let deviation = parameters.offset_deviation(place).unwrap_or_default();
+        for (index, offset) in parameters.offsets().iter().enumerate() {
+            let deviation = parameters.offset_deviation(index).unwrap_or_default();
             let numbers = offset
                 .reading
                 .force_first()

@@ -190,7 +190,7 @@ pub(crate) fn wrong_signs(
 /// An error that is estimated.
 #[derive(Clone, Debug, PartialEq)]
 enum SetupError {
-    /// The zero of a joint's encoder (its place among the tested ones), in all logs or in one.
+    /// The zero of a joint's encoder (its index among the tested ones), in all logs or in one.
     Zero { joint: usize, log: Option<usize> },
     /// The common delay of these streams: F/T sensors, then joint torques.
     Delay(Range<usize>),
@@ -371,8 +371,8 @@ impl<'a> Search<'a> {
         let columns = self.r.columns(self.r.ncols() - parameters, parameters);
         let mut columns =
             (columns.into_owned()).resize_horizontally(parameters + errors.len(), 0.0);
-        for (place, error) in errors.iter().enumerate() {
-            columns.set_column(parameters + place, &self.column(error));
+        for (index, error) in errors.iter().enumerate() {
+            columns.set_column(parameters + index, &self.column(error));
         }
         columns
     }
@@ -419,8 +419,8 @@ impl<'a> Search<'a> {
             .take(TRIED)
             .map(|(_, own)| own.clone())
             .collect();
-        for place in 0..likely.len() {
-            if let SetupError::Zero { joint, .. } = likely[place] {
+        for index in 0..likely.len() {
+            if let SetupError::Zero { joint, .. } = likely[index] {
                 let in_all = SetupError::Zero { joint, log: None };
                 if !likely.contains(&in_all) && !errors.contains(&in_all) {
                     likely.push(in_all);
@@ -442,16 +442,16 @@ impl<'a> Search<'a> {
         accepted(|errors| self.likely(errors), cost, |_| self.gain, 1.0)
     }
 
-    /// Whether the zero at `place` may as well be in another log, with the opposite sign.
-    fn is_exchangeable(&self, errors: &[SetupError], place: usize) -> bool {
+    /// Whether the zero at `index` may as well be in another log, with the opposite sign.
+    fn is_exchangeable(&self, errors: &[SetupError], index: usize) -> bool {
         let cost_in = |log: Option<usize>| {
             let mut errors = errors.to_vec();
-            if let SetupError::Zero { log: own, .. } = &mut errors[place] {
+            if let SetupError::Zero { log: own, .. } = &mut errors[index] {
                 *own = log.or(*own);
             }
             self.fit(&errors).map_or(f64::INFINITY, |(cost, _)| cost)
         };
-        let SetupError::Zero { log, .. } = &errors[place] else {
+        let SetupError::Zero { log, .. } = &errors[index] else {
             return false;
         };
         let cost = cost_in(None);
@@ -501,8 +501,8 @@ impl<'a> Search<'a> {
             let own = each
                 .get(count + sensors..)
                 .and_then(|each| alone(each, is_long));
-            findings.extend(own.map(|(place, delay)| {
-                let joint = robot.model.dof_name(unknowns.joints[place]);
+            findings.extend(own.map(|(index, delay)| {
+                let joint = robot.model.dof_name(unknowns.joints[index]);
                 let joint = format!("joint/{joint}/torque");
                 late(
                     &joint,
@@ -520,9 +520,9 @@ impl<'a> Search<'a> {
         let mut findings = Vec::new();
         for (number, &dof) in self.dofs.iter().enumerate() {
             let found: Vec<(usize, Option<usize>, f64)> = (zeros.iter().zip(estimates).enumerate())
-                .filter_map(|(place, (error, (angle, _)))| match error {
+                .filter_map(|(index, (error, (angle, _)))| match error {
                     SetupError::Zero { joint, log } if *joint == number => {
-                        Some((place, *log, *angle))
+                        Some((index, *log, *angle))
                     }
                     _ => None,
                 })
@@ -549,7 +549,7 @@ impl<'a> Search<'a> {
             let mut what = format!("encoder offset of {}", each.collect::<Vec<_>>().join(", "));
             let rest = match *found {
                 [(_, None, _)] => "",
-                [(place, Some(_), _)] if self.is_exchangeable(zeros, place) => {
+                [(index, Some(_), _)] if self.is_exchangeable(zeros, index) => {
                     what += ", or the opposite in all other logs";
                     " and use logs of one calibration"
                 }
@@ -639,16 +639,16 @@ fn late(subject: &str, seem: &str, (seconds, deviation): Estimate) -> Finding {
 /// The single torque that has a delay while all others have none.
 fn alone(each: &[Estimate], is_long: impl Fn(Estimate) -> bool) -> Option<(usize, Estimate)> {
     let known: Vec<usize> = (0..each.len()).filter(|&k| is_known(&each[k])).collect();
-    known.iter().filter(|_| known.len() > 2).find_map(|&place| {
-        let others = || known.iter().filter(|&&k| k != place).map(|&k| each[k]);
+    known.iter().filter(|_| known.len() > 2).find_map(|&index| {
+        let others = || known.iter().filter(|&&k| k != index).map(|&k| each[k]);
         let weight: f64 = others().map(|(_, deviation)| deviation.powi(-2)).sum();
         let weighted = others().map(|(own, deviation)| own * deviation.powi(-2));
         let common = (weighted.sum::<f64>() / weight, weight.sqrt().recip());
         let off = others().map(|(seconds, _)| (seconds - common.0).abs());
         let farthest = off.fold(0.0, f64::max);
-        let own = each[place];
+        let own = each[index];
         let apart = (own.0 - common.0, own.1.hypot(common.1));
         let is_alone = is_long(apart) && apart.0.abs() > SINGLE * farthest;
-        (is_alone && is_long(own) && !is_long(common)).then_some((place, own))
+        (is_alone && is_long(own) && !is_long(common)).then_some((index, own))
     })
 }

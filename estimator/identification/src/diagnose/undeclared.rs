@@ -53,7 +53,7 @@ impl Undeclared {
         };
         let is_same = |other: &&mut LoadChange| {
             let apart = (edge(other) - edge(&load)).seconds().abs();
-            (other.log, other.place, other.is_after) == (load.log, load.place, load.is_after)
+            (other.log, other.index, other.is_after) == (load.log, load.index, load.is_after)
                 && apart <= LONGEST_HANDOVER.max(1.5 * load.within)
         };
         match self.loads.iter_mut().find(is_same) {
@@ -126,8 +126,8 @@ impl Undeclared {
                 log.findings
                     .push(Finding::warning(FindingCode::Disturbance, part, text));
             }
-            for (place, (load, body)) in log_loads.enumerate() {
-                let handovers = apparent.iter().filter(|own| own.load == Some(place));
+            for (index, (load, body)) in log_loads.enumerate() {
+                let handovers = apparent.iter().filter(|own| own.load == Some(index));
                 report_load(measurement, log, load, body.as_ref(), handovers);
             }
         }
@@ -145,8 +145,8 @@ fn report_load<'a>(
     handovers: impl Iterator<Item = &'a ApparentContact>,
 ) {
     let (robot, unknowns) = (measurement.robot(), measurement.unknowns());
-    let place = body.map_or(load.place, |(place, _)| *place);
-    let link = robot.model.link_name(unknowns.links[place]);
+    let index = body.map_or(load.index, |(index, _)| *index);
+    let link = robot.model.link_name(unknowns.links[index]);
     let since = |t: Nanos| (t - log.span.0).seconds();
     let stamps = log.instants.iter().map(|instant| instant.t);
     let mut out: Vec<bool> = stamps.map(|t| load.has(t)).collect();
@@ -358,11 +358,11 @@ mod tests {
     use super::*;
 
     /// A load that comes at `from` \[s\], known to `within`, of a log of 100 s.
-    fn load(log: usize, place: usize, from: i64, within: f64) -> LoadChange {
+    fn load(log: usize, index: usize, from: i64, within: f64) -> LoadChange {
         let at = |seconds: i64| Nanos::from_millis(1000 * seconds);
         LoadChange {
             log,
-            place,
+            index,
             span: (at(from), at(100)),
             clear: (at(from + 1), at(100)),
             within,
