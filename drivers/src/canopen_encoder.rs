@@ -116,7 +116,7 @@ impl PositionMapping {
     /// causes first, and of these the one that most SYNCs cause.
     fn all(node: u8, options: &CanopenEncoderOptions) -> Result<ArrayVec<Self, 4>, SpecError> {
         let name = options.eds.as_deref().unwrap_or_default();
-        let mut places = ArrayVec::new();
+        let mut mappings = ArrayVec::new();
         match &options.objects {
             Some(file) if !options.configure => {
                 let has = |pdo: &Pdo| position_of(pdo).is_some();
@@ -126,13 +126,13 @@ impl PositionMapping {
                 let mut problem = None;
                 for (number, pdo) in (0_u8..).zip(&pdos) {
                     match Self::of_file(pdo, &pdos) {
-                        Some(Ok(place)) => places.push(place),
+                        Some(Ok(mapping)) => mappings.push(mapping),
                         Some(Err(why)) => problem = problem.or(Some((number, why))),
                         None => {}
                     }
                 }
-                places.sort_by_key(|place: &Self| place.sync.wrapping_sub(1));
-                if places.is_empty() {
+                mappings.sort_by_key(|mapping: &Self| mapping.sync.wrapping_sub(1));
+                if mappings.is_empty() {
                     let problem = match problem {
                         Some((number, why)) => format!(
                             ", [{:04X}sub1]: TPDO {} has the position (6004), but {why}",
@@ -146,16 +146,16 @@ impl PositionMapping {
                     )));
                 }
             }
-            _ => places.extend(Bits::new(0, 32, false).map(|bits| Self {
+            _ => mappings.extend(Bits::new(0, 32, false).map(|bits| Self {
                 id: tpdo(node, 0),
                 bits,
                 sync: options.sync,
             })),
         }
-        Ok(places)
+        Ok(mappings)
     }
 
-    /// The place of the position in a TPDO, or why it can not be received; `None` if it has none.
+    /// The mapping of the position in a TPDO, or why it can not be received; `None` if it has none.
     fn of_file(pdo: &Pdo, all: &[Pdo]) -> Option<Result<Self, &'static str>> {
         let bits = position_of(pdo)?;
         let is_same = |other: &&Pdo| other.used_id() == pdo.used_id();
@@ -204,7 +204,7 @@ impl Driver for CanopenEncoderOptions {
         self.check()?;
         let node = node_of(spec)?;
         canopen::check_file(node, self.objects.as_ref())?;
-        let places = PositionMapping::all(node, self)?;
+        let mappings = PositionMapping::all(node, self)?;
         let listens = spec.mode == Mode::Listen;
         if let (true, None, Some(file)) = (listens, self.counts_per_turn, &self.objects) {
             let scales = [OPERATING, SCALED_PER_TURN, PER_TURN];
@@ -212,7 +212,7 @@ impl Driver for CanopenEncoderOptions {
             let name = self.eds.as_deref().unwrap_or_default();
             canopen::check_objects((name, file), is_scale, "set counts_per_turn")?;
         }
-        let first = places.first().map_or(tpdo(node, 0), |place| place.id);
+        let first = mappings.first().map_or(tpdo(node, 0), |mapping| mapping.id);
         let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, first);
         bringup.start_with(NMT, &[nmt::START, node]);
         bringup.stop_with(NMT, &[nmt::PRE_OPERATIONAL, node]);
@@ -225,14 +225,14 @@ impl Driver for CanopenEncoderOptions {
             no_timer: false,
         };
         let claims = canopen::claims(node)
-            .chain(places.iter().map(|place| Claim::exclusive(place.id)))
+            .chain(mappings.iter().map(|mapping| Claim::exclusive(mapping.id)))
             .chain([Claim::shared(SYNC)])
             .collect::<Vec<_>>();
         let script = Script::new(node, spec.mode, start);
         let this = Encoder {
             node,
-            cycle: Cycle::new(places.first().map_or(0, |place| place.sync)),
-            places,
+            cycle: Cycle::new(mappings.first().map_or(0, |mapping| mapping.sync)),
+            mappings,
             rates: Rates::default(),
             state: NodeState::default(),
         };
@@ -368,7 +368,7 @@ impl EncoderStart {
 struct Encoder {
     node: u8,
     /// The best first.
-    places: ArrayVec<PositionMapping, 4>,
+    mappings: ArrayVec<PositionMapping, 4>,
     rates: Rates,
     cycle: Cycle,
     state: NodeState,
@@ -383,10 +383,10 @@ impl Encoder {
         session: &mut Session<Script<EncoderStart>>,
         out: &mut Decoded,
     ) {
-        let Some(place) = self.places.get(at).copied() else {
+        let Some(mapping) = self.mappings.get(at).copied() else {
             return;
         };
-        let Some(counts) = place.bits.of(data) else {
+        let Some(counts) = mapping.bits.of(data) else {
             return out.fault(Counter::Length, 1, frame.id);
         };
         let Some(counts_per_turn) = session.questions.plan.known() else {
@@ -395,7 +395,7 @@ impl Encoder {
         if !self.rates.is_first(at, |other| at < other) {
             return;
         }
-        let measured = match place.sync {
+        let measured = match mapping.sync {
             1.. if at == 0 => self.cycle.measured(frame),
             _ => Some((frame.t, frame.stamp)),
         };
@@ -436,7 +436,11 @@ impl Family for Encoder {
         };
         if frame.id == SYNC {
             self.cycle.sync(frame);
-        } else if let Some(at) = self.places.iter().position(|place| place.id == frame.id) {
+        } else if let Some(at) = self
+            .mappings
+            .iter()
+            .position(|mapping| mapping.id == frame.id)
+        {
             self.position(at, data, frame, session, out);
         }
     }

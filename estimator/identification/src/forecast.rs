@@ -160,10 +160,10 @@ fn prior(robot: &Robot, measurement: &MeasurementModel<'_>) -> Result<DMatrix<f6
     let unknowns = measurement.unknowns();
     let prior = Prior::new(robot.model.inertias())?.with_roughly(robot.urdf_relative_std);
     let mut root = DMatrix::zeros(unknowns.parameters(), unknowns.parameters());
-    for (place, &link) in unknowns.links.iter().enumerate() {
+    for (index, &link) in unknowns.links.iter().enumerate() {
         let factor = prior.metric(link).cholesky().map(|factor| factor.l());
         let block = factor.unwrap_or_default().transpose() / (SQRT_2 * prior.expected_tau());
-        let at = LINK_PARAMETERS * place;
+        let at = LINK_PARAMETERS * index;
         root.view_mut((at, at), (LINK_PARAMETERS, LINK_PARAMETERS))
             .copy_from(&block);
     }
@@ -184,9 +184,9 @@ fn with_known(
     let mut columns = Vec::new();
     for (row, column) in known.columns.iter().enumerate() {
         if let ParameterColumn::Inertial { link, parameter } = *column
-            && let Ok(place) = unknowns.links.binary_search(&link)
+            && let Ok(index) = unknowns.links.binary_search(&link)
         {
-            columns.push((row, LINK_PARAMETERS * place + parameter));
+            columns.push((row, LINK_PARAMETERS * index + parameter));
         }
     }
     for (row, &(sensor, unknown)) in known.calibrations.iter().enumerate() {

@@ -267,7 +267,7 @@ impl ConfigurationEvidence {
         let mut of_sensors = nuisance.clone();
         let ones = vec![1.0; unknowns.channels()];
         let mut variances = ones.clone();
-        for torque in (0..unknowns.sensors.len()).flat_map(|place| 6 * place..6 * place + 3) {
+        for torque in (0..unknowns.sensors.len()).flat_map(|index| 6 * index..6 * index + 3) {
             variances[torque] = Structure::LENGTH_SCALE.powi(2);
         }
         let [mut rows, mut moved] = [
@@ -293,8 +293,8 @@ impl ConfigurationEvidence {
                 })
             };
             let all = g(&rows);
-            for (place, &sensor) in unknowns.sensors.iter().enumerate() {
-                let channels = 6 * place..6 * place + 6;
+            for (index, &sensor) in unknowns.sensors.iter().enumerate() {
+                let channels = 6 * index..6 * index + 6;
                 let Some(map) = attribute_to(&rows, &ones, channels.clone()) else {
                     continue;
                 };
@@ -522,9 +522,9 @@ fn reading_columns(
 ) {
     let last = lines.ncols() - 1;
     for row in 0..rows.count {
-        for (place, &sensor) in unknowns.sensors.iter().enumerate() {
+        for (index, &sensor) in unknowns.sensors.iter().enumerate() {
             let reading = instant.readings[sensor].torque_first();
-            for (i, g) in rows.g(row)[6 * place..][..6].iter().enumerate() {
+            for (i, g) in rows.g(row)[6 * index..][..6].iter().enumerate() {
                 for (j, y) in reading.iter().enumerate().filter(|_| *g != 0.0) {
                     lines[(row, entry(sensor, i, j))] = g * y;
                 }

@@ -307,12 +307,12 @@ mod tests {
             .collect();
 
         // [d | s of each block]. A step of zero variance means the same unknown.
-        let mut place = vec![[0; 6]; count];
+        let mut index = vec![[0; 6]; count];
         let mut unknowns = p;
         for block in 0..count {
             for i in 0..s {
-                place[block][i] = if block > 0 && steps[i] == 0.0 {
-                    place[block - 1][i]
+                index[block][i] = if block > 0 && steps[i] == 0.0 {
+                    index[block - 1][i]
                 } else {
                     unknowns += 1;
                     unknowns - 1
@@ -326,12 +326,12 @@ mod tests {
             a
         };
         for i in 0..s {
-            lines.push((line(&[(place[0][i], 1.0 / f64::sqrt(prior[i]))]), 0.0));
+            lines.push((line(&[(index[0][i], 1.0 / f64::sqrt(prior[i]))]), 0.0));
             for block in 1..count {
                 if steps[i] > 0.0 {
                     let weight = 1.0 / f64::sqrt(steps[i]);
                     lines.push((
-                        line(&[(place[block][i], weight), (place[block - 1][i], -weight)]),
+                        line(&[(index[block][i], weight), (index[block - 1][i], -weight)]),
                         0.0,
                     ));
                 }
@@ -342,7 +342,7 @@ mod tests {
             let of_s = g
                 .iter()
                 .enumerate()
-                .map(|(i, g)| (place[k / per_block][i], *g));
+                .map(|(i, g)| (index[k / per_block][i], *g));
             lines.push((line(&of_d.chain(of_s).collect::<Vec<_>>()), *y));
         }
         // Exact rows first, so that Householder's triangle keeps the digits of all (Higham 2002,
@@ -378,7 +378,7 @@ mod tests {
         let last = nuisance.estimates();
         for i in 0..s {
             let value = last[(i, p)] - last.row(i).columns(0, p).transpose().dot(&d);
-            let off = (value - all[place[count - 1][i]]).abs() / all.amax();
+            let off = (value - all[index[count - 1][i]]).abs() / all.amax();
             assert!(off < 1e-10, "offset {i}: {off:e}");
         }
     }
