@@ -164,7 +164,7 @@ impl Family for Aft {
             stamp,
             ..StampedReading::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        session.give(stamped, frame, out);
+        session.add(stamped, frame, out);
     }
 
     fn reset(&mut self) {

@@ -415,7 +415,7 @@ impl Encoder {
             stamp,
             ..StampedReading::new(0, frame, quality, reading)
         };
-        session.give(stamped, frame, out);
+        session.add(stamped, frame, out);
     }
 }
 

@@ -190,12 +190,12 @@ impl<Q: Inquiry> Session<Q> {
     ) {
         let reading = Reading::Joint(state);
         let stamped = StampedReading::new(output, frame, quality, reading);
-        self.give(stamped, frame, out);
+        self.add(stamped, frame, out);
     }
 
     /// Adds a main reading that `frame` completes, counts the faults in its quality, and marks the
     /// first one after a gap.
-    pub(crate) fn give(&mut self, mut stamped: StampedReading, frame: &Frame, out: &mut Decoded) {
+    pub(crate) fn add(&mut self, mut stamped: StampedReading, frame: &Frame, out: &mut Decoded) {
         count_faults(stamped.quality, frame, out);
         if self.bringup.reading(frame.t) {
             stamped.quality |= Quality::GAP_BEFORE;

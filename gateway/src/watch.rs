@@ -314,7 +314,7 @@ mod tests {
         }
     }
 
-    fn told(of: &[Vec<Frame>]) -> Vec<String> {
+    fn warnings(of: &[Vec<Frame>]) -> Vec<String> {
         let mut frames = of.concat();
         frames.sort_by_key(|frame| frame.t);
         look(&plan(), 0, &frames)
@@ -323,9 +323,9 @@ mod tests {
     #[test]
     fn a_device_that_nobody_reads_is_told() {
         let one = board(("odrive", 5), 0.002, joint(0.0));
-        assert_eq!(told(std::slice::from_ref(&one)), [""; 0]);
+        assert_eq!(warnings(std::slice::from_ref(&one)), [""; 0]);
         let other = board(("odrive", 3), 0.004, joint(1.0));
-        let said = told(&[one, other]);
+        let said = warnings(&[one, other]);
         let [line] = &said[..] else {
             panic!("{said:?}")
         };
@@ -341,13 +341,13 @@ mod tests {
     fn two_devices_at_one_address_are_told() {
         let strain = |at, offset| board(("icub_strain", 13), at, wrench(offset));
         let odrive = |at, offset| board(("odrive", 5), at, joint(offset));
-        assert_eq!(told(&[strain(0.0, 5.0), odrive(0.001, 0.0)]), [""; 0]);
-        let said = told(&[strain(0.0, 5.0), odrive(0.001, 0.0), odrive(0.006, 2.0)]);
+        assert_eq!(warnings(&[strain(0.0, 5.0), odrive(0.001, 0.0)]), [""; 0]);
+        let said = warnings(&[strain(0.0, 5.0), odrive(0.001, 0.0), odrive(0.006, 2.0)]);
         assert!(
             said.len() == 1 && said[0].starts_with("o: two devices"),
             "{said:?}"
         );
-        let said = told(&[strain(0.0, 5.0), strain(0.004, -20.0), odrive(0.001, 0.0)]);
+        let said = warnings(&[strain(0.0, 5.0), strain(0.004, -20.0), odrive(0.001, 0.0)]);
         assert!(
             said.len() == 1 && said[0].starts_with("ft: two devices"),
             "{said:?}"

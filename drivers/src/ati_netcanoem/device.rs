@@ -139,13 +139,13 @@ impl Netcanoem {
         let (firsts, seconds) = (self.firsts.take(), self.seconds.take());
         for (first, second) in firsts.into_iter().zip(seconds) {
             let is_trusted = frame.t >= self.untrusted;
-            give(first, second, is_trusted, frame, session, out);
+            add(first, second, is_trusted, frame, session, out);
         }
     }
 }
 
 /// The reading of two halves.
-fn give(
+fn add(
     first: First,
     second: [i16; 3],
     is_trusted: bool,
@@ -180,7 +180,7 @@ fn give(
         stamp: first.stamp,
         ..StampedReading::new(0, frame, quality, reading)
     };
-    session.give(stamped, frame, out);
+    session.add(stamped, frame, out);
 }
 
 impl Driver for AtiNetcanoemOptions {

@@ -218,7 +218,7 @@ impl CanopenDrive {
             let is_better = |other| rank_of(other).is_none_or(|other| rank > other.rank);
             let is_first = self.rates.is_first(at(bit), is_better);
             if is_first && !self.synced.is_some_and(|t| self.is_fresh(t, frame.t)) {
-                self.give(None, frame, session, out);
+                self.add(None, frame, session, out);
             }
         } else if group & bit != 0 {
             self.add_to_group(bit, group, frame, session, out);
@@ -253,7 +253,7 @@ impl CanopenDrive {
         }
         self.synced = Some(frame.t);
         let measured = self.measured.take();
-        self.give(measured, frame, session, out);
+        self.add(measured, frame, session, out);
     }
 
     fn quality(&self) -> Quality {
@@ -274,7 +274,7 @@ impl CanopenDrive {
     }
 
     /// Makes a reading, measured when `frame` came, or at another time.
-    fn give(
+    fn add(
         &mut self,
         measured: Option<(Nanos, StampKind)>,
         frame: &Frame,
@@ -299,7 +299,7 @@ impl CanopenDrive {
         });
         let mut stamped = StampedReading::new(0, frame, self.quality(), reading);
         (stamped.acquired, stamped.stamp) = measured.unwrap_or((frame.t, frame.stamp));
-        session.give(stamped, frame, out);
+        session.add(stamped, frame, out);
     }
 }
 

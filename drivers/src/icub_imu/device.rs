@@ -141,11 +141,11 @@ impl ImuDevice {
             device_counter: u32::from(self.sequence.unwrap_or(0)),
             ..StampedReading::new(0, frame, quality, Reading::Imu(imu))
         };
-        self.give(stamped, frame, session, out);
+        self.add(stamped, frame, session, out);
     }
 
     /// Adds a reading; the first one after something was lost is marked.
-    fn give(
+    fn add(
         &mut self,
         mut stamped: StampedReading,
         frame: &Frame,
@@ -156,7 +156,7 @@ impl ImuDevice {
             stamped.quality |= Quality::GAP_BEFORE;
         }
         self.seen = true;
-        session.give(stamped, frame, out);
+        session.add(stamped, frame, out);
     }
 
     fn triple(
@@ -290,7 +290,7 @@ impl ImuDevice {
             stamp,
             ..StampedReading::new(0, frame, Quality::GOOD, Reading::Imu(imu))
         };
-        self.give(stamped, frame, session, out);
+        self.add(stamped, frame, session, out);
     }
 }
 

@@ -292,7 +292,7 @@ impl Strain {
             Quality::GOOD
         };
         let quality = whole.quality | frozen | step | self.calibrated.take_gap();
-        session.give(whole.output(quality, reading, frame), frame, out);
+        session.add(whole.output(quality, reading, frame), frame, out);
     }
 
     fn gauges(
@@ -311,7 +311,7 @@ impl Strain {
             counts: [a, b, c, d, e, f].map(i32::from),
         });
         let quality = whole.quality | self.raw.take_gap();
-        session.give(whole.output(quality, reading, frame), frame, out);
+        session.add(whole.output(quality, reading, frame), frame, out);
     }
 }
 

@@ -144,7 +144,7 @@ impl Jr3 {
             device_counter: u32::from(half.counter),
             ..StampedReading::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        session.give(stamped, frame, out);
+        session.add(stamped, frame, out);
     }
 
     /// The number of periods in which the sensor takes `samples`, to the nearest.

@@ -170,7 +170,7 @@ impl Family for OpenImuSensor {
             stamp: whole.stamp,
             ..StampedReading::new(0, frame, quality, Reading::Imu(imu))
         };
-        session.give(stamped, frame, out);
+        session.add(stamped, frame, out);
     }
 
     fn reset(&mut self) {

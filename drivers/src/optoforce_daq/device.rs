@@ -119,7 +119,7 @@ impl Opto {
             device_counter: u32::from(counter),
             ..StampedReading::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        session.give(stamped, frame, out);
+        session.add(stamped, frame, out);
     }
 }
 

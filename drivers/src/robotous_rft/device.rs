@@ -129,7 +129,7 @@ impl Rft {
         (Wrench { force, torque }, quality)
     }
 
-    fn give(
+    fn add(
         &mut self,
         halves: [[u8; 8]; 2],
         first: (Nanos, StampKind),
@@ -146,7 +146,7 @@ impl Rft {
             stamp,
             ..StampedReading::new(0, frame, quality, Reading::Wrench(wrench))
         };
-        session.give(stamped, frame, out);
+        session.add(stamped, frame, out);
     }
 }
 
@@ -202,7 +202,7 @@ impl Family for Rft {
         };
         match halves[0] {
             [command::START, ..] => {
-                self.give(halves, (acquired, stamp), frame, session, out);
+                self.add(halves, (acquired, stamp), frame, session, out);
             }
             [command::GET_RATE, code, ..] if session.bringup.mode() == Mode::Supervise => {
                 session.questions.answer(code, frame, out);

@@ -109,7 +109,7 @@ impl Mti {
     }
 
     /// Outputs a complete sample.
-    fn give(
+    fn add(
         &mut self,
         whole: &PartialReading<MtiSample>,
         frame: &Frame,
@@ -139,7 +139,7 @@ impl Mti {
             device_counter: u32::from(sample.counter),
             ..StampedReading::new(0, frame, quality, Reading::Imu(sample.imu))
         };
-        session.give(stamped, frame, out);
+        session.add(stamped, frame, out);
     }
 }
 
@@ -194,7 +194,7 @@ impl Family for Mti {
         let whole = (self.group).push(position, frame, MtiSample::EMPTY, add, &mut dropped);
         session.lost(Counter::Unpaired, dropped, frame, out);
         if let Some(whole) = whole {
-            self.give(&whole, frame, session, out);
+            self.add(&whole, frame, session, out);
         }
     }
 

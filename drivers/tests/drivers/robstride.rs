@@ -26,7 +26,7 @@ fn motor(keys: &str, address: u32, mode: Mode) -> Box<dyn Device> {
 }
 
 /// Modes and faults.
-fn told(readings: &[StampedReading]) -> Vec<(u32, u32)> {
+fn actuators(readings: &[StampedReading]) -> Vec<(u32, u32)> {
     (readings.iter())
         .filter_map(|stamped| match stamped.reading {
             Reading::Actuator(actuator) => Some((actuator.mode, actuator.faults)),
@@ -96,7 +96,7 @@ fn frames_are_read_as_other_programs_read_them() {
                 assert!(joint.current.is_nan() && joint.acceleration.is_nan());
                 let faults: u32 = faults.parse().unwrap();
                 assert_eq!(
-                    told(&readings),
+                    actuators(&readings),
                     [(mode.parse().unwrap(), faults << 24)],
                     "{line}"
                 );
@@ -165,7 +165,7 @@ fn faults_hold_until_they_are_over() {
     let mut read = |frame: Frame| {
         let (readings, _) = decode(&mut *device, &[frame]);
         (
-            told(&readings),
+            actuators(&readings),
             joints(&readings).first().map(|(_, quality)| *quality),
         )
     };
@@ -272,7 +272,7 @@ fn answers_and_states_are_not_mixed() {
     let mut device = motor(ASKED, 1, Mode::Listen);
     let (readings, _) = decode(&mut *device, &[state]);
     assert!(joints(&readings).is_empty());
-    assert_eq!(told(&readings), [(2, 0x1000_0000)]);
+    assert_eq!(actuators(&readings), [(2, 0x1000_0000)]);
     assert_eq!(temperatures(&readings), [(1, 32.0)]);
     let frames = [
         answer("1B70", 3.0, 1.0),
@@ -333,7 +333,7 @@ fn the_mit_protocol_has_its_own_frames() {
         qualities,
         [Quality::GOOD, Quality::DEVICE_FAULT, Quality::GOOD]
     );
-    assert_eq!(told(&readings), [(0, 0), (0, 0x80), (0, 0)]);
+    assert_eq!(actuators(&readings), [(0, 0), (0, 0x80), (0, 0)]);
     assert_eq!(temperatures(&readings), [(1, 32.0)]);
 }
 
