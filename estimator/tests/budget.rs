@@ -93,12 +93,12 @@ fn squares(errors: impl Iterator<Item = Vec<f64>>, stated: &[f64]) -> Vec<f64> {
 }
 
 fn share(budget: &TorqueBudget, source: Source, name: &str) -> f64 {
-    let own =
+    let is_it =
         |part: &&proprio_topics::BudgetPart| part.source == source && part.name.as_str() == name;
     budget
         .parts()
         .iter()
-        .find(own)
+        .find(is_it)
         .map_or(0.0, |part| part.variance)
 }
 

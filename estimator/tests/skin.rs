@@ -457,12 +457,12 @@ fn a_table_gives_the_live_estimates() {
     let mut out = Vec::new();
     let report = offline::estimate(setup.clone(), text.as_slice(), &mut out, None).unwrap();
     assert_eq!((report.log.bad_rows, report.unused_channels.len()), (0, 0));
-    let mut own = offline::EstimateTable::new(Vec::new(), &setup).unwrap();
+    let mut table = offline::EstimateTable::new(Vec::new(), &setup).unwrap();
     for estimate in &live {
-        own.write(estimate, None, true).unwrap();
+        table.write(estimate, None, true).unwrap();
     }
-    let own = own.into_inner();
-    assert!(own.len() > 10_000 && own == out, "the tables differ");
+    let table = table.into_inner();
+    assert!(table.len() > 10_000 && table == out, "the tables differ");
     // The hand's place is in it, and moves.
     let place = |ms: i64| at(&live, ms).contacts.contacts()[hand].position[1];
     assert!(

@@ -232,12 +232,12 @@ fn a_contact_that_nothing_would_show_is_not_assumed_absent() {
         let mut last = None;
         for instant in 0..60 {
             for number in 0..setup.robot.channels.len() {
-                let own = match number == ft {
+                let quality = match number == ft {
                     true => Quality::DEVICE_FAULT,
                     false => Quality::GOOD,
                 };
                 let t = Nanos(PERIOD * instant);
-                pipeline.push(number, t, &reading(&setup, number), own);
+                pipeline.push(number, t, &reading(&setup, number), quality);
             }
             while let Some(estimate) = pipeline.poll() {
                 last = Some(estimate.clone());

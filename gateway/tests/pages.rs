@@ -99,8 +99,8 @@ fn the_keys_of_each_page_load() {
 
 /// The fields of the structs that are read from the keys, at the place that a driver has for them.
 fn fields(driver: &str) -> Vec<String> {
-    let own = source(&format!("{driver}.rs"));
-    let text = own + &source(&format!("{driver}/options.rs"));
+    let module = source(&format!("{driver}.rs"));
+    let text = module + &source(&format!("{driver}/options.rs"));
     let mut fields = Vec::new();
     for part in text.split("#[derive(").skip(1) {
         let Some((head, body)) = part.split_once("pub struct ") else {

@@ -290,8 +290,8 @@ impl Chain {
             .into_iter()
             .enumerate()
             .map(|(bus, boards)| {
-                let own = troubles.iter().filter(|_| bus == target.0);
-                let planned = own.map(|trouble| Planned {
+                let of_bus = troubles.iter().filter(|_| bus == target.0);
+                let planned = of_bus.map(|trouble| Planned {
                     fault: trouble.fault,
                     from: at(trouble.from),
                     until: at(trouble.until),
@@ -313,9 +313,9 @@ impl Chain {
             .map(|c| setup.channel(c.kind, &c.name))
             .collect();
         let is_concerned = |name: &str| {
-            let mut own = plan.channels.iter().filter(|c| c.name == name);
+            let mut channels = plan.channels.iter().filter(|c| c.name == name);
             let is_of_device = troubles.iter().all(|trouble| trouble.fault.is_of_device());
-            own.any(|c| c.bus == target.0 && (!is_of_device || c.device == target.1))
+            channels.any(|c| c.bus == target.0 && (!is_of_device || c.device == target.1))
         };
         let concerned = setup
             .channels()

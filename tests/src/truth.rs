@@ -205,7 +205,7 @@ fn readings(
         };
     for (number, (kind, name)) in setup.channels().enumerate() {
         let mut noise = Random::new(number as u64 ^ random.below(1 << 30) as u64, "noise");
-        let own = if together {
+        let first = if together {
             phase
         } else {
             random.uniform(0.0, period)
@@ -221,7 +221,7 @@ fn readings(
                         turn,
                     )]
                 };
-                add(kind, name, period, own, &mut read);
+                add(kind, name, period, first, &mut read);
             }
             Kind::Wrench => {
                 let role = setup.robot.channels.get(number).map(|channel| channel.role);

@@ -211,13 +211,13 @@ fn a_gateway_publishes_one_channel_for_each_joint() {
     let rig = Rig::new();
     let folder = rig.path("robot");
     // Buses of its own: other tests' arms are on the virtual bus, too.
-    let own = rig
+    let name = rig
         .path("")
         .file_name()
         .and_then(|name| name.to_str())
         .expect("a name")
         .to_owned();
-    let robot = write(&folder, &own, "");
+    let robot = write(&folder, &name, "");
     let text = |path: &Path| path.to_str().expect("a path in UTF-8").to_owned();
     let gateway = text(&folder.join("gateway.toml"));
     let check = rig.run(&["gateway", "--config", &gateway, "--check"]);

@@ -538,7 +538,7 @@ fn a_written_motion_keeps_limits_and_box() {
             let mut position = vec![0.0; 3];
             for (name, [q, v, a]) in &joints {
                 let at = |values: &[f64]| [values[row], values[row + 1]];
-                let own = between(h, at(q), at(v), s);
+                let middle = between(h, at(q), at(v), s);
                 let velocity = between(h, at(v), at(a), s);
                 let (dof, joint) = (model.dof(name).unwrap(), model.joint(name).unwrap());
                 let range = model.limits(joint).unwrap();
@@ -547,8 +547,8 @@ fn a_written_motion_keeps_limits_and_box() {
                     _ => ([range.lower, range.upper], [2.5, 5.0]),
                 };
                 assert!(
-                    own > range[0] && own < range[1],
-                    "{name}: {own} at {}",
+                    middle > range[0] && middle < range[1],
+                    "{name}: {middle} at {}",
                     t[row]
                 );
                 assert!(velocity.abs() < most[0], "{name}: {velocity} at {}", t[row]);
@@ -557,7 +557,7 @@ fn a_written_motion_keeps_limits_and_box() {
                     "{name} at {}",
                     t[row]
                 );
-                position[dof] = own;
+                position[dof] = middle;
             }
             let still = [0.0; 3];
             let state = JointState {

@@ -165,10 +165,10 @@ impl Machine {
         fs::write(program, format!("#!/bin/sh\n{line}\n")).expect("a program");
         fs::set_permissions(program, fs::Permissions::from_mode(0o755)).expect("a program");
         let unit = format!("/usr/share/doc/proprio/examples/{LOOP}");
-        let own = Path::new("/etc/systemd/system").join(LOOP);
+        let unit_file = Path::new("/etc/systemd/system").join(LOOP);
         // systemd takes seconds to read all units again.
-        if !own.exists() {
-            fs::copy(unit, own).expect("the example");
+        if !unit_file.exists() {
+            fs::copy(unit, unit_file).expect("the example");
             sh("systemctl daemon-reload");
         }
         sh(&format!("systemctl restart {LOOP}"));

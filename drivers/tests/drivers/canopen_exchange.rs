@@ -158,8 +158,8 @@ fn what_another_program_is_answered_is_not_taken() {
                 // Also of the same object, as the other one writes it.
                 return vec!["581#6001650000000000".into(), usual(question).unwrap()];
             }
-            let own = usual(question);
-            [foreign.to_owned()].into_iter().chain(own).collect()
+            let answers = usual(question);
+            [foreign.to_owned()].into_iter().chain(answers).collect()
         });
         assert_eq!(sent, usual_frames, "{foreign}");
         let faults = out.faults.iter();

@@ -193,14 +193,14 @@ fn motors_share_an_identifier() {
     assert_eq!(first.claims(), [Claim::shared(Id::standard(0))]);
     assert_eq!(first.claims(), second.claims());
     // A motor whose replies have its own number as identifier: commands have it too.
-    let mut own = motor(&format!("{MIT}\nhost_id = 7"), 7);
-    assert_eq!(own.claims(), [Claim::shared(Id::standard(7))]);
+    let mut named = motor(&format!("{MIT}\nhost_id = 7"), 7);
+    assert_eq!(named.claims(), [Claim::shared(Id::standard(7))]);
     let frames = [
         frame("007#80007FF000000800", 0.0),
         frame("007#FFFFFFFFFFFFFFFC", 0.5),
         frame("007#0780007FF8004100", 1.0),
     ];
-    let (readings, faults) = decode(&mut *own, &frames);
+    let (readings, faults) = decode(&mut *named, &frames);
     assert!(faults.is_empty());
     assert_eq!(joints(&readings).len(), 1);
     assert_eq!(actuators(&readings), [(0, 25.0)]);

@@ -570,8 +570,8 @@ fn damiao_motors_share_an_identifier() {
 
 #[test]
 fn a_motor_in_motion_mode_sends_its_own_number() {
-    let own = found("myactuator", &mit("501", "01", 10, 0.0));
-    assert_eq!(own.map(|found| found.address), Some(1));
+    let motor = found("myactuator", &mit("501", "01", 10, 0.0));
+    assert_eq!(motor.map(|found| found.address), Some(1));
     assert!(found("myactuator", &mit("501", "02", 10, 0.0)).is_none());
 }
 

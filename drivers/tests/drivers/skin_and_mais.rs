@@ -114,10 +114,11 @@ fn a_gap_is_that_of_its_triangle() {
     }
     let (readings, _) = decode(&mut *device, &frames);
     let gaps = |wanted: u32| -> Vec<bool> {
-        let own = readings
+        let wanted_readings = readings
             .iter()
             .filter(|r| skin(&r.reading).triangle == wanted);
-        own.map(|r| r.quality.contains(Quality::GAP_BEFORE))
+        wanted_readings
+            .map(|r| r.quality.contains(Quality::GAP_BEFORE))
             .collect()
     };
     assert_eq!(gaps(5), [false; 5]);

@@ -74,8 +74,8 @@ fn encoder_that_counts_backwards_is_named() {
         let columns = ["position", "velocity", "acceleration"].map(|what| format!("/{what}"));
         let header = log.lines().next().expect("a header").split(',');
         let is_turned = |name: &&str| {
-            let mut own = joints.iter().map(|joint| format!("joint/{joint}"));
-            own.any(|joint| columns.iter().any(|column| *name == joint.clone() + column))
+            let mut names = joints.iter().map(|joint| format!("joint/{joint}"));
+            names.any(|joint| columns.iter().any(|column| *name == joint.clone() + column))
         };
         let turned = header
             .filter(is_turned)
@@ -83,13 +83,14 @@ fn encoder_that_counts_backwards_is_named() {
         let findings = run(&setup, &[("log", LogRole::Train, &turned)], &[])
             .findings
             .into_iter();
-        let own = findings
+        let errors = findings
             .filter(|f| [FindingCode::WrongSign, FindingCode::EncoderOffset].contains(&f.code));
-        own.map(|f| {
-            assert!(f.text.contains("Encoder zeros and delays were not tested"));
-            f.subject
-        })
-        .collect()
+        errors
+            .map(|f| {
+                assert!(f.text.contains("Encoder zeros and delays were not tested"));
+                f.subject
+            })
+            .collect()
     };
     for joints in [&["j4"][..], &["j2"], &["j5"]] {
         let expected: Vec<String> = joints
@@ -142,8 +143,8 @@ fn joint_whose_zero_is_elsewhere_in_some_logs_is_named() {
             .map(|(log, name)| (name, LogRole::Train, &**log))
             .collect();
         let findings = run(&setup, &logs, &[]).findings.into_iter();
-        let own = findings.filter(|f| f.code == FindingCode::EncoderOffset);
-        own.map(|f| (f.subject, f.text)).collect()
+        let offsets = findings.filter(|f| f.code == FindingCode::EncoderOffset);
+        offsets.map(|f| (f.subject, f.text)).collect()
     };
     assert_eq!(found(3, "j4", [0.0; 3]), []);
     let told = |count: usize, joint: &str, by: [f64; 3]| {

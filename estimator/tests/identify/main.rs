@@ -766,8 +766,8 @@ fn with_torques(wrenches: &str, torques: &str) -> String {
         .map(|name| name.ends_with("/torque"))
         .collect();
     let rows = wrenches.lines().zip(torques.lines()).map(|(row, torques)| {
-        let own = torques.split(',').zip(&is_torque).filter(|(_, is)| **is);
-        own.fold(row.to_owned(), |row, (cell, _)| row + "," + cell) + "\n"
+        let cells = torques.split(',').zip(&is_torque).filter(|(_, is)| **is);
+        cells.fold(row.to_owned(), |row, (cell, _)| row + "," + cell) + "\n"
     });
     rows.collect()
 }

@@ -481,12 +481,12 @@ fn offsets_and_drifts_are_no_fault_of_the_parameters() {
         "{a:?} {b:?}"
     );
     let rms = |predicted: &Predicted| {
-        let own = predicted
+        let sensor = predicted
             .sensors
             .iter()
             .find(|(name, _)| name == "r_leg_ft_sensor")
             .expect("it is compared");
-        own.1.cad[0]
+        sensor.1.cad[0]
     };
     let (a, b) = (rms(&still), rms(&drifting));
     // A drift of 1 N/s over some ten seconds, about its mean, in addition to the readings.

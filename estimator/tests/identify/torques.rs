@@ -28,14 +28,14 @@ fn the_number_of_cores_changes_nothing() {
     };
     let on_one = std::thread::scope(|scope| {
         let alone = scope.spawn(|| {
-            let own = Pid::from_raw(0);
-            let all = sched_getaffinity(own).expect("the cores");
+            let this_thread = Pid::from_raw(0);
+            let all = sched_getaffinity(this_thread).expect("the cores");
             let core = (0..CpuSet::count())
                 .find(|&core| all.is_set(core) == Ok(true))
                 .expect("a core");
             let mut one = CpuSet::new();
             one.set(core).expect("a core");
-            sched_setaffinity(own, &one).expect("one core");
+            sched_setaffinity(this_thread, &one).expect("one core");
             assert_eq!(
                 std::thread::available_parallelism().map_or(0, usize::from),
                 1

@@ -175,11 +175,11 @@ fn clock_reads(sources: &[Source]) -> Vec<String> {
     let mut wrong = outside(sources, &allowed, |line| {
         system.iter().any(|w| line.contains(w))
     });
-    let own: Vec<&Source> = sources
+    let inner: Vec<&Source> = sources
         .iter()
         .filter(|s| !s.path.contains("/tests/") && !listed(&OUTERMOST, &s.path))
         .collect();
-    for source in own.into_iter().filter(|s| s.is_rust()) {
+    for source in inner.into_iter().filter(|s| s.is_rust()) {
         wrong.extend(
             source
                 .code()

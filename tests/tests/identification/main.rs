@@ -254,13 +254,13 @@ impl Table {
     /// of the logs.
     fn rows_at(&self, stamps: &[f64]) -> Vec<usize> {
         let tick = |t: f64| (t * 1e5).round() as i64;
-        let own: BTreeMap<i64, usize> = self
+        let rows: BTreeMap<i64, usize> = self
             .column("t")
             .iter()
             .enumerate()
             .map(|(row, t)| (tick(*t), row))
             .collect();
-        stamps.iter().map(|t| own[&tick(*t)]).collect()
+        stamps.iter().map(|t| rows[&tick(*t)]).collect()
     }
 
     /// The rows with a value in column `name`.
@@ -651,13 +651,13 @@ fn must_be_good(what: &str, sessions: &Sessions, outcome: &Outcome) {
         outcome.verdict, outcome.tau, outcome.least_retained_fraction
     );
     let cad = without_noise(sessions, sessions.setup(Urdf::Cad, None));
-    let own = without_noise(sessions, with(sessions.setup(Urdf::Cad, None), outcome));
+    let identified = without_noise(sessions, with(sessions.setup(Urdf::Cad, None), outcome));
     let (log, name) = (sessions.log("validate"), "validate");
     let run = |setup: Setup| scores(sessions, name, &log, setup, |_| true);
     let noisy_exact = run(sessions.setup_touched(Urdf::True, Some(name)));
     let noisy_cad = run(sessions.setup_touched(Urdf::Cad, Some(name)));
     let noisy_own = run(with(sessions.setup_touched(Urdf::Cad, Some(name)), outcome));
-    for (joint, score) in &own {
+    for (joint, score) in &identified {
         println!(
             "  {joint}: without noise CAD {:.4}, identified {:.4} +- {:.4} Nm; with noise CAD \
              {:.4}, identified {:.4} +- {:.4}, exact {:.4} Nm",
@@ -671,7 +671,7 @@ fn must_be_good(what: &str, sessions: &Sessions, outcome: &Outcome) {
         );
     }
     let mut covered = Vec::new();
-    for (joint, score) in &own {
+    for (joint, score) in &identified {
         let (error, cad) = (score.error, cad[joint].error);
         let [exact, off, noisy] =
             [&noisy_exact, &noisy_cad, &noisy_own].map(|scores| scores[joint].error);

@@ -292,7 +292,7 @@ fn a_payload_picked_up_within_a_log_is_noticed_and_told() {
                     .parse::<f64>()
                     .unwrap_or_else(|e| panic!("{text}: {e}"))
             };
-            let own = parsed(
+            let found = parsed(
                 before
                     .split(": ")
                     .last()
@@ -301,7 +301,7 @@ fn a_payload_picked_up_within_a_log_is_noticed_and_told() {
                     .next()
                     .unwrap(),
             );
-            assert!((own - mass).abs() < 0.01, "{own} kg, not {mass}");
+            assert!((found - mass).abs() < 0.01, "{found} kg, not {mass}");
             for (part, centre) in after.split(" +- ").next().unwrap().split(", ").zip(&centre) {
                 assert!(
                     (parsed(part) - mass * centre).abs() < 0.001,

@@ -707,12 +707,12 @@ fn skewed_buses(
     for (number, values) in recorder.by_channel() {
         let channel = &plan.channels[number as usize];
         assert_eq!(values, offline[&channel.name], "{}", channel.name);
-        let own = recorder
+        let all_there = recorder
             .taken
             .iter()
             .filter(|s| s.channel == number)
             .all(|s| s.header.bus as usize == channel.bus);
-        assert!(own, "{}", channel.name);
+        assert!(all_there, "{}", channel.name);
     }
 
     let samples = rig.path("samples.csv");

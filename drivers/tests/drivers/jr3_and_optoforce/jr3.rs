@@ -658,8 +658,8 @@ fn two_jr3s_do_not_disturb_each_other() {
     };
     let (one, two) = (claims(1), claims(0x7F));
     let exclusive = |claims: &[proprio_drivers::Claim]| {
-        let own = claims.iter().filter(|claim| claim.exclusive);
-        own.map(|claim| claim.id.raw()).collect::<Vec<_>>()
+        let claims = claims.iter().filter(|claim| claim.exclusive);
+        claims.map(|claim| claim.id.raw()).collect::<Vec<_>>()
     };
     assert_eq!(exclusive(&one), [0x601, 0x681, 0x101, 0x701]);
     assert_eq!(exclusive(&two), [0x67F, 0x6FF, 0x17F, 0x77F]);

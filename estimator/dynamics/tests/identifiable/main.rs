@@ -960,8 +960,8 @@ fn joined(links: usize, seed: u64) {
             .unwrap();
         stacked.eliminate_contacts(Weighting::LengthScale);
         for (part, tree) in parts.iter().zip(stacked.subtrees()) {
-            let own = columns_of(tree.links().iter().copied(), tree.sensors());
-            assert_eq!(part.columns(), own);
+            let columns = columns_of(tree.links().iter().copied(), tree.sensors());
+            assert_eq!(part.columns(), columns);
             let rows: Vec<f64> = (0..tree.remaining())
                 .flat_map(|row| tree.projected_row(row).to_vec())
                 .collect();
