@@ -676,8 +676,8 @@ proptest! {
                     // determine p.
                     if tree.sensors().count() > 0 {
                         let first = tree.offset_column();
-                        let columns = columns_of(tree, first, 6);
-                        let p = columns
+                        let offset = columns_of(tree, first, 6);
+                        let p = offset
                             .transpose()
                             .lu()
                             .solve(&DVector::from_row_slice(&projected[first..first + 6]))
