@@ -49,8 +49,9 @@ impl CdrMessage {
     }
 
     fn put<const N: usize>(&mut self, number: [u8; N]) {
-        let place = self.bytes.len() - HEAD.len();
-        self.bytes.resize(HEAD.len() + place.next_multiple_of(N), 0);
+        let position = self.bytes.len() - HEAD.len();
+        self.bytes
+            .resize(HEAD.len() + position.next_multiple_of(N), 0);
         self.bytes.extend(number);
     }
 
@@ -103,7 +104,7 @@ impl CdrMessage {
 #[derive(Debug)]
 pub struct CdrReader<'a> {
     body: &'a [u8],
-    place: usize,
+    position: usize,
 }
 
 impl<'a> CdrReader<'a> {
@@ -111,13 +112,13 @@ impl<'a> CdrReader<'a> {
     #[must_use]
     pub fn new(bytes: &'a [u8]) -> Option<Self> {
         let body = bytes.strip_prefix(&HEAD)?;
-        Some(Self { body, place: 0 })
+        Some(Self { body, position: 0 })
     }
 
     fn take<const N: usize>(&mut self) -> Option<[u8; N]> {
-        let from = self.place.next_multiple_of(N);
+        let from = self.position.next_multiple_of(N);
         let number = self.body.get(from..from + N)?;
-        self.place = from + N;
+        self.position = from + N;
         number.try_into().ok()
     }
 
@@ -151,8 +152,8 @@ impl<'a> CdrReader<'a> {
 
     /// So many bytes. `None` where the message ends before.
     pub fn bytes(&mut self, count: usize) -> Option<&'a [u8]> {
-        let bytes = self.body.get(self.place..)?.get(..count)?;
-        self.place += count;
+        let bytes = self.body.get(self.position..)?.get(..count)?;
+        self.position += count;
         Some(bytes)
     }
 

@@ -48,16 +48,16 @@ pub(crate) fn of(
         all.extend(health.buses().iter().map(|it| bus(robot, it)));
         all.extend(health.devices().iter().map(|it| device(robot, it)));
     }
-    let mut own = daemon(
+    let mut status = daemon(
         robot,
         "estimator",
         estimator.map(|it| it.header.published),
         now,
     );
     if let Some(health) = estimator {
-        if own.level == Level::Ok {
+        if status.level == Level::Ok {
             let since = now.saturating_sub(health.last_estimate);
-            (own.level, own.message) = match health.last_estimate > Nanos::ZERO {
+            (status.level, status.message) = match health.last_estimate > Nanos::ZERO {
                 true if since <= SILENCE => (Level::Ok, "estimates".to_owned()),
                 true => {
                     let text = format!("the last estimate was {:.0} s ago", since.seconds());
@@ -66,7 +66,7 @@ pub(crate) fn of(
                 false => (Level::Warn, "no estimate yet".to_owned()),
             };
         }
-        own.values = vec![
+        status.values = vec![
             ("estimates", health.estimates.to_string()),
             ("withheld", health.withheld.to_string()),
             ("samples", health.samples.to_string()),
@@ -74,11 +74,12 @@ pub(crate) fn of(
             ("late", health.late.to_string()),
         ];
         if health.identification.groups > 0 {
-            own.values
+            status
+                .values
                 .push(("identification", health.identification.to_string()));
         }
     }
-    all.push(own);
+    all.push(status);
     // What a silent daemon said last may no longer hold.
     if all
         .first()
@@ -232,16 +233,16 @@ mod tests {
         };
         let mut estimator = estimator;
         estimator.header.published = NOW;
-        let of = |health: &GatewayHealth, estimator: &EstimatorHealth| {
+        let levels = |health: &GatewayHealth, estimator: &EstimatorHealth| {
             let all = of("arm", Some(health), Some(estimator), NOW);
             all.into_iter().map(|one| one.level).collect::<Vec<_>>()
         };
-        assert_eq!(of(&health, &estimator), [Level::Ok; 4]);
+        assert_eq!(levels(&health, &estimator), [Level::Ok; 4]);
         health.buses[0].interface.controller = Controller::Passive.in_memory();
         health.devices[0].state = DeviceState::Silent.in_memory();
         estimator.last_estimate = Nanos::from_millis(8_000);
         assert_eq!(
-            of(&health, &estimator),
+            levels(&health, &estimator),
             [Level::Ok, Level::Warn, Level::Error, Level::Error]
         );
         health.buses[0].link = LinkState::BusOff.in_memory();
@@ -249,7 +250,7 @@ mod tests {
         health.devices[0].frozen_axes = 1;
         estimator.last_estimate = Nanos::ZERO;
         assert_eq!(
-            of(&health, &estimator),
+            levels(&health, &estimator),
             [Level::Ok, Level::Error, Level::Warn, Level::Warn]
         );
     }

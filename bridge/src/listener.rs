@@ -245,16 +245,16 @@ impl Listener {
         stop: &AtomicBool,
         mut say: impl FnMut(&str),
     ) -> Result<Option<Self>, ListenError> {
-        let mut told = String::new();
+        let mut last_why = String::new();
         while !stop.load(Relaxed) {
             match Self::open(config, robot) {
                 Ok(listener) => return Ok(Some(listener)),
                 Err(error @ ListenError::Several { .. }) => return Err(error),
                 Err(error) => {
                     let why = error.to_string();
-                    if why != told {
+                    if why != last_why {
                         say(&why);
-                        told = why;
+                        last_why = why;
                     }
                 }
             }
@@ -327,11 +327,11 @@ impl Listener {
     /// their estimator, and are lost.
     #[must_use]
     pub fn lost_estimates(&self) -> u64 {
-        let of = |estimates: &Estimates| {
+        let lost = |estimates: &Estimates| {
             let drives = estimates.drives.as_ref().map_or(0, Reader::lost);
             estimates.torques.lost() + estimates.contacts.lost() + drives
         };
-        self.lost_estimates + self.estimates.as_ref().map_or(0, of)
+        self.lost_estimates + self.estimates.as_ref().map_or(0, lost)
     }
 
     /// Samples whose channel has no name: those of a gateway that has ended meanwhile.

@@ -6,7 +6,7 @@ use anyhow::{Context, bail};
 use clap::error::ErrorKind;
 use proprio_estimator::assessment::{Assessment, Assessor, Coverage};
 use proprio_estimator::config::InvalidConfig;
-use proprio_estimator::reading::{self, ReadingError};
+use proprio_estimator::sample_log::{self, SampleLogError};
 use proprio_estimator::setup::Setup;
 use proprio_estimator::{files, offline as estimates};
 use proprio_gateway::log::{LogFormat, Stamps};
@@ -406,14 +406,14 @@ pub(crate) fn encode(args: &EncodeArgs) -> anyhow::Result<()> {
 ///
 /// # Errors
 /// An [`InvalidConfig`]: the configuration does not match the log.
-pub(crate) fn check_columns(
+pub(crate) fn check_header(
     header: &[u8],
     log: &Path,
     config: &Path,
     setup: &Setup,
 ) -> anyhow::Result<()> {
     let reader = csv::TableReader::new(header).with_context(|| log.display().to_string())?;
-    reading::check_columns(&setup.robot, reader.series(), |_| true)
+    sample_log::check_columns(&setup.robot, reader.series(), |_| true)
         .map_err(|missing| unfit(config, log, &missing).into())
 }
 
@@ -454,7 +454,7 @@ impl Configured {
                         --config` has its own\n";
             clap::Error::raw(ErrorKind::MissingRequiredArgument, text).exit();
         };
-        let (_, setup) = proprio_estimator::daemon::load(&config, |config| {
+        let (_, setup) = Setup::load(&config, |config| {
             // The command line overrides the configuration.
             if let Some(parameters) = parameters {
                 config.parameters = Some(parameters.to_owned());
@@ -599,7 +599,8 @@ fn warn_of_implausible(args: &EstimateArgs, setup: &Setup) {
         .then(|| File::open(&args.samples).ok())
         .flatten();
     let robot = &setup.robot;
-    let read = |log: File| reading::dataset(robot, "", LogRole::Validate, log.take(CHECKED)).ok();
+    let read =
+        |log: File| sample_log::dataset(robot, "", LogRole::Validate, log.take(CHECKED)).ok();
     let found = log
         .and_then(read)
         .map(|dataset| implausible(robot, dataset));
@@ -621,7 +622,7 @@ fn assessor(args: &EstimateArgs, config: &Path, setup: &Setup) -> anyhow::Result
         );
     }
     Assessor::new(setup, log).map_err(|error| match error {
-        ReadingError::MissingChannels(_) => unfit(config, &args.samples, &error).into(),
+        SampleLogError::MissingChannels(_) => unfit(config, &args.samples, &error).into(),
         error => anyhow::Error::from(error).context(args.samples.display().to_string()),
     })
 }

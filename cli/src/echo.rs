@@ -106,7 +106,7 @@ fn follow<T: Topic>(
     let is_enough = |printed| args.count.is_some_and(|count| printed >= count);
     let mut printed = 0_u64;
     let (mut newest, mut is_told) = (monotonic(), false);
-    let mut look = newest + LOOK;
+    let mut next_look = newest + LOOK;
     while !stop.load(Relaxed) && !is_enough(printed) {
         let before = printed;
         while !is_enough(printed)
@@ -123,8 +123,8 @@ fn follow<T: Topic>(
             eprintln!("waiting: nothing is published; `proprio status` says what is missing");
             is_told = true;
         }
-        if monotonic() > look {
-            look = monotonic() + LOOK;
+        if monotonic() > next_look {
+            next_look = monotonic() + LOOK;
             if let Some(Ok(new)) = domain.reopened()
                 && let Some(publisher) = described.newest().publisher.get()
                 && let Ok(names) = DescriptionReader::to_come(&new, robot, publisher)

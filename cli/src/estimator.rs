@@ -57,14 +57,14 @@ fn posture(setup: &Setup, at: &[String], domain: &DomainConfig) -> Result<Postur
 /// Checks that the gateway publishes all channels that the estimator reads; prints the result.
 fn fits(config: &Path, setup: &Setup, gateway: &Path) -> anyhow::Result<()> {
     let plan = Plan::load(gateway)?;
-    let wrong = |problem: String| InvalidConfig {
+    let invalid = |problem: String| InvalidConfig {
         file: config.to_owned(),
         problem,
     };
     if plan.robot != setup.robot.name {
         let (own, other) = (&setup.robot.name, &plan.robot);
         let file = gateway.display();
-        return Err(wrong(format!(
+        return Err(invalid(format!(
             "robot = {own:?}, but robot = {other:?} in {file}: they would not find each other"
         ))
         .into());
@@ -72,7 +72,7 @@ fn fits(config: &Path, setup: &Setup, gateway: &Path) -> anyhow::Result<()> {
     let missing = missing(setup, &plan);
     if !missing.is_empty() {
         let file = gateway.display();
-        return Err(wrong(format!("{file} publishes no {}", missing.join(", no "))).into());
+        return Err(invalid(format!("{file} publishes no {}", missing.join(", no "))).into());
     }
     let reads = |name: &str| setup.channels().any(|(_, own)| own == name);
     let unread: Vec<&str> = plan

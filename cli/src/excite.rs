@@ -10,7 +10,6 @@ use proprio_dynamics::model::{Frame, Limits, Model};
 use proprio_dynamics::regressor::identifiable::ParameterColumn;
 use proprio_dynamics::spatial::Pose;
 use proprio_estimator::config::{Base, Config, InvalidConfig};
-use proprio_estimator::daemon;
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::setup::{Setup, frame};
 use proprio_identification::forecast::SensorNoise;
@@ -71,7 +70,7 @@ pub(crate) struct ExciteArgs {
 
 /// Plans a motion.
 pub(crate) fn run(args: &ExciteArgs) -> anyhow::Result<()> {
-    let (config, mut setup) = daemon::load(&args.config, |config| {
+    let (config, mut setup) = Setup::load(&args.config, |config| {
         // What was identified earlier counts only if it is named.
         config.parameters = None;
         config.identification.enabled = false;
@@ -81,12 +80,12 @@ pub(crate) fn run(args: &ExciteArgs) -> anyhow::Result<()> {
         None => None,
     };
     let at_work = setup.robot_as_identified();
-    let wrong = |problem: String| InvalidConfig {
+    let invalid = |problem: String| InvalidConfig {
         file: args.config.clone(),
         problem,
     };
-    let robot = without(&at_work, &args.absent).map_err(wrong)?;
-    let task = task(args, &config, &robot, known).map_err(wrong)?;
+    let robot = without(&at_work, &args.absent).map_err(invalid)?;
+    let task = task(args, &config, &robot, known).map_err(invalid)?;
     let wanted = task.wanted.clone();
     let file = || args.config.display().to_string();
     let planner = Planner::new(task, &at_work).with_context(file)?;
@@ -205,16 +204,16 @@ fn limits(
     given: &[String],
 ) -> Result<Vec<Option<JointLimits>>, String> {
     let model = &robot.model;
-    let mut own: Vec<KnownLimits> = (0..model.dof_count())
+    let mut limits: Vec<KnownLimits> = (0..model.dof_count())
         .map(|dof| urdf_limits(model, dof))
         .collect();
     for text in given {
         let (dof, values) = given_limits(model, dofs, text)?;
-        for (place, value) in own[dof].iter_mut().zip(values) {
+        for (place, value) in limits[dof].iter_mut().zip(values) {
             *place = Some(value);
         }
     }
-    let is_free = |dof: &&usize| own[**dof].iter().take(3).any(Option::is_none);
+    let is_free = |dof: &&usize| limits[**dof].iter().take(3).any(Option::is_none);
     let free: Vec<&str> = dofs
         .iter()
         .filter(is_free)
@@ -228,7 +227,7 @@ fn limits(
         ));
     }
     let complete = |dof: usize| {
-        let [lower, upper, velocity, acceleration] = own[dof];
+        let [lower, upper, velocity, acceleration] = limits[dof];
         let (lower, upper, velocity) = (lower?, upper?, velocity?);
         dofs.contains(&dof).then_some(JointLimits {
             range: Limits { lower, upper },

@@ -92,24 +92,24 @@ mod tests {
     /// Files beside the configuration, in a folder below it and elsewhere, whatever key names them.
     #[test]
     fn a_copied_configuration_needs_no_file_of_the_original() {
-        let place = tempfile::tempdir().unwrap();
-        let (from, to) = (place.path().join("a/robot"), place.path().join("b"));
+        let folder = tempfile::tempdir().unwrap();
+        let (from, to) = (folder.path().join("a/robot"), folder.path().join("b"));
         fs::create_dir_all(from.join("maps")).unwrap();
         for (file, text) in [
             ("a/robot/drive.dbc", "one"),
             ("a/robot/maps/hand.txt", "two"),
             ("a/drive.dbc", "three"),
         ] {
-            fs::write(place.path().join(file), text).unwrap();
+            fs::write(folder.path().join(file), text).unwrap();
         }
-        let outside = place.path().join("a/drive.dbc");
+        let outside = folder.path().join("a/drive.dbc");
         let table = format!(
             "name = \"drive\"\nlink = \"\"\n[[bus]]\ndevice = [{{ dbc = \"drive.dbc\" }}, \
              {{ eds = \"../drive.dbc\" }}, {{ any = {outside:?} }}]\n[skin]\ntaxels = \
              \"./maps/hand.txt\"\nnone = \"maps/foot.txt\"\n"
         );
         let copy = with_files(table.parse().unwrap(), &from, &to).unwrap();
-        fs::remove_dir_all(place.path().join("a")).unwrap();
+        fs::remove_dir_all(folder.path().join("a")).unwrap();
         let read = |value: &toml::Value| fs::read_to_string(to.join(value.as_str().unwrap()));
         let devices = copy["bus"][0]["device"].as_array().unwrap();
         for (value, text) in [

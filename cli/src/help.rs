@@ -181,7 +181,7 @@ fn print_help_of(verb: &[String], mut program: Command) {
         program = program.find_subcommand(word).cloned().unwrap_or_else(|| {
             let name = program.get_name().to_owned();
             let why = format!("{name} has no {word:?}; `proprio help {name}` lists what it has");
-            wrong(&mut program, &why)
+            refuse(&mut program, &why)
         });
     }
     match is_for_a_person() {
@@ -191,7 +191,7 @@ fn print_help_of(verb: &[String], mut program: Command) {
 }
 
 /// Ends the program: the command line is wrong.
-fn wrong(command: &mut Command, why: &str) -> ! {
+fn refuse(command: &mut Command, why: &str) -> ! {
     command.error(ErrorKind::InvalidValue, why).exit()
 }
 
@@ -255,7 +255,7 @@ pub(crate) fn run(args: &HelpArgs, mut program: Command) {
                 lines.collect::<String>().trim_end()
             );
         }
-        Lookup::Unknown(near) => wrong(
+        Lookup::Unknown(near) => refuse(
             &mut program,
             &format!("nothing is called {word:?}{near}; `proprio help topics` lists the pages"),
         ),

@@ -94,19 +94,19 @@ pub(crate) fn run(args: &IdentifiableArgs) -> anyhow::Result<()> {
         (None, Some(urdf)) => (urdf, of_urdf(urdf, &args.base)?),
         (None, None) => anyhow::bail!("give a URDF, or --config with estimator.toml"),
     };
-    let wrong = |problem: String| InvalidConfig {
+    let invalid = |problem: String| InvalidConfig {
         file: file.clone(),
         problem,
     };
     let sets = match args.sensors.as_slice() {
         [] => vec![config.clone()],
         sets => (sets.iter())
-            .map(|names| with_sensors(&config, names).map_err(wrong))
+            .map(|names| with_sensors(&config, names).map_err(invalid))
             .collect::<Result<_, _>>()?,
     };
     let sets = sets.into_iter().map(|config| {
-        let robot = Setup::new(&config).map_err(wrong)?.robot;
-        let free = without(&robot, &args.absent).map_err(wrong)?;
+        let robot = Setup::new(&config).map_err(invalid)?.robot;
+        let free = without(&robot, &args.absent).map_err(invalid)?;
         let about = || file.display().to_string();
         let workspace = Workspace::new(&robot, STATES).with_context(about)?;
         let knowledge = Knowledge::of(&free, &regime(&free), &workspace).with_context(about)?;
@@ -123,7 +123,7 @@ pub(crate) fn run(args: &IdentifiableArgs) -> anyhow::Result<()> {
     let sets = sets.collect::<anyhow::Result<Vec<SensorPlacement>>>()?;
     let remedies = sets.iter().map(|set| {
         let dof = match &args.joint {
-            Some(name) => Some(torque_of(&set.robot, name).map_err(wrong)?),
+            Some(name) => Some(torque_of(&set.robot, name).map_err(invalid)?),
             None => None,
         };
         remedies(set, &args.absent, dof).with_context(|| file.display().to_string())
@@ -187,11 +187,11 @@ pub(crate) fn short(number: f64) -> String {
 
 /// The configuration of a robot of which only the URDF is known.
 fn of_urdf(urdf: &Path, base: &str) -> Result<Config, InvalidConfig> {
-    let wrong = |problem| InvalidConfig {
+    let invalid = |problem| InvalidConfig {
         file: urdf.to_owned(),
         problem,
     };
-    let model = Model::from_file(urdf, &[]).map_err(|error| wrong(error.to_string()))?;
+    let model = Model::from_file(urdf, &[]).map_err(|error| invalid(error.to_string()))?;
     let (link, sensor) = (
         model.link_name(0),
         ["", "sensor = \"imu\""][usize::from(base == "imu")],
@@ -200,7 +200,7 @@ fn of_urdf(urdf: &Path, base: &str) -> Result<Config, InvalidConfig> {
         "schema = 1\nrobot = \"robot\"\nmodel = {urdf:?}\n[base]\nkind = {base:?}\nlink = \
          {link:?}\n{sensor}\n"
     );
-    Config::parse(&text).map_err(wrong)
+    Config::parse(&text).map_err(invalid)
 }
 
 /// The configuration with F/T sensors in these joints. Those that it has keep their noise.
@@ -268,7 +268,8 @@ fn remedies(
     let Some((dof, now)) = chosen else {
         return Ok(None);
     };
-    let of = |deviations: Vec<Deviation>| deviations.iter().find(|own| own.dof == dof)?.torque;
+    let deviation =
+        |deviations: Vec<Deviation>| deviations.iter().find(|own| own.dof == dof)?.torque;
     let least = |mut all: Vec<(String, f64)>, than: f64| {
         all.retain(|(_, own)| than > NOTHING && *own < (1.0 - WORTH) * than);
         all.sort_by(|a, b| a.1.total_cmp(&b.1));
@@ -300,13 +301,13 @@ fn remedies(
         }
         let workspace = Workspace::new(&robot, STATES).ok()?;
         let free = without(&robot, absent).ok()?;
-        of(limit(&free, &regime(&free), &workspace).ok()?)
+        deviation(limit(&free, &regime(&free), &workspace).ok()?)
     };
     let sensors = parallel::map(places.len(), |k| with(places[k]));
     let sensors = places.iter().zip(sensors);
     let sensors = sensors.filter_map(|(place, own)| Some(((*place).clone(), own?)));
     let moving =
-        |dofs: &[usize]| of(limit(&set.free, &only(&set.free, dofs), &set.workspace).ok()?);
+        |dofs: &[usize]| deviation(limit(&set.free, &only(&set.free, dofs), &set.workspace).ok()?);
     let still = moving(&[]).unwrap_or(now);
     let dofs: Vec<usize> = set.knowledge.torques.iter().map(|own| own.dof).collect();
     let motions = parallel::map(dofs.len(), |k| moving(&dofs[k..=k]));

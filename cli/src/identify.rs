@@ -77,14 +77,14 @@ pub(crate) fn run(args: &IdentifyArgs) -> anyhow::Result<()> {
         );
     }
     let out = args.out.as_deref().unwrap_or_else(|| Path::new("."));
-    let (config, setup) = proprio_estimator::daemon::load(&args.config, |config| {
+    let (config, setup) = Setup::load(&args.config, |config| {
         // Identification starts from the URDF, not from parameters identified earlier.
         config.parameters = None;
         config.identification.enabled = false;
     })?;
     let train = args.samples.iter().map(|f| (f, LogRole::Train));
     let validate = args.validate.iter().map(|f| (f, LogRole::Validate));
-    let inputs = Inputs {
+    let run = IdentificationRun {
         config_file: &args.config,
         // Read now: it may be a result of an earlier run, which is removed below.
         urdf: Model::read_text(&config.model)?,
@@ -93,14 +93,14 @@ pub(crate) fn run(args: &IdentifyArgs) -> anyhow::Result<()> {
         files: train.chain(validate).collect(),
         bar: progress_bar(),
     };
-    let outcome = inputs.identify(out)?;
+    let outcome = run.identify(out)?;
     let advice = Advice::of(&outcome);
     let mut json = summary::summary(&outcome, &advice);
     let found = match advice.grade {
         Grade::Reject => Vec::new(),
-        _ => inputs.write_parameters(&outcome, out)?,
+        _ => run.write_parameters(&outcome, out)?,
     };
-    inputs.bar.finish_and_clear();
+    run.bar.finish_and_clear();
     json["drives"] = drives::in_json(&found);
     let mut text = serde_json::to_string_pretty(&json)?;
     text.push('\n');
@@ -128,8 +128,8 @@ pub(crate) fn run(args: &IdentifyArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What is identified from.
-struct Inputs<'a> {
+/// A run: the configuration and the logs that it identifies from.
+struct IdentificationRun<'a> {
     config_file: &'a Path,
     config: Config,
     setup: Setup,
@@ -138,7 +138,7 @@ struct Inputs<'a> {
     bar: ProgressBar,
 }
 
-impl Inputs<'_> {
+impl IdentificationRun<'_> {
     fn show(&self, step: &str, done: f64) {
         self.bar.set_position((done * 1000.0) as u64);
         self.bar.set_message(step.to_owned());

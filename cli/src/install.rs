@@ -5,6 +5,7 @@
 use crate::folder::{each_file, read};
 use anyhow::{Context as _, bail};
 use proprio_estimator::files;
+use proprio_estimator::setup::Setup;
 use proprio_gateway::plan::Plan;
 use std::collections::BTreeSet;
 use std::fmt;
@@ -143,10 +144,12 @@ pub(crate) fn run(args: &InstallArgs) -> anyhow::Result<()> {
     if is_packaged {
         refuse_copies(&args.root)?;
     } else {
-        let own = std::env::current_exe().context("cannot find this program's own file")?;
+        let this_program =
+            std::env::current_exe().context("cannot find this program's own file")?;
         let program = args.root.join(PROGRAM);
-        if own != program {
-            let bytes = fs::read(&own).with_context(|| format!("cannot read {}", own.display()))?;
+        if this_program != program {
+            let bytes = fs::read(&this_program)
+                .with_context(|| format!("cannot read {}", this_program.display()))?;
             steps.push(write(program, bytes, 0o755));
         }
         steps.push(write(args.root.join(USER.0), USER.1.into(), 0o644));
@@ -208,7 +211,7 @@ fn check(folder: &Path) -> anyhow::Result<()> {
         Plan::load_live(&gateway)?;
     }
     if estimator.is_file() {
-        proprio_estimator::daemon::load(&estimator, |_| {})?;
+        Setup::load(&estimator, |_| {})?;
     }
     Ok(())
 }

@@ -137,7 +137,7 @@ struct RecordedCounts {
 }
 
 /// A recording in progress: what is heard is sorted, and written.
-struct Session {
+struct RecordingSession {
     /// The names of the buses whose frames are recorded.
     buses: Vec<String>,
     order: InOrder<RecordItem>,
@@ -146,7 +146,7 @@ struct Session {
     out: Destination,
 }
 
-impl Session {
+impl RecordingSession {
     /// Something heard or a frame of `t`; `series` are all that are known by now.
     fn push(&mut self, t: Nanos, item: RecordItem, series: &[Series]) -> io::Result<()> {
         let Self {
@@ -244,7 +244,7 @@ pub(crate) fn run(args: &RecordArgs, config: &DomainConfig) -> anyhow::Result<()
         }
     };
     let began = monotonic();
-    let mut session = Session {
+    let mut session = RecordingSession {
         buses: (frames.as_ref()).map_or(Vec::new(), |frames| frames.buses.clone()),
         order: InOrder::new(REORDER),
         gaps: Gaps::new(listener.description()),
@@ -283,12 +283,12 @@ pub(crate) fn run(args: &RecordArgs, config: &DomainConfig) -> anyhow::Result<()
 /// Ends the recording, and says what it has.
 fn finish(
     args: &RecordArgs,
-    session: Session,
+    session: RecordingSession,
     listener: &Listener,
     began: Nanos,
     frames: Option<&RawFrames>,
 ) -> anyhow::Result<()> {
-    let Session {
+    let RecordingSession {
         order,
         gaps,
         counts,

@@ -35,7 +35,7 @@ pub fn wrench() -> Result<Wrench, Box<dyn Error>> {
         let at = Nanos(1000 * microseconds);
         sensor.on_frame(&frame.at(at, StampKind::Software), &mut decoded);
     }
-    match decoded.readings.first().map(|output| output.reading) {
+    match decoded.readings.first().map(|stamped| stamped.reading) {
         Some(Reading::Wrench(wrench)) => Ok(wrench),
         _ => Err("no wrench came".into()),
     }

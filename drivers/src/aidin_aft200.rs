@@ -8,11 +8,11 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, Output, OutputInfo, Spec, SpecError, bytes, keys,
-    wrench,
+    Claim, Decoded, Device, Driver, Frame, Id, OutputInfo, Spec, SpecError, StampedReading, bytes,
+    keys, wrench,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -138,7 +138,7 @@ fn axes(half: [u8; 6], scale: (f64, f64), axis: u32, quality: &mut Quality) -> [
 impl Family for Aft {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         let [force, torque] = self.ids;
         let second = frame.id == torque;
         if !second && frame.id != force {
@@ -152,19 +152,19 @@ impl Family for Aft {
         };
         let mut unpaired = 0;
         let paired = self.pairing.push(second, frame, half, &mut unpaired);
-        link.lost(Counter::Unpaired, unpaired, frame, out);
+        session.lost(Counter::Unpaired, unpaired, frame, out);
         let Paired::With(acquired, stamp, [first, second]) = paired else {
             return;
         };
         let mut quality = Quality::GOOD;
         let force = axes(first, NEWTON, 0, &mut quality);
         let torque = axes(second, NEWTON_METRE, 3, &mut quality);
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
-            ..Output::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
+            ..StampedReading::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        link.give(output, frame, out);
+        session.add(stamped, frame, out);
     }
 
     fn reset(&mut self) {

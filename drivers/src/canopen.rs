@@ -36,7 +36,7 @@ pub(crate) use recognise::{NO_PROFILE, Recognised, commands, questions, recognis
 pub(crate) use script::{READ, Script, ScriptStep, StartPlan};
 
 use crate::bytes::u16_le;
-use crate::family::Supervision;
+use crate::family::Session;
 use crate::objects::Objects;
 use crate::{Claim, Decoded, Frame, Spec, SpecError, bytes};
 use alloc::format;
@@ -159,20 +159,20 @@ impl Cycle {
     /// When the node measured what `frame` holds: at its SYNC; at its own stamp if it measures by
     /// itself, or no SYNC is heard. `None` if it is not known which SYNC was its.
     pub(crate) fn measured(&mut self, frame: &Frame) -> Option<(Nanos, StampKind)> {
-        let own = (frame.t, frame.stamp);
+        let stamp = (frame.t, frame.stamp);
         let (Some(last), 1..) = (self.last, self.every) else {
-            return Some(own);
+            return Some(stamp);
         };
         let is_late = last.1 != StampKind::None && frame.t < last.0;
         if self.every > 1 {
             return if is_late { self.before } else { self.last };
         }
         match self.open {
-            0 => Some(own),
+            0 => Some(stamp),
             1 => {
                 self.open = 0;
                 // The host may have noted its own SYNC late.
-                Some(if is_late { own } else { last })
+                Some(if is_late { stamp } else { last })
             }
             _ => {
                 self.open -= 1;
@@ -242,7 +242,7 @@ impl NodeState {
         &mut self,
         node: u8,
         frame: &Frame,
-        link: &mut Supervision<Script<P>>,
+        session: &mut Session<Script<P>>,
         out: &mut Decoded,
     ) -> bool {
         let ids = [emcy(node), sdo_from(node), heartbeat(node), sdo_to(node)];
@@ -253,9 +253,9 @@ impl NodeState {
             return true;
         };
         if frame.id == sdo_from(node) {
-            link.questions.answer(data, frame, out);
+            session.questions.answer(data, frame, out);
         } else if frame.id == sdo_to(node) {
-            link.questions.overhear(data);
+            session.questions.overhear(data);
         } else if frame.id == emcy(node) {
             match data.len() {
                 8 => self.error = u16_le(data, 0),
@@ -268,9 +268,9 @@ impl NodeState {
                 [state] if state & 0x7F == OPERATIONAL => {}
                 [0] => {
                     self.error = 0;
-                    link.bringup.restart();
+                    session.bringup.restart();
                 }
-                [_] if link.bringup.is_watching() => link.bringup.restart(),
+                [_] if session.bringup.is_watching() => session.bringup.restart(),
                 [_] => {}
                 _ => out.fault(Counter::Length, 1, frame.id),
             }

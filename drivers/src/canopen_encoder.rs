@@ -11,11 +11,12 @@ use crate::canopen::{
     self, Cycle, NMT, NodeState, Object, Pdo, Rates, SYNC, Script, ScriptStep, StartPlan, is_free,
     nmt, node_of, object, tpdo,
 };
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::objects::Objects;
 use crate::signal::Bits;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, Id, Mode, OutputInfo, Spec, SpecError, StampedReading,
+    bytes,
 };
 use alloc::boxed::Box;
 use alloc::format;
@@ -95,9 +96,9 @@ impl CanopenEncoderOptions {
     /// The counts per turn of this very encoder by its file: of 6001 if 6000 says that it is
     /// scaled.
     fn counts_of_file(&self) -> Option<f64> {
-        let own = |object: Object| self.objects.as_ref()?.own(object.index, object.sub);
-        let scaled = own(OPERATING).is_some_and(|parameters| parameters & SCALED != 0);
-        own(if scaled { SCALED_PER_TURN } else { PER_TURN }).map(f64::from)
+        let value = |object: Object| self.objects.as_ref()?.own(object.index, object.sub);
+        let scaled = value(OPERATING).is_some_and(|parameters| parameters & SCALED != 0);
+        value(if scaled { SCALED_PER_TURN } else { PER_TURN }).map(f64::from)
     }
 }
 
@@ -115,7 +116,7 @@ impl PositionMapping {
     /// causes first, and of these the one that most SYNCs cause.
     fn all(node: u8, options: &CanopenEncoderOptions) -> Result<ArrayVec<Self, 4>, SpecError> {
         let name = options.eds.as_deref().unwrap_or_default();
-        let mut places = ArrayVec::new();
+        let mut mappings = ArrayVec::new();
         match &options.objects {
             Some(file) if !options.configure => {
                 let has = |pdo: &Pdo| position_of(pdo).is_some();
@@ -125,13 +126,13 @@ impl PositionMapping {
                 let mut problem = None;
                 for (number, pdo) in (0_u8..).zip(&pdos) {
                     match Self::of_file(pdo, &pdos) {
-                        Some(Ok(place)) => places.push(place),
+                        Some(Ok(mapping)) => mappings.push(mapping),
                         Some(Err(why)) => problem = problem.or(Some((number, why))),
                         None => {}
                     }
                 }
-                places.sort_by_key(|place: &Self| place.sync.wrapping_sub(1));
-                if places.is_empty() {
+                mappings.sort_by_key(|mapping: &Self| mapping.sync.wrapping_sub(1));
+                if mappings.is_empty() {
                     let problem = match problem {
                         Some((number, why)) => format!(
                             ", [{:04X}sub1]: TPDO {} has the position (6004), but {why}",
@@ -145,16 +146,16 @@ impl PositionMapping {
                     )));
                 }
             }
-            _ => places.extend(Bits::new(0, 32, false).map(|bits| Self {
+            _ => mappings.extend(Bits::new(0, 32, false).map(|bits| Self {
                 id: tpdo(node, 0),
                 bits,
                 sync: options.sync,
             })),
         }
-        Ok(places)
+        Ok(mappings)
     }
 
-    /// The place of the position in a TPDO, or why it can not be received; `None` if it has none.
+    /// The mapping of the position in a TPDO, or why it can not be received; `None` if it has none.
     fn of_file(pdo: &Pdo, all: &[Pdo]) -> Option<Result<Self, &'static str>> {
         let bits = position_of(pdo)?;
         let is_same = |other: &&Pdo| other.used_id() == pdo.used_id();
@@ -203,7 +204,7 @@ impl Driver for CanopenEncoderOptions {
         self.check()?;
         let node = node_of(spec)?;
         canopen::check_file(node, self.objects.as_ref())?;
-        let places = PositionMapping::all(node, self)?;
+        let mappings = PositionMapping::all(node, self)?;
         let listens = spec.mode == Mode::Listen;
         if let (true, None, Some(file)) = (listens, self.counts_per_turn, &self.objects) {
             let scales = [OPERATING, SCALED_PER_TURN, PER_TURN];
@@ -211,7 +212,7 @@ impl Driver for CanopenEncoderOptions {
             let name = self.eds.as_deref().unwrap_or_default();
             canopen::check_objects((name, file), is_scale, "set counts_per_turn")?;
         }
-        let first = places.first().map_or(tpdo(node, 0), |place| place.id);
+        let first = mappings.first().map_or(tpdo(node, 0), |mapping| mapping.id);
         let mut bringup = Bringup::new(spec, spec.mode, canopen::TIMING, first);
         bringup.start_with(NMT, &[nmt::START, node]);
         bringup.stop_with(NMT, &[nmt::PRE_OPERATIONAL, node]);
@@ -224,14 +225,14 @@ impl Driver for CanopenEncoderOptions {
             no_timer: false,
         };
         let claims = canopen::claims(node)
-            .chain(places.iter().map(|place| Claim::exclusive(place.id)))
+            .chain(mappings.iter().map(|mapping| Claim::exclusive(mapping.id)))
             .chain([Claim::shared(SYNC)])
             .collect::<Vec<_>>();
         let script = Script::new(node, spec.mode, start);
         let this = Encoder {
             node,
-            cycle: Cycle::new(places.first().map_or(0, |place| place.sync)),
-            places,
+            cycle: Cycle::new(mappings.first().map_or(0, |mapping| mapping.sync)),
+            mappings,
             rates: Rates::default(),
             state: NodeState::default(),
         };
@@ -367,7 +368,7 @@ impl EncoderStart {
 struct Encoder {
     node: u8,
     /// The best first.
-    places: ArrayVec<PositionMapping, 4>,
+    mappings: ArrayVec<PositionMapping, 4>,
     rates: Rates,
     cycle: Cycle,
     state: NodeState,
@@ -379,27 +380,27 @@ impl Encoder {
         at: usize,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<Script<EncoderStart>>,
+        session: &mut Session<Script<EncoderStart>>,
         out: &mut Decoded,
     ) {
-        let Some(place) = self.places.get(at).copied() else {
+        let Some(mapping) = self.mappings.get(at).copied() else {
             return;
         };
-        let Some(counts) = place.bits.of(data) else {
+        let Some(counts) = mapping.bits.of(data) else {
             return out.fault(Counter::Length, 1, frame.id);
         };
-        let Some(counts_per_turn) = link.questions.plan.known() else {
-            return link.questions.missed();
+        let Some(counts_per_turn) = session.questions.plan.known() else {
+            return session.questions.missed();
         };
         if !self.rates.is_first(at, |other| at < other) {
             return;
         }
-        let measured = match place.sync {
+        let measured = match mapping.sync {
             1.. if at == 0 => self.cycle.measured(frame),
             _ => Some((frame.t, frame.stamp)),
         };
         let Some((acquired, stamp)) = measured else {
-            return link.lost(Counter::Unpaired, 1, frame, out);
+            return session.lost(Counter::Unpaired, 1, frame, out);
         };
         let mut quality = Quality::GOOD;
         if self.state.error != 0 {
@@ -409,12 +410,12 @@ impl Encoder {
             position: counts as f64 / counts_per_turn * TAU,
             ..JointState::ABSENT
         });
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
-            ..Output::new(0, frame, quality, reading)
+            ..StampedReading::new(0, frame, quality, reading)
         };
-        link.give(output, frame, out);
+        session.add(stamped, frame, out);
     }
 }
 
@@ -424,10 +425,10 @@ impl Family for Encoder {
     fn on_frame(
         &mut self,
         frame: &Frame,
-        link: &mut Supervision<Script<EncoderStart>>,
+        session: &mut Session<Script<EncoderStart>>,
         out: &mut Decoded,
     ) {
-        if self.state.on_frame(self.node, frame, link, out) {
+        if self.state.on_frame(self.node, frame, session, out) {
             return;
         }
         let Some(data) = bytes::payload(frame, out) else {
@@ -435,8 +436,12 @@ impl Family for Encoder {
         };
         if frame.id == SYNC {
             self.cycle.sync(frame);
-        } else if let Some(at) = self.places.iter().position(|place| place.id == frame.id) {
-            self.position(at, data, frame, link, out);
+        } else if let Some(at) = self
+            .mappings
+            .iter()
+            .position(|mapping| mapping.id == frame.id)
+        {
+            self.position(at, data, frame, session, out);
         }
     }
 

@@ -6,7 +6,7 @@ mod board;
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::canopen::{self, SYNC};
-use crate::family::{Family, Supervised, Supervision, next_in_step};
+use crate::family::{Family, Session, Supervised, next_in_step};
 use crate::{Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -74,13 +74,12 @@ struct Producer {
 impl Family for Producer {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, _frame: &Frame, _link: &mut Supervision<NoInquiry>, _out: &mut Decoded) {
-    }
+    fn on_frame(&mut self, _frame: &Frame, _session: &mut Session<NoInquiry>, _out: &mut Decoded) {}
 
     fn request(
         &mut self,
         now: Nanos,
-        link: &mut Supervision<NoInquiry>,
+        session: &mut Session<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         if now < self.next {
@@ -88,7 +87,7 @@ impl Family for Producer {
         }
         self.next = next_in_step(self.next, self.period, now);
         // It works as long as the bus takes them.
-        link.bringup.reading(now);
+        session.bringup.reading(now);
         Some(Frame::new(SYNC, &[]))
     }
 

@@ -66,10 +66,11 @@ impl Claim {
     }
 }
 
-/// A complete reading of a device.
+/// A complete reading of one output of a device, with its stamp.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Output {
-    /// The device's output: 0 for a sensor, the device's own channel number for joint devices.
+pub struct StampedReading {
+    /// The number of the output that gives it: 0 for a sensor, the device's own channel number for
+    /// joint devices.
     pub output: u8,
     /// Receive time of its first frame \[ns\].
     pub acquired: Nanos,
@@ -86,7 +87,7 @@ pub struct Output {
     pub reading: Reading,
 }
 
-impl Output {
+impl StampedReading {
     /// A reading that `frame` holds, of a device without time and sequence number.
     #[must_use]
     pub const fn new(output: u8, frame: &Frame, quality: Quality, reading: Reading) -> Self {
@@ -105,7 +106,7 @@ impl Output {
 /// An output of a device, as its driver states it before the device is built.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct OutputInfo {
-    /// Its number: [`Output::output`].
+    /// Its number: [`StampedReading::output`].
     pub number: u8,
     /// The kind of its main reading. An output of kind [`Kind::Joint`] is used only if a
     /// `[[bus.device.joint]]` with that channel names it.
@@ -151,7 +152,7 @@ pub struct Fault {
 #[derive(Debug, Default)]
 pub struct Decoded {
     /// Readings that the frame completes.
-    pub readings: ArrayVec<Output, { Self::MOST }>,
+    pub readings: ArrayVec<StampedReading, { Self::MOST }>,
     /// Faults in the frame. They do not affect the readings.
     pub faults: ArrayVec<Fault, 4>,
 }
@@ -175,8 +176,8 @@ impl Decoded {
 
     /// Adds a reading; one that does not fit is counted as lost (no device is built that yields
     /// that many).
-    pub fn push(&mut self, output: Output, id: Id) {
-        if self.readings.try_push(output).is_err() {
+    pub fn push(&mut self, stamped: StampedReading, id: Id) {
+        if self.readings.try_push(stamped).is_err() {
             self.fault(Counter::Lost, 1, id);
         }
     }

@@ -8,7 +8,7 @@
 use crate::bringup::{Bringup, Inquiry};
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
-    NotSent, Output, State, Transmit,
+    NotSent, StampedReading, State, Transmit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -23,7 +23,7 @@ pub(crate) trait Family: Send {
     fn on_frame(
         &mut self,
         frame: &Frame,
-        link: &mut Supervision<Self::Questions>,
+        session: &mut Session<Self::Questions>,
         out: &mut Decoded,
     );
 
@@ -34,10 +34,10 @@ pub(crate) trait Family: Send {
     fn request(
         &mut self,
         now: Nanos,
-        link: &mut Supervision<Self::Questions>,
+        session: &mut Session<Self::Questions>,
         out: &mut Decoded,
     ) -> Option<Frame> {
-        let _ = (now, link, out);
+        let _ = (now, session, out);
         None
     }
 
@@ -60,8 +60,8 @@ pub(crate) trait Family: Send {
     }
 
     /// As [`Device::full_scale`].
-    fn full_scale(&self, link: &Supervision<Self::Questions>) -> Option<[f64; 6]> {
-        let _ = link;
+    fn full_scale(&self, session: &Session<Self::Questions>) -> Option<[f64; 6]> {
+        let _ = session;
         None
     }
 
@@ -70,18 +70,18 @@ pub(crate) trait Family: Send {
         &mut self,
         command: Command,
         now: Nanos,
-        link: &Supervision<Self::Questions>,
+        session: &Session<Self::Questions>,
     ) -> Result<(), CommandRefused> {
-        let _ = (command, now, link);
+        let _ = (command, now, session);
         Err(CommandRefused::Unsupported)
     }
 
     /// As [`Device::outcome`].
     fn outcome(
         &mut self,
-        link: &Supervision<Self::Questions>,
+        session: &Session<Self::Questions>,
     ) -> Option<Result<CommandOutcome, CommandFailed>> {
-        let _ = link;
+        let _ = session;
         None
     }
 }
@@ -162,18 +162,19 @@ pub(crate) fn count_faults(quality: Quality, frame: &Frame, out: &mut Decoded) {
 pub(crate) fn temperature(output: u8, celsius: f64, frame: &Frame, out: &mut Decoded) {
     if celsius.is_finite() {
         let reading = Reading::Temperature(Temperature { celsius });
-        out.push(Output::new(output, frame, Quality::GOOD, reading), frame.id);
+        let stamped = StampedReading::new(output, frame, Quality::GOOD, reading);
+        out.push(stamped, frame.id);
     }
 }
 
-/// The bring-up of a board, and what it has been asked.
+/// The session with a board: its bring-up, and what it has been asked.
 #[derive(Debug)]
-pub(crate) struct Supervision<Q> {
+pub(crate) struct Session<Q> {
     pub(crate) bringup: Bringup,
     pub(crate) questions: Q,
 }
 
-impl<Q: Inquiry> Supervision<Q> {
+impl<Q: Inquiry> Session<Q> {
     pub(crate) fn state(&self) -> State {
         self.bringup.state(&self.questions)
     }
@@ -188,17 +189,18 @@ impl<Q: Inquiry> Supervision<Q> {
         out: &mut Decoded,
     ) {
         let reading = Reading::Joint(state);
-        self.give(Output::new(output, frame, quality, reading), frame, out);
+        let stamped = StampedReading::new(output, frame, quality, reading);
+        self.add(stamped, frame, out);
     }
 
     /// Adds a main reading that `frame` completes, counts the faults in its quality, and marks the
     /// first one after a gap.
-    pub(crate) fn give(&mut self, mut output: Output, frame: &Frame, out: &mut Decoded) {
-        count_faults(output.quality, frame, out);
+    pub(crate) fn add(&mut self, mut stamped: StampedReading, frame: &Frame, out: &mut Decoded) {
+        count_faults(stamped.quality, frame, out);
         if self.bringup.reading(frame.t) {
-            output.quality |= Quality::GAP_BEFORE;
+            stamped.quality |= Quality::GAP_BEFORE;
         }
-        out.push(output, frame.id);
+        out.push(stamped, frame.id);
     }
 
     /// Readings were lost: they are counted, and the next one is marked.
@@ -227,7 +229,7 @@ impl<Q: Inquiry> Supervision<Q> {
 #[derive(Debug)]
 pub(crate) struct Supervised<F: Family> {
     claims: Vec<Claim>,
-    link: Supervision<F::Questions>,
+    session: Session<F::Questions>,
     family: F,
 }
 
@@ -243,7 +245,7 @@ impl<F: Family + 'static> Supervised<F> {
     {
         Box::new(Self {
             claims: claims.into_iter().collect(),
-            link: Supervision { bringup, questions },
+            session: Session { bringup, questions },
             family,
         })
     }
@@ -255,8 +257,8 @@ impl<F: Family> Device for Supervised<F> {
     }
 
     fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
-        if self.link.bringup.active() {
-            self.family.on_frame(frame, &mut self.link, out);
+        if self.session.bringup.active() {
+            self.family.on_frame(frame, &mut self.session, out);
         }
     }
 
@@ -267,7 +269,7 @@ impl<F: Family> Device for Supervised<F> {
     }
 
     fn poll_transmit(&mut self, now: Nanos, out: &mut Decoded) -> Option<Transmit> {
-        let Supervision { bringup, questions } = &mut self.link;
+        let Session { bringup, questions } = &mut self.session;
         let was_silent = bringup.is_silent();
         let transmit = bringup.poll(now, questions, out);
         if bringup.is_silent() && !was_silent {
@@ -279,34 +281,34 @@ impl<F: Family> Device for Supervised<F> {
         if transmit.is_some() || !bringup.may_lend() {
             return transmit;
         }
-        let frame = self.family.request(now, &mut self.link, out)?;
-        Some(self.link.bringup.lend(frame, now))
+        let frame = self.family.request(now, &mut self.session, out)?;
+        Some(self.session.bringup.lend(frame, now))
     }
 
     fn on_sent(&mut self, frame: &Frame, outcome: Result<Nanos, NotSent>) {
-        let Supervision { bringup, questions } = &mut self.link;
+        let Session { bringup, questions } = &mut self.session;
         bringup.on_sent(frame, outcome, questions);
         self.family.on_sent(frame, outcome);
     }
 
     fn next_wake(&self) -> Option<Nanos> {
-        let Supervision { bringup, questions } = &self.link;
+        let Session { bringup, questions } = &self.session;
         let request = (self.family.request_at()).filter(|_| bringup.may_lend());
         let bringup = bringup.next_wake(questions);
         bringup.into_iter().chain(request).min()
     }
 
     fn state(&self) -> State {
-        self.link.state()
+        self.session.state()
     }
 
     fn stop(&mut self, _now: Nanos) {
-        self.link.bringup.stop();
+        self.session.bringup.stop();
         self.family.interrupt();
     }
 
     fn restart(&mut self, _now: Nanos) {
-        self.link.bringup.restart();
+        self.session.bringup.restart();
         self.family.interrupt();
         self.family.reset();
     }
@@ -316,18 +318,18 @@ impl<F: Family> Device for Supervised<F> {
     }
 
     fn full_scale(&self) -> Option<[f64; 6]> {
-        self.family.full_scale(&self.link)
+        self.family.full_scale(&self.session)
     }
 
     fn set_max_silence(&mut self, max_silence: Nanos) {
-        self.link.bringup.set_max_silence(max_silence);
+        self.session.bringup.set_max_silence(max_silence);
     }
 
     fn command(&mut self, command: Command, now: Nanos) -> Result<(), CommandRefused> {
-        self.family.command(command, now, &self.link)
+        self.family.command(command, now, &self.session)
     }
 
     fn outcome(&mut self) -> Option<Result<CommandOutcome, CommandFailed>> {
-        self.family.outcome(&self.link)
+        self.family.outcome(&self.session)
     }
 }

@@ -7,10 +7,11 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class, command};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Outputs, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, OutputInfo, Outputs, Spec, SpecError, StampedReading,
+    bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -93,7 +94,7 @@ struct Mais {
 impl Family for Mais {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address);
         let (first, length) = match stream {
             Some(HES0TO6) => (0, SECOND),
@@ -103,7 +104,7 @@ impl Family for Mais {
         let Some(data) = bytes::payload_of(usize::from(length), frame, out) else {
             return;
         };
-        if link.bringup.reading(frame.t) {
+        if session.bringup.reading(frame.t) {
             self.gap = self.seen;
         }
         for (output, count) in (first..).zip(data) {
@@ -121,7 +122,8 @@ impl Family for Mais {
                 position: f64::from(*count),
                 ..JointState::ABSENT
             });
-            out.push(Output::new(output, frame, quality, reading), frame.id);
+            let stamped = StampedReading::new(output, frame, quality, reading);
+            out.push(stamped, frame.id);
         }
     }
 }

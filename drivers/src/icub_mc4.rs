@@ -7,13 +7,13 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Supervised, Supervision, count_faults, quality_of};
+use crate::family::{Family, Session, Supervised, count_faults, quality_of};
 use crate::held::HeldValue;
 use crate::icub::{self, class};
 use crate::icub_motor::mode;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Outputs, Spec, SpecError,
-    bytes,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Outputs, Spec, SpecError,
+    StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -88,22 +88,22 @@ struct StepSizes {
 
 impl IcubMc4Options {
     fn scales(&self) -> Result<[StepSizes; JOINTS], SpecError> {
-        let wrong = |key, value, expected| SpecError::Key {
+        let error = |key, value, expected| SpecError::Key {
             key,
             value,
             expected,
         };
         if !(1..=1000).contains(&self.hold_ms) {
-            return Err(wrong("hold_ms", f64::from(self.hold_ms), "1 to 1000"));
+            return Err(error("hold_ms", f64::from(self.hold_ms), "1 to 1000"));
         }
         for ticks in self.ticks_per_turn {
             if !(ticks > 0.0 && ticks.is_finite()) {
-                return Err(wrong("ticks_per_turn", ticks, "a number above 0"));
+                return Err(error("ticks_per_turn", ticks, "a number above 0"));
             }
         }
         for shift in self.velocity_shift {
             if shift > 15 {
-                return Err(wrong("velocity_shift", f64::from(shift), "0 to 15"));
+                return Err(error("velocity_shift", f64::from(shift), "0 to 15"));
             }
         }
         let [ticks0, ticks1] = self.ticks_per_turn;
@@ -182,10 +182,10 @@ impl Mc4 {
         &self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<NoInquiry>,
+        session: &mut Session<NoInquiry>,
         out: &mut Decoded,
     ) {
-        let gap = link.bringup.reading(frame.t);
+        let gap = session.bringup.reading(frame.t);
         for (joint, output) in self.joints.iter().zip(0_u8..) {
             if !self.outputs.0.contains(&output) {
                 continue;
@@ -201,7 +201,8 @@ impl Mc4 {
                 velocity: joint.velocity.at(frame, self.hold),
                 ..JointState::ABSENT
             });
-            out.push(Output::new(output, frame, quality, reading), frame.id);
+            let stamped = StampedReading::new(output, frame, quality, reading);
+            out.push(stamped, frame.id);
         }
     }
 
@@ -209,8 +210,8 @@ impl Mc4 {
         let &[faults0, mode0, faults1, mode1, _, shared, ..] = data else {
             return;
         };
-        let told = [(faults0, mode0), (faults1, mode1)];
-        let joints = self.joints.iter_mut().zip(told).zip(fault::BOARD);
+        let reports = [(faults0, mode0), (faults1, mode1)];
+        let joints = self.joints.iter_mut().zip(reports).zip(fault::BOARD);
         for (((joint, (faults, mode)), mask), output) in joints.zip(0_u8..) {
             let faults = u32::from(faults) | u32::from(shared) << 8 & mask;
             let mode = u32::from(mode);
@@ -222,7 +223,8 @@ impl Mc4 {
                 faults,
             });
             if self.outputs.0.contains(&output) {
-                out.push(Output::new(output, frame, joint.status, reading), frame.id);
+                let stamped = StampedReading::new(output, frame, joint.status, reading);
+                out.push(stamped, frame.id);
             }
         }
     }
@@ -231,7 +233,7 @@ impl Mc4 {
 impl Family for Mc4 {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_MOTOR, self.address);
         let Some(kind @ (kind::POSITION | kind::STATUS | kind::VELOCITY)) = stream else {
             return;
@@ -240,7 +242,7 @@ impl Family for Mc4 {
             return;
         };
         match kind {
-            kind::POSITION => self.positions(data, frame, link, out),
+            kind::POSITION => self.positions(data, frame, session, out),
             kind::STATUS => self.status(data, frame, out),
             _ => {
                 for (joint, at) in self.joints.iter_mut().zip([0, 2]) {

@@ -7,10 +7,10 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -160,7 +160,7 @@ impl TwoFoc {
         &self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<NoInquiry>,
+        session: &mut Session<NoInquiry>,
         out: &mut Decoded,
     ) {
         let velocity = f64::from(bytes::i16_le(data, 2)) * RAD_PER_S_PER_LSB;
@@ -170,7 +170,7 @@ impl TwoFoc {
             current: f64::from(bytes::i16_le(data, 0)) * AMPERE_PER_LSB,
             ..JointState::ABSENT
         };
-        link.joint(0, frame, self.status, joint, out);
+        session.joint(0, frame, self.status, joint, out);
     }
 
     fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
@@ -182,17 +182,15 @@ impl TwoFoc {
             faults: bytes::u32_le(data, 4),
         };
         self.status = quality_of(&actuator);
-        out.push(
-            Output::new(0, frame, self.status, Reading::Actuator(actuator)),
-            frame.id,
-        );
+        let stamped = StampedReading::new(0, frame, self.status, Reading::Actuator(actuator));
+        out.push(stamped, frame.id);
     }
 }
 
 impl Family for TwoFoc {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         let Some(stream) = icub::stream_type(frame.id, class::PERIODIC_MOTOR, self.address) else {
             return;
         };
@@ -206,7 +204,7 @@ impl Family for TwoFoc {
             return;
         };
         match (stream, data.len()) {
-            (kind::TWO_FOC, 8) => self.motion(data, frame, link, out),
+            (kind::TWO_FOC, 8) => self.motion(data, frame, session, out),
             (kind::STATUS, 8) => self.status(data, frame, out),
             (kind::ADDITIONAL_STATUS, 4) => {}
             (kind::OVERFLOW, _) => out.fault(Counter::DeviceFault, 1, frame.id),

@@ -8,10 +8,11 @@ mod recognise;
 
 use crate::bringup::{Bringup, Timing};
 use crate::configure::{Configure, Setting};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class, command};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Outputs, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, OutputInfo, Outputs, Spec, SpecError, StampedReading,
+    bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -222,13 +223,13 @@ struct Pos {
 impl Family for Pos {
     type Questions = Configure;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<Configure>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<Configure>, out: &mut Decoded) {
         if frame.id == icub::to_host(class::POLLING_ANALOG, self.address) {
             // Answers to other questions are for other devices.
             if let Some(data) = bytes::payload(frame, out)
                 && data.first() == Some(&command::POS_CONFIG_GET)
             {
-                link.questions.answer(data, frame, out);
+                session.questions.answer(data, frame, out);
             }
             return;
         }
@@ -249,7 +250,7 @@ impl Family for Pos {
         if quantity != code || !(1..=VALUES).contains(&count) || label + count - 1 > LABEL_MOST {
             return out.fault(Counter::Value, 1, frame.id);
         }
-        if link.bringup.reading(frame.t) {
+        if session.bringup.reading(frame.t) {
             self.gap = self.seen;
         }
         for (output, value) in (label..)
@@ -264,7 +265,7 @@ impl Family for Pos {
             if self.gap & bit != 0 {
                 quality |= Quality::GAP_BEFORE;
             }
-            if !link.questions.confirmed() {
+            if !session.questions.confirmed() {
                 quality |= Quality::NOT_CALIBRATED;
             }
             self.gap &= !bit;
@@ -274,8 +275,8 @@ impl Family for Pos {
                 position,
                 ..JointState::ABSENT
             });
-            let output = Output::new(output, frame, quality, reading);
-            out.push(output, frame.id);
+            let stamped = StampedReading::new(output, frame, quality, reading);
+            out.push(stamped, frame.id);
         }
     }
 }

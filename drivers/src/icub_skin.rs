@@ -7,10 +7,12 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
-use crate::{Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Spec, SpecError, bytes};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError, StampedReading, bytes,
+};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Skin};
@@ -191,7 +193,7 @@ impl SkinPatch {
 impl Family for SkinPatch {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_SKIN, self.address);
         let Some(triangle) = stream else { return };
         let Some(data) = bytes::payload(frame, out) else {
@@ -220,7 +222,7 @@ impl Family for SkinPatch {
         let Paired::With(acquired, stamp, [first, second]) = paired else {
             return;
         };
-        if link.bringup.reading(frame.t) {
+        if session.bringup.reading(frame.t) {
             self.gap = self.seen;
         }
         let (skin, mut quality) = self.skin(triangle, first, second);
@@ -232,12 +234,12 @@ impl Family for SkinPatch {
         }
         self.gap &= !bit;
         self.seen |= bit;
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
-            ..Output::new(0, frame, quality, Reading::Skin(skin))
+            ..StampedReading::new(0, frame, quality, Reading::Skin(skin))
         };
-        out.push(output, frame.id);
+        out.push(stamped, frame.id);
     }
 
     fn reset(&mut self) {

@@ -67,7 +67,8 @@ pub use board::{Board, EncodeError, Frames, Simulate};
 pub use calibration::Calibration;
 pub use device::{
     COMMAND_TIME, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
-    Driver, Fault, Mode, NotSent, Output, OutputInfo, Outputs, Spec, SpecError, State, Transmit,
+    Driver, Fault, Mode, NotSent, OutputInfo, Outputs, Spec, SpecError, StampedReading, State,
+    Transmit,
 };
 pub use frame::{Format, Frame, Id};
 #[cfg(feature = "recognise")]

@@ -8,11 +8,11 @@ mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes::{self, i16_le, u32_le};
-use crate::family::{Family, Supervised, Supervision, next_in_step};
+use crate::family::{Family, Session, Supervised, next_in_step};
 use crate::held::OnChange;
 use crate::{
-    Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, NotSent, Output, OutputInfo, Spec,
-    SpecError,
+    Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, NotSent, OutputInfo, Spec, SpecError,
+    StampedReading,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -354,7 +354,7 @@ impl MoteusController {
 impl Family for MoteusController {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         // Short frames are sent as classic ones by some programs.
         let Some(data) = bytes::fd_payload(frame, out) else {
             return;
@@ -366,7 +366,7 @@ impl Family for MoteusController {
             return out.fault(Counter::Value, 1, frame.id);
         };
         // A reply to nobody is an old one, which a queue of an adapter has held back.
-        if link.bringup.mode() == Mode::Supervise && !core::mem::take(&mut self.asked) {
+        if session.bringup.mode() == Mode::Supervise && !core::mem::take(&mut self.asked) {
             return out.fault(Counter::Unexpected, 1, frame.id);
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // casts saturate
@@ -386,13 +386,15 @@ impl Family for MoteusController {
                 encoder: 0,
                 faults: self.fault,
             });
-            out.push(Output::new(0, frame, self.quality(), reading), frame.id);
+            let stamped = StampedReading::new(0, frame, self.quality(), reading);
+            out.push(stamped, frame.id);
         }
         if let Some(celsius) = told.temperature.filter(|celsius| celsius.is_finite())
             && self.temperature.is_due((), frame)
         {
             let reading = Reading::Temperature(Temperature { celsius });
-            out.push(Output::new(0, frame, Quality::GOOD, reading), frame.id);
+            let stamped = StampedReading::new(0, frame, Quality::GOOD, reading);
+            out.push(stamped, frame.id);
         }
         let Some(position) = told.position else {
             return;
@@ -407,7 +409,7 @@ impl Family for MoteusController {
             torque: finite(told.torque),
             ..JointState::ABSENT
         };
-        link.joint(0, frame, self.quality(), state, out);
+        session.joint(0, frame, self.quality(), state, out);
     }
 
     fn reset(&mut self) {
@@ -418,7 +420,7 @@ impl Family for MoteusController {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Supervision<NoInquiry>,
+        _session: &mut Session<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         if now < self.next {

@@ -462,13 +462,13 @@ fn follows(first: &Stream, second: &Stream, is_own: &dyn Fn(&Frame) -> bool) -> 
     let Some(period) = first.period().filter(|period| *period > Nanos::ZERO) else {
         return false;
     };
-    let own = || second.recent().filter(|frame| is_own(frame));
+    let own_frames = || second.recent().filter(|frame| is_own(frame));
     let near = |a: &&Frame| {
-        let mut after = own().map(|b| b.t - a.t);
+        let mut after = own_frames().map(|b| b.t - a.t);
         after.any(|gap| gap >= Nanos::ZERO && gap.0 * 8 <= period.0)
     };
     // Both have the same number of newest frames: those of one may reach further back.
-    let front = own().next().map(|frame| frame.t);
+    let front = own_frames().next().map(|frame| frame.t);
     let late = |a: &&Frame| front.is_none_or(|front| front <= a.t);
     let all = first.recent().filter(late).count();
     let followed = first.recent().filter(late).filter(near).count();

@@ -263,8 +263,8 @@ pub fn questions(seen: &Traffic, named: &[&str]) -> Vec<Frame> {
     let suspects = suspect(seen);
     let mut there: Vec<&Finding> = Vec::new();
     for finding in &suspects {
-        let mut own = finding.explains.iter().map(|explained| explained.id);
-        if !own.all(|id| there.iter().any(|better| better.has(id))) {
+        let mut ids = finding.explains.iter().map(|explained| explained.id);
+        if !ids.all(|id| there.iter().any(|better| better.has(id))) {
             there.push(finding);
         }
     }

@@ -18,7 +18,7 @@ use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::{RigidInertia, Vec3};
 use proprio_dynamics::{FrameMotion, InverseDynamics, JointState, Kinematics};
 use proprio_estimator::config::Config;
-use proprio_estimator::reading;
+use proprio_estimator::sample_log;
 use proprio_estimator::setup::Setup;
 use proprio_identification::{LogRole, Verdict, identify};
 use std::fmt::Write as _;
@@ -125,17 +125,17 @@ fn log(setup: &Setup, samples: usize) -> String {
         .for_each(|axis| text += &format!(",wrench/ft/{axis}"));
     for i in 0..samples {
         let t = i as f64 * 1e-3;
-        let of = |f: fn(f64, f64, f64) -> f64| -> Vec<f64> {
+        let joints = |f: fn(f64, f64, f64) -> f64| -> Vec<f64> {
             let sum = |waves: &[(f64, f64); 4]| {
                 waves.iter().map(|(w, phase)| 0.25 * f(*w, *phase, t)).sum()
             };
             waves.iter().map(sum).collect()
         };
-        let position = of(|w, phase, t| (w * t + phase).sin());
+        let position = joints(|w, phase, t| (w * t + phase).sin());
         let state = JointState {
             position: &position,
-            velocity: &of(|w, phase, t| w * (w * t + phase).cos()),
-            acceleration: &of(|w, phase, t| -w * w * (w * t + phase).sin()),
+            velocity: &joints(|w, phase, t| w * (w * t + phase).cos()),
+            acceleration: &joints(|w, phase, t| -w * w * (w * t + phase).sin()),
         };
         kinematics.update(&model, state, &base).expect("a state");
         dynamics.update(&model, &kinematics, &[]).expect("a state");
@@ -160,7 +160,7 @@ fn identify_a_log(bencher: Bencher<'_, '_>, samples: usize) {
     bencher.counter(ItemsCount::new(samples)).bench_local(|| {
         let log = text.as_bytes();
         let dataset =
-            reading::dataset(&setup.robot, "log.csv", LogRole::Train, log).expect("a log");
+            sample_log::dataset(&setup.robot, "log.csv", LogRole::Train, log).expect("a log");
         let outcome = identify(&setup.robot, vec![dataset], &[], &mut |_| ()).expect("an outcome");
         assert_eq!(outcome.verdict, Verdict::Identified);
         outcome

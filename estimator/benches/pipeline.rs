@@ -141,12 +141,12 @@ impl Bench {
         let readings = (0..PERIOD)
             .map(|millisecond| {
                 let t = millisecond as f64 * 1e-3;
-                let of = |f: fn(&(f64, f64, f64), f64) -> f64| {
+                let joints = |f: fn(&(f64, f64, f64), f64) -> f64| {
                     waves.iter().map(|wave| f(wave, t)).collect::<Vec<_>>()
                 };
-                let position = of(|(a, w, p), t| a * (w * t + p).sin());
-                let velocity = of(|(a, w, p), t| a * w * (w * t + p).cos());
-                let acceleration = of(|(a, w, p), t| -a * w * w * (w * t + p).sin());
+                let position = joints(|(a, w, p), t| a * (w * t + p).sin());
+                let velocity = joints(|(a, w, p), t| a * w * (w * t + p).cos());
+                let acceleration = joints(|(a, w, p), t| -a * w * w * (w * t + p).sin());
                 let state = JointState {
                     position: &position,
                     velocity: &velocity,

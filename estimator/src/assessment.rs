@@ -14,7 +14,7 @@
 
 use crate::inertial::InertialState;
 use crate::pipeline::{Estimate, Pipeline};
-use crate::reading::{self, ReadingError};
+use crate::sample_log::{self, SampleLogError};
 use crate::setup::Setup;
 use proprio_identification::dataset::observation::Observation;
 use proprio_identification::{InForce, LogRole, Predicted, Robot, judged, predicted};
@@ -91,12 +91,12 @@ impl Assessor {
     ///
     /// # Errors
     /// The log cannot be read.
-    pub fn new(setup: &Setup, log: impl Read) -> Result<Self, ReadingError> {
+    pub fn new(setup: &Setup, log: impl Read) -> Result<Self, SampleLogError> {
         let robot = setup.robot.clone();
         Ok(Self {
             instants: judged(
                 &robot,
-                reading::dataset(&robot, "", LogRole::Validate, log)?,
+                sample_log::dataset(&robot, "", LogRole::Validate, log)?,
             ),
             next: 0,
             last: None,

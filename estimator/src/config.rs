@@ -699,13 +699,13 @@ impl ForceTorque {
     /// Its offset, and the standard deviations of it [torque; force] \[Nm, N\].
     #[must_use]
     pub fn offset(&self) -> (Wrench, [f64; 6]) {
-        let of = |value: Option<[f64; 3]>, deviation: Option<[f64; 3]>, unknown: f64| {
+        let with_std = |value: Option<[f64; 3]>, deviation: Option<[f64; 3]>, unknown: f64| {
             let exact = if value.is_some() { 0.0 } else { unknown };
             (value.unwrap_or_default(), deviation.unwrap_or([exact; 3]))
         };
         let [of_torque, of_force] = [UNKNOWN_OFFSET[0], UNKNOWN_OFFSET[3]];
-        let (force, [fx, fy, fz]) = of(self.offset_n, self.offset_std_n, of_force);
-        let (torque, [tx, ty, tz]) = of(self.offset_nm, self.offset_std_nm, of_torque);
+        let (force, [fx, fy, fz]) = with_std(self.offset_n, self.offset_std_n, of_force);
+        let (torque, [tx, ty, tz]) = with_std(self.offset_nm, self.offset_std_nm, of_torque);
         (Wrench::from_parts(force, torque), [tx, ty, tz, fx, fy, fz])
     }
 

@@ -58,13 +58,13 @@ pub fn check(
     config: &Path,
     posture: impl FnOnce(&Setup) -> Result<Posture, String>,
 ) -> anyhow::Result<Setup> {
-    let (_, setup) = load(config, |_| {})?;
+    let (_, setup) = Setup::load(config, |_| {})?;
     let file = config.to_owned();
-    let wrong = |problem| InvalidConfig {
+    let invalid = |problem| InvalidConfig {
         file: file.clone(),
         problem,
     };
-    let posture = posture(&setup).map_err(wrong)?;
+    let posture = posture(&setup).map_err(invalid)?;
     let checked = Check::of(&setup, &posture).context("the configuration cannot be checked")?;
     // The reader of a pipe may close it early.
     let _ = write!(std::io::stdout(), "{setup}{checked}");
@@ -80,7 +80,7 @@ pub fn check(
 /// One error chain that states what is wrong, where, and what to do. [`InvalidConfig`] in the chain
 /// means a wrong configuration.
 pub fn run(config: &Path, domain: &DomainConfig) -> anyhow::Result<()> {
-    let (config, setup) = load(config, |_| {})?;
+    let (config, setup) = Setup::load(config, |_| {})?;
     let served = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
@@ -90,27 +90,6 @@ pub fn run(config: &Path, domain: &DomainConfig) -> anyhow::Result<()> {
         Some(remedy) => error.context(remedy),
         None => error,
     })
-}
-
-/// Reads a configuration, applies `adjust` to it, then reads the files that it names (model,
-/// identified parameters). Logs the warnings.
-///
-/// # Errors
-/// [`InvalidConfig`].
-pub fn load(
-    file: &Path,
-    adjust: impl FnOnce(&mut Config),
-) -> Result<(Config, Setup), InvalidConfig> {
-    let mut config = Config::load(file)?;
-    adjust(&mut config);
-    let setup = Setup::new(&config).map_err(|problem| InvalidConfig {
-        file: file.to_owned(),
-        problem,
-    })?;
-    for warning in setup.warnings() {
-        tracing::warn!("{}: {warning}", file.display());
-    }
-    Ok((config, setup))
 }
 
 async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::Result<()> {

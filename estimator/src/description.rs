@@ -100,8 +100,8 @@ impl Setup {
         if !others.is_empty() {
             writeln!(f, "  the URDF's, {known}: {}", others.join(", "))?;
         }
-        for (place, offset) in parameters.offsets().iter().enumerate() {
-            let deviation = parameters.offset_deviation(place).unwrap_or_default();
+        for (index, offset) in parameters.offsets().iter().enumerate() {
+            let deviation = parameters.offset_deviation(index).unwrap_or_default();
             let numbers = offset
                 .reading
                 .force_first()
@@ -117,16 +117,16 @@ impl Setup {
                 numbers.join(", ")
             )?;
             if let Some(found) = &offset.calibrated {
-                let of = |values: [f64; 6]| values.map(|value| format!("{value:.4}")).join(", ");
+                let text = |values: [f64; 6]| values.map(|value| format!("{value:.4}")).join(", ");
                 if found.kind.gain != Gain::None {
-                    let diagonal: [f64; 6] =
-                        std::array::from_fn(|i| found.calibration.gain_force_first()[7 * i]);
-                    writeln!(f, "  gain of {}, diagonal: {}", offset.sensor, of(diagonal))?;
+                    let gain = found.calibration.gain_force_first();
+                    let diagonal = text(std::array::from_fn(|i| gain[7 * i]));
+                    writeln!(f, "  gain of {}, diagonal: {diagonal}", offset.sensor)?;
                 }
                 if let (true, Some(reference)) =
                     (found.kind.temperature, found.calibration.reference())
                 {
-                    let per_kelvin = of(found.calibration.per_kelvin().force_first());
+                    let per_kelvin = text(found.calibration.per_kelvin().force_first());
                     writeln!(
                         f,
                         "  per kelvin beyond {reference} C, {} [N/K, Nm/K]: {per_kelvin}",

@@ -200,8 +200,8 @@ impl<const D: usize> Window<D> {
         let stamps = &self.stamps.all()[skipped.min(self.len)..][..known];
         let count = self.within(stamps, until);
         std::array::from_fn(|component| {
-            let own = &self.roughness_square[component].all()[skipped.min(self.len)..][..count];
-            (sum(own) / count.max(1) as f64).sqrt()
+            let squares = &self.roughness_square[component].all()[skipped.min(self.len)..][..count];
+            (sum(squares) / count.max(1) as f64).sqrt()
         })
     }
 

@@ -163,8 +163,8 @@ impl DriveModel {
         let [relative, offset] = self.inherited;
         let inherited = [relative * self.parameters[0], 0.0, 0.0, 0.0, 0.0, offset];
         std::array::from_fn(|i| {
-            let own = self.covariance[(i, i)].max(0.0);
-            (own + inherited[i].powi(2)).sqrt()
+            let variance = self.covariance[(i, i)].max(0.0);
+            (variance + inherited[i].powi(2)).sqrt()
         })
     }
 }

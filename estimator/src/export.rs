@@ -60,8 +60,8 @@ pub fn parameters(
             rows.extend(own);
             let calibrations = outcome.covariance.calibrations.iter();
             let calibrations = calibrations.zip(outcome.covariance.columns.len()..);
-            let own = calibrations.filter(|((other, _), _)| *other == sensor);
-            of_calibrations.extend(own.map(|(_, row)| row));
+            let calibrated = calibrations.filter(|((other, _), _)| *other == sensor);
+            of_calibrations.extend(calibrated.map(|(_, row)| row));
         }
     }
     rows.extend(of_calibrations);
@@ -152,12 +152,12 @@ pub fn known(parameters: &Parameters, robot: &Robot) -> KnownParameters {
     let root = parameters.root();
     // The deviation of each channel's gain with itself, the largest.
     let mut gains = vec![0.0; robot.offsets.len()];
-    for (place, offset) in parameters.offsets().iter().enumerate() {
+    for (index, offset) in parameters.offsets().iter().enumerate() {
         let Some(sensor) = robot.sensor(&offset.sensor) else {
             continue;
         };
         let unknowns = offset.calibrated.iter().flat_map(|own| own.kind.unknowns());
-        let deviations = parameters.calibration_deviation(place);
+        let deviations = parameters.calibration_deviation(index);
         for (unknown, deviation) in unknowns.zip(deviations) {
             if matches!(unknown, Unknown::Gain { channel, of } if channel == of) {
                 gains[sensor] = deviation.max(gains[sensor]);

@@ -49,7 +49,7 @@ impl FirstLook {
         let mut configured = setup.robot.clone();
         // Skipped samples must not count as silence.
         configured.max_silence = configured.max_silence.max(MIN_INTERVAL + MIN_INTERVAL);
-        let look = move || {
+        let watch = move || {
             let mut reported = BTreeSet::new();
             for window_number in 1..=WINDOWS {
                 let Ok(mut window) = windows.recv() else {
@@ -75,7 +75,7 @@ impl FirstLook {
         };
         std::thread::Builder::new()
             .name("first look".into())
-            .spawn(look)
+            .spawn(watch)
             .context("cannot start a thread")?;
         Ok(Self {
             buffer: Some(Vec::with_capacity(
@@ -230,10 +230,10 @@ mod tests {
     #[test]
     fn a_wrong_measurement_direction_is_found_in_a_window() {
         let setup = setup();
-        let of = |by: f64| findings(&setup.robot, &mut received(&setup, by));
-        assert_eq!(of(1.0), Vec::<Finding>::new());
-        let [finding] = &of(-1.0)[..] else {
-            panic!("{:?}", of(-1.0))
+        let found = |by: f64| findings(&setup.robot, &mut received(&setup, by));
+        assert_eq!(found(1.0), Vec::<Finding>::new());
+        let [finding] = &found(-1.0)[..] else {
+            panic!("{:?}", found(-1.0))
         };
         assert_eq!(
             (finding.code, finding.subject.as_str()),
@@ -242,7 +242,7 @@ mod tests {
         // Buses are read one after the other.
         let mut mixed = received(&setup, -1.0);
         mixed.sort_by_key(|(channel, ..)| *channel);
-        assert_eq!(findings(&setup.robot, &mut mixed), of(-1.0));
+        assert_eq!(findings(&setup.robot, &mut mixed), found(-1.0));
     }
 
     #[test]
@@ -250,7 +250,7 @@ mod tests {
         let (mut look, full, empty) = {
             let (full, windows) = mpsc::sync_channel(1);
             let (returned, empty) = mpsc::sync_channel(1);
-            let look = FirstLook {
+            let first_look = FirstLook {
                 buffer: Some(Vec::with_capacity(100_000)),
                 began: None,
                 last: vec![Nanos::MIN; 2],
@@ -258,7 +258,7 @@ mod tests {
                 full,
                 empty,
             };
-            (look, windows, returned)
+            (first_look, windows, returned)
         };
         let reading = Reading::Wrench(proprio_topics::Wrench {
             force: [0.0; 3],
@@ -289,8 +289,8 @@ mod tests {
         };
         run(0, 30);
         let window = full.try_recv().expect("a window");
-        let of = |channel: usize| window.iter().filter(|(own, ..)| *own == channel).count();
-        assert_eq!((of(0), of(1), of(2)), (2501, 2000, 1));
+        let count = |channel: usize| window.iter().filter(|(own, ..)| *own == channel).count();
+        assert_eq!((count(0), count(1), count(2)), (2501, 2000, 1));
         assert_eq!(
             (window.capacity(), window[0].1),
             (100_000, Nanos::from_millis(5_000))

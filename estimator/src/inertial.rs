@@ -108,17 +108,17 @@ impl InertialState {
                 let Some(sensor) = robot.sensor(&offset.sensor) else {
                     continue;
                 };
-                if let Some(place) = self.offsets.get_mut(sensor) {
-                    *place = offset.reading;
+                if let Some(slot) = self.offsets.get_mut(sensor) {
+                    *slot = offset.reading;
                 }
                 let noise = offset.noise.torque_first().map(|x| x * x);
-                if let Some(place) = self.excess_variance.get_mut(sensor) {
-                    *place = excess(&robot.structure, sensor, &noise);
+                if let Some(slot) = self.excess_variance.get_mut(sensor) {
+                    *slot = excess(&robot.structure, sensor, &noise);
                 }
-                if let (Some(place), Some(found)) =
+                if let (Some(slot), Some(found)) =
                     (self.calibrations.get_mut(sensor), &offset.calibrated)
                 {
-                    *place = found.calibration;
+                    *slot = found.calibration;
                     calibrated.push((sensor, found.kind));
                 }
                 let ([fx, fy, fz], [tx, ty, tz]) =
@@ -198,18 +198,18 @@ impl InertialState {
         let Some(parameters) = &self.identified else {
             return Vec::new();
         };
-        let of = |(place, offset): (usize, &Offset)| {
+        let deviation = |(index, offset): (usize, &Offset)| {
             let sensor = robot
                 .sensor(&offset.sensor)
                 .filter(|sensor| sensors.contains(sensor))?;
             let kind = offset.calibrated.as_ref()?.kind;
-            Some(((sensor, kind), parameters.calibration_deviation(place)))
+            Some(((sensor, kind), parameters.calibration_deviation(index)))
         };
         parameters
             .offsets()
             .iter()
             .enumerate()
-            .filter_map(of)
+            .filter_map(deviation)
             .collect()
     }
 
@@ -296,20 +296,20 @@ fn with_calibrations(
     all.view_mut((0, 0), (rows, columns)).copy_from(root);
     let mut next = 0;
     for ((sensor, kind), deviations) in calibrated {
-        let place = group
+        let index = group
             .sensors
             .iter()
             .position(|other| other == sensor)
             .unwrap_or(0);
         let offset = group
             .offsets
-            .get(place)
+            .get(index)
             .map_or([0.0; 6], Wrench::torque_first);
         for (unknown, deviation) in kind.unknowns().zip(*deviations) {
             all[(rows + next, columns + next)] = *deviation;
             if let Unknown::Gain { channel, .. } = unknown {
                 // Without load the gain error is already contained in the offset.
-                let column = 10 * group.links.len() + 6 * place + channel;
+                let column = 10 * group.links.len() + 6 * index + channel;
                 all[(rows + next, column)] = -deviation * unknown.as_offset(&offset, 0.0);
             }
             next += 1;
@@ -339,19 +339,19 @@ fn with_gains(
         calibrated.push((sensor, kind));
         let mut row = all.row_mut(rows + number);
         row.columns_mut(columns + 6 * number, 6).fill(GAIN);
-        for (place, (other, offset)) in group.sensors.iter().zip(group.offsets).enumerate() {
+        for (index, (other, offset)) in group.sensors.iter().zip(group.offsets).enumerate() {
             if *other == sensor {
-                let own = offset.torque_first().map(|channel| GAIN * channel);
-                let first = 10 * group.links.len() + 6 * place;
-                row.columns_mut(first, 6).copy_from_slice(&own);
+                let values = offset.torque_first().map(|channel| GAIN * channel);
+                let first = 10 * group.links.len() + 6 * index;
+                row.columns_mut(first, 6).copy_from_slice(&values);
             }
         }
-        for (place, (&link, body)) in group.links.iter().zip(group.bodies).enumerate() {
+        for (index, (&link, body)) in group.links.iter().zip(group.bodies).enumerate() {
             let subtree = robot.structure.subtree_of(link);
             let subtree = subtree.and_then(|number| robot.structure.subtrees().get(number));
             if subtree.is_some_and(|own| own.sensors.iter().eq([sensor])) {
-                let own = body.parameters().map(|parameter| GAIN * parameter);
-                row.columns_mut(10 * place, 10).copy_from_slice(&own);
+                let values = body.parameters().map(|parameter| GAIN * parameter);
+                row.columns_mut(10 * index, 10).copy_from_slice(&values);
             }
         }
     }

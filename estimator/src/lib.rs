@@ -18,7 +18,7 @@ pub mod offline;
 pub mod parameters;
 pub mod pipeline;
 mod plausible;
-pub mod reading;
+pub mod sample_log;
 #[cfg(test)]
 #[path = "../../tests/schema.rs"]
 mod schema;

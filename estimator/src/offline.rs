@@ -32,7 +32,7 @@
 use crate::assessment::Assessor;
 use crate::drive::DriveRow;
 use crate::pipeline::{Estimate, Pipeline};
-use crate::reading::{ColumnOwner, MissingChannels, check_columns, check_skins, targets};
+use crate::sample_log::{ColumnOwner, MissingChannels, check_columns, check_skins, targets};
 use crate::setup::Setup;
 use proprio_identification::online::Hypothesis;
 use proprio_topics::csv::{Row, Series, SeriesValue, TableReader, TableReport, Value, What};

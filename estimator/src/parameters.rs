@@ -297,11 +297,11 @@ impl Parameters {
         for (number, inertia) in inertias {
             let link = new.links.get_mut(*number);
             let link = link.filter(|link| link.identified.is_none());
-            let wrong = ParametersError::Link {
+            let error = ParametersError::Link {
                 number: *number,
                 count,
             };
-            link.ok_or(wrong)?.identified = Some(inertia.parameters());
+            link.ok_or(error)?.identified = Some(inertia.parameters());
         }
         // In the file links are in the order of the model.
         let mut order: Vec<usize> = (0..inertias.len()).collect();
@@ -416,25 +416,25 @@ impl Parameters {
         &self.sensors
     }
 
-    /// Standard deviation of an offset, by its place in [`Parameters::offsets`].
+    /// Standard deviation of an offset, by its index in [`Parameters::offsets`].
     #[must_use]
-    pub(crate) fn offset_deviation(&self, place: usize) -> Option<Wrench> {
+    pub(crate) fn offset_deviation(&self, index: usize) -> Option<Wrench> {
         let (sensors, _) = self.sensor_deviations.as_chunks();
         sensors
             .get(..self.sensors.len())?
-            .get(place)
+            .get(index)
             .copied()
             .map(Wrench::from_torque_first)
     }
 
-    /// Standard deviations of the identified unknowns of a sensor's calibration, by its place in
+    /// Standard deviations of the identified unknowns of a sensor's calibration, by its index in
     /// [`Parameters::offsets`], in the order of [`Kind::unknowns`].
     #[must_use]
-    pub fn calibration_deviation(&self, place: usize) -> &[f64] {
-        let before = self.sensors.get(..place).map_or(0, calibration_columns);
+    pub fn calibration_deviation(&self, index: usize) -> &[f64] {
+        let before = self.sensors.get(..index).map_or(0, calibration_columns);
         let count = self
             .sensors
-            .get(place..=place)
+            .get(index..=index)
             .map_or(0, calibration_columns);
         let first = 6 * self.sensors.len() + before;
         self.sensor_deviations

@@ -74,10 +74,10 @@ mod drives;
 mod estimate;
 mod identification;
 mod input;
+mod offset_steps;
 mod prediction;
 mod residuals;
 mod solution;
-mod steps;
 mod validity;
 
 pub use estimate::{Counts, Estimate};
@@ -94,6 +94,7 @@ use channels::Inputs;
 use contacts::Contacts;
 use drives::{Drives, Instant};
 use identification::OnlineIdentification;
+use offset_steps::OffsetStepCover;
 use prediction::Predictor;
 use proprio_dynamics::spatial::Wrench;
 use proprio_dynamics::{
@@ -105,7 +106,6 @@ use proprio_identification::robot::ChannelRole;
 use proprio_topics::{DriveEstimate, InertiaEstimate, Nanos, Reason, TorqueBudget};
 use residuals::ResidualMonitor;
 use std::collections::VecDeque;
-use steps::StepCover;
 use validity::Dependences;
 
 /// The estimator's core: no input, no output, no clock.
@@ -139,7 +139,7 @@ pub struct Pipeline {
     /// Tests the F/T residual of each sub-tree.
     residuals: ResidualMonitor,
     /// What else the residuals may be.
-    steps: StepCover,
+    steps: OffsetStepCover,
     /// See [`validity::ValidityCheck`].
     unwatched: Vec<(ContactSet, Reason, u32)>,
     /// Per F/T sensor, since when its zero is another one than that of the offset in use.
@@ -197,7 +197,7 @@ impl Pipeline {
         };
         let mut identification = identification;
         if let Some(identification) = &mut identification {
-            identification.install_initial_covariance(&mut uncertainty.parameters);
+            identification.install_initial_covariance(&mut uncertainty.propagation);
         }
         Self {
             buffers: setup
@@ -224,7 +224,7 @@ impl Pipeline {
             solver: Solver::new(&setup.robot.structure),
             uncertainty: Box::new(uncertainty),
             residuals: ResidualMonitor::new(&setup.robot.structure),
-            steps: StepCover::new(&setup.robot.structure, dofs),
+            steps: OffsetStepCover::new(&setup.robot.structure, dofs),
             unwatched: Vec::with_capacity(setup.robot.structure.subtrees().len()),
             new_zeros: vec![None; setup.robot.structure.sensors().len()],
             dependences: Dependences {
@@ -271,7 +271,7 @@ impl Pipeline {
             state,
             &self.setup,
             &mut self.parameters,
-            &mut self.uncertainty.parameters,
+            &mut self.uncertainty.propagation,
         )
     }
 
@@ -423,7 +423,7 @@ impl Pipeline {
             }
             let touched = self.residuals.touched(&self.structure);
             let (parameters, propagation) =
-                (&mut self.parameters, &mut self.uncertainty.parameters);
+                (&mut self.parameters, &mut self.uncertainty.propagation);
             if identification.apply(&self.setup, parameters, propagation, &touched) {
                 self.residuals.restart_means();
                 for (sensor, since) in self.new_zeros.iter_mut().enumerate() {

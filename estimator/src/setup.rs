@@ -11,7 +11,7 @@ use self::contacts::{contacts, skins, stances, standing};
 use self::names::no_joint;
 pub(crate) use self::names::similar_name;
 use self::sensors::sensors;
-use crate::config::{Base, Config, ForceTorque, STANDARD_GRAVITY};
+use crate::config::{Base, Config, ForceTorque, InvalidConfig, STANDARD_GRAVITY};
 use crate::differentiate::Settings;
 use crate::drive::DriveModel;
 use crate::inertial::InertialState;
@@ -29,6 +29,7 @@ use proprio_identification::robot::{
     BaseMotion, Channel, ChannelRole, IdentificationInput, NamedContact,
 };
 use proprio_topics::{Kind, MAX_JOINTS, Nanos};
+use std::path::Path;
 
 /// Largest number of samples for an estimate of velocity and acceleration. The differentiator keeps
 /// 128; the difference is for samples that come while an instant waits for other channels.
@@ -72,6 +73,27 @@ pub struct Setup {
 }
 
 impl Setup {
+    /// Reads a configuration, applies `adjust` to it, then reads the files that it names (model,
+    /// identified parameters). Logs the warnings.
+    ///
+    /// # Errors
+    /// [`InvalidConfig`].
+    pub fn load(
+        file: &Path,
+        adjust: impl FnOnce(&mut Config),
+    ) -> Result<(Config, Self), InvalidConfig> {
+        let mut config = Config::load(file)?;
+        adjust(&mut config);
+        let setup = Self::new(&config).map_err(|problem| InvalidConfig {
+            file: file.to_owned(),
+            problem,
+        })?;
+        for warning in setup.warnings() {
+            tracing::warn!("{}: {warning}", file.display());
+        }
+        Ok((config, setup))
+    }
+
     /// Reads the model and resolves every name.
     ///
     /// # Errors
@@ -522,9 +544,9 @@ pub(crate) fn gravity_loads(model: &Model) -> Vec<f64> {
         let (mass, moment) = (mass + more, moment + moment_of_more);
         if let Some(load) = joint.dof.and_then(|dof| loads.get_mut(dof)) {
             let is_prismatic = matches!(joint.kind, JointKind::Prismatic(_));
-            let own = STANDARD_GRAVITY * if is_prismatic { mass } else { moment };
+            let effort = STANDARD_GRAVITY * if is_prismatic { mass } else { moment };
             // Joints that follow add what they carry.
-            *load += own * joint.ratio.abs();
+            *load += effort * joint.ratio.abs();
         }
         if let Some((sum, moments)) = beyond.get_mut(joint.parent) {
             *sum += mass;

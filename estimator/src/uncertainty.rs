@@ -18,7 +18,7 @@
 mod motion;
 pub mod propagation;
 
-pub(crate) use motion::Solution;
+pub(crate) use motion::OperatingPoint;
 
 use crate::inertial::InertialState;
 use motion::{MotionErrors, sum_of_squares};
@@ -30,7 +30,7 @@ use proprio_topics::Source;
 /// The standard deviations of the last solution, with all the memory to compute them.
 pub(crate) struct Uncertainty {
     /// Of inertial parameters, offsets, gains and what else is uncertain in an F/T reading.
-    pub(crate) parameters: Propagation,
+    pub(crate) propagation: Propagation,
     motion: MotionErrors,
     places: PlaceErrors,
 }
@@ -46,7 +46,7 @@ impl Uncertainty {
         base_link: usize,
     ) -> Result<Self, DynamicsError> {
         Ok(Self {
-            parameters: Propagation::new(structure, &state.covariance)?,
+            propagation: Propagation::new(structure, &state.covariance)?,
             motion: MotionErrors::new(&state.model, structure, base_link)?,
             places: PlaceErrors::new(structure),
         })
@@ -70,18 +70,18 @@ impl Uncertainty {
     /// Sizes differ, or a number is not finite.
     pub(crate) fn update(
         &mut self,
-        solution: &Solution<'_>,
+        point: &OperatingPoint<'_>,
         place_std: impl Fn(usize) -> PlaceStd,
     ) -> Result<(), DynamicsError> {
-        let Solution {
+        let OperatingPoint {
             t,
             structure,
             solver,
             kinematics,
             ..
-        } = *solution;
-        self.parameters.update(structure, solver, kinematics, t)?;
-        self.motion.update(solution)?;
+        } = *point;
+        self.propagation.update(structure, solver, kinematics, t)?;
+        self.motion.update(point)?;
         self.places.update(structure, solver, kinematics, place_std)
     }
 
@@ -89,7 +89,7 @@ impl Uncertainty {
     pub(crate) fn torque_variance(&self, solver: &Solver, dof: usize) -> f64 {
         let independent = [
             solver.torque_deviation(),
-            self.parameters.torque_std(),
+            self.propagation.torque_std(),
             self.motion.torque_std(),
             self.places.torque_std(),
         ];
@@ -106,7 +106,7 @@ impl Uncertainty {
         let noise = solver.contacts().get(contact).map(|own| own.deviation);
         let independent = [
             noise,
-            self.parameters.contact_std().get(contact).copied(),
+            self.propagation.contact_std().get(contact).copied(),
             self.motion.contact_std(contact),
             self.places.contact_std().get(contact).copied(),
         ];
@@ -117,7 +117,7 @@ impl Uncertainty {
     /// The covariance of a sub-tree's imbalance without F/T noise [torque; force], at the origin of
     /// base coordinates [Nm, N].
     pub(crate) fn imbalance_covariance(&self, subtree: usize) -> Option<Matrix6<f64>> {
-        let parameters = self.parameters.imbalance_covariances().get(subtree)?;
+        let parameters = self.propagation.imbalance_covariances().get(subtree)?;
         let places = self.places.imbalance_covariances().get(subtree)?;
         Some(parameters + places + self.motion.imbalance_covariance(subtree))
     }
@@ -134,7 +134,7 @@ impl Uncertainty {
         mut share: impl FnMut(Source, usize, f64),
     ) {
         let solution = (solver, kinematics);
-        self.parameters
+        self.propagation
             .torque_shares(structure, solution, dof, &mut share);
         self.motion.torque_shares(dof, &mut share);
         for at in place_std.enumerate() {

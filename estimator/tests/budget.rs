@@ -54,15 +54,16 @@ fn last(change: &Change<'_>) -> (Vec<f64>, Vec<TorqueBudget>) {
     }
     for (number, row) in rows.iter().enumerate() {
         for item in &row.items {
-            let of = &series[item.series];
-            let (What::Channel(kind), Value::Reading(mut reading, quality)) = (of.what, item.value)
+            let series = &series[item.series];
+            let (What::Channel(kind), Value::Reading(mut reading, quality)) =
+                (series.what, item.value)
             else {
                 continue;
             };
             if let Some(change) = change.reading {
-                change(&of.name, number + 1 == rows.len(), &mut reading);
+                change(&series.name, number + 1 == rows.len(), &mut reading);
             }
-            if let Some(channel) = pipeline.setup().robot.channel(kind, &of.name) {
+            if let Some(channel) = pipeline.setup().robot.channel(kind, &series.name) {
                 pipeline.push(channel, row.t.unwrap(), &reading, quality);
             }
         }
@@ -92,12 +93,12 @@ fn squares(errors: impl Iterator<Item = Vec<f64>>, stated: &[f64]) -> Vec<f64> {
 }
 
 fn share(budget: &TorqueBudget, source: Source, name: &str) -> f64 {
-    let own =
+    let is_it =
         |part: &&proprio_topics::BudgetPart| part.source == source && part.name.as_str() == name;
     budget
         .parts()
         .iter()
-        .find(own)
+        .find(is_it)
         .map_or(0.0, |part| part.variance)
 }
 

@@ -265,13 +265,13 @@ fn what_will_be_withheld_is_told_with_its_cause() {
             .map(|(why, _)| why)
             .collect::<Vec<_>>()
     };
-    let told = whys(&bound("0.15")).join("; ");
+    let why = whys(&bound("0.15")).join("; ");
     assert!(
-        told.contains("known to 20.0 % only (identification.urdf_relative_std)"),
-        "{told}"
+        why.contains("known to 20.0 % only (identification.urdf_relative_std)"),
+        "{why}"
     );
-    let told = whys(&bound("1e-5")).join("; ");
-    assert!(told.contains("because of the noise"), "{told}");
+    let why = whys(&bound("1e-5")).join("; ");
+    assert!(why.contains("because of the noise"), "{why}");
 
     // On-line identification does not use the offsets that are stated.
     let identifies = (
@@ -295,12 +295,12 @@ fn what_will_be_withheld_is_told_with_its_cause() {
     // What hides a torque at any time is withheld for that reason.
     let both = format!("{hand}[[contact]]\nlink = \"arm\"\n");
     let hidden = setup_with(&both, 50.0, "", &[known]);
-    let told = reasons(&hidden);
-    let (_, names) = told
+    let groups = reasons(&hidden);
+    let (_, names) = groups
         .iter()
         .find(|(why, _)| why.starts_with("undetermined"))
         .expect("it");
-    assert!(names.contains(&"wrist".to_owned()), "{told:?}");
+    assert!(names.contains(&"wrist".to_owned()), "{groups:?}");
 }
 
 /// A chain of `moving` joints, of which the last `locked` are locked.
@@ -462,7 +462,7 @@ fn a_name_above_the_robot_is_told_as_such() {
     let free = "<link name=\"world\"/><joint name=\"free\" type=\"floating\">\
                 <parent link=\"world\"/><child link=\"base\"/></joint></robot>";
     let urdf = GRIPPER.replace("</robot>", free);
-    let told = |name: &str| {
+    let warning = |name: &str| {
         format!(
             "\"{name}\" is above the robot, which floats in the URDF, and is dropped; the root is \
              the link \"base\""
@@ -476,7 +476,7 @@ fn a_name_above_the_robot_is_told_as_such() {
         ("[locked]\nfree = 0.0\n", "locked.free: ", "free"),
     ] {
         let (_folder, setup) = files(urdf.as_bytes(), more);
-        assert_eq!(setup.unwrap_err(), place.to_owned() + &told(name));
+        assert_eq!(setup.unwrap_err(), place.to_owned() + &warning(name));
     }
     assert!(files(urdf.as_bytes(), "").1.is_ok());
     // Of a joint that is not there at all, the configuration's key is told.
@@ -613,7 +613,7 @@ fn a_sensor_is_the_one_of_its_name_in_its_joint() {
             .replace("<mimic", "<ignored")
             .replace("</robot>", &elements)
     };
-    let of = |urdf: &str, name: &str, keys: &str| {
+    let fz = |urdf: &str, name: &str, keys: &str| {
         let ft = format!("[[force_torque]]\nsensor = \"{name}\"\njoint = \"j2\"\n{keys}");
         let (_folder, setup) = files(urdf.as_bytes(), &ft);
         setup.map(|setup| checked(&setup).sensors[0].reading.force_first()[2])
@@ -622,21 +622,21 @@ fn a_sensor_is_the_one_of_its_name_in_its_joint() {
         element("u", "child_to_parent"),
         element("w", "parent_to_child"),
     ]);
-    let (u, w) = (of(&two, "u", "").unwrap(), of(&two, "w", "").unwrap());
+    let (u, w) = (fz(&two, "u", "").unwrap(), fz(&two, "w", "").unwrap());
     assert!(u < -4.0 && (u + w).abs() < 1e-9, "{u} {w}");
-    let error = of(&two, "v", "").unwrap_err();
+    let error = fz(&two, "v", "").unwrap_err();
     assert!(
         error.contains("\"v\": the URDF has several sensors in joint j2, none of this name: u, w"),
         "{error}"
     );
     let one = robot(&[element("u", "parent_to_child")]);
-    assert_eq!(of(&one, "v", ""), Ok(w));
+    assert_eq!(fz(&one, "v", ""), Ok(w));
     let misspelt = robot(&[element("u", "parenttochild")]);
-    let error = of(&misspelt, "u", "").unwrap_err();
+    let error = fz(&misspelt, "u", "").unwrap_err();
     assert!(
         error.contains("its direction is parenttochild") && error.contains("line 1: F/T sensor"),
         "{error}"
     );
     let given = "frame = \"child\"\ndirection = \"parent_to_child\"\n";
-    assert_eq!(of(&misspelt, "u", given), Ok(w));
+    assert_eq!(fz(&misspelt, "u", given), Ok(w));
 }

@@ -377,7 +377,7 @@ fn a_replay_with_a_skin_gives_the_live_estimates() {
 
 /// All numbers of all estimates.
 fn bits(estimates: &[Estimate]) -> Vec<Vec<u64>> {
-    let of = |estimate: &Estimate| {
+    let bits = |estimate: &Estimate| {
         let contacts = estimate.contacts.contacts().iter().flat_map(|c| {
             let numbers = c
                 .force
@@ -403,7 +403,7 @@ fn bits(estimates: &[Estimate]) -> Vec<Vec<u64>> {
         });
         contacts.chain(joints).collect()
     };
-    estimates.iter().map(of).collect()
+    estimates.iter().map(bits).collect()
 }
 
 /// A recording holds all that the estimates rest on: the table of samples, skins and declared
@@ -457,12 +457,12 @@ fn a_table_gives_the_live_estimates() {
     let mut out = Vec::new();
     let report = offline::estimate(setup.clone(), text.as_slice(), &mut out, None).unwrap();
     assert_eq!((report.log.bad_rows, report.unused_channels.len()), (0, 0));
-    let mut own = offline::EstimateTable::new(Vec::new(), &setup).unwrap();
+    let mut table = offline::EstimateTable::new(Vec::new(), &setup).unwrap();
     for estimate in &live {
-        own.write(estimate, None, true).unwrap();
+        table.write(estimate, None, true).unwrap();
     }
-    let own = own.into_inner();
-    assert!(own.len() > 10_000 && own == out, "the tables differ");
+    let table = table.into_inner();
+    assert!(table.len() > 10_000 && table == out, "the tables differ");
     // The hand's place is in it, and moves.
     let place = |ms: i64| at(&live, ms).contacts.contacts()[hand].position[1];
     assert!(
@@ -495,7 +495,7 @@ fn a_declared_place_is_as_good_as_a_configured_one() {
     };
     let all: Vec<Event> = events(&near, &push, 0);
     let forearm = near.robot.contact("forearm").unwrap();
-    let told = |state: ContactState| {
+    let declare = |state: ContactState| {
         move |pipeline: &mut Pipeline, t: Nanos| {
             if t == Nanos::ZERO {
                 pipeline.declare(forearm, t, &state);
@@ -507,8 +507,8 @@ fn a_declared_place_is_as_good_as_a_configured_one() {
         direction: along,
         ..ContactState::configured(true)
     };
-    let (expected, _) = run_with(near.clone(), &all, told(ContactState::configured(true)));
-    let (found, _) = run_with(far.clone(), &all, told(placed));
+    let (expected, _) = run_with(near.clone(), &all, declare(ContactState::configured(true)));
+    let (found, _) = run_with(far.clone(), &all, declare(placed));
     for (a, b) in expected.iter().zip(&found) {
         assert_eq!(a.torques.joints(), b.torques.joints());
         let (a, b) = (
@@ -524,7 +524,7 @@ fn a_declared_place_is_as_good_as_a_configured_one() {
         position_std: 0.01,
         ..placed
     };
-    let (less, _) = run_with(far.clone(), &all, told(uncertain));
+    let (less, _) = run_with(far.clone(), &all, declare(uncertain));
     let std = |e: &[Estimate]| at(e, 2000).contacts.contacts()[forearm].standard_deviation[5];
     assert!(
         std(&less) > 1.5 * std(&found),
@@ -543,7 +543,7 @@ fn a_declared_place_is_as_good_as_a_configured_one() {
             position_std,
             ..beside
         };
-        let (found, _) = run_with(far.clone(), &all, told(state));
+        let (found, _) = run_with(far.clone(), &all, declare(state));
         // Another contact must then be there, too, and which does what is not determined.
         let contacts = at(&found, 2000).contacts.contacts().to_vec();
         (contacts[hand].detected, contacts[forearm].valid)
@@ -560,7 +560,7 @@ fn a_declared_place_is_as_good_as_a_configured_one() {
         let is_before = t < Nanos::from_millis(2040);
         pipeline.declare(forearm, t, if is_before { &placed } else { &other });
     });
-    let [here, there] = [placed, other].map(|state| run_with(far.clone(), &calm, told(state)).0);
+    let [here, there] = [placed, other].map(|state| run_with(far.clone(), &calm, declare(state)).0);
     let stds = |e: &[Estimate]| at(e, 2050).contacts.contacts()[forearm].standard_deviation;
     assert_ne!(stds(&here), stds(&there));
     assert_eq!(stds(&jumped), stds(&there));
@@ -583,7 +583,7 @@ fn a_declared_place_is_as_good_as_a_configured_one() {
             ..placed
         },
     ] {
-        let (found, pipeline) = run_with(far.clone(), &all, told(wrong));
+        let (found, pipeline) = run_with(far.clone(), &all, declare(wrong));
         let contact = &at(&found, 2000).contacts.contacts()[forearm];
         assert_eq!(
             (contact.located, pipeline.counts().not_finite),
@@ -787,9 +787,9 @@ fn the_plan_states_what_a_skin_shows() {
     let setup = setup(&config(ContactModel::Force));
     let plan = setup.to_string();
     // 6 mm / sqrt(12); 3.65 standard deviations of 1 count.
-    let told = "reads skin l_forearm_skin: 160 taxels, pressed above 3.6; touches of forearm \
+    let line = "reads skin l_forearm_skin: 160 taxels, pressed above 3.6; touches of forearm \
                 within 1.7 mm";
-    assert!(plan.contains(told), "{plan}");
+    assert!(plan.contains(line), "{plan}");
     let description = setup.description();
     let index = description
         .index(proprio_topics::Role::Channel, "l_forearm_skin")

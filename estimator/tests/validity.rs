@@ -232,12 +232,12 @@ fn a_contact_that_nothing_would_show_is_not_assumed_absent() {
         let mut last = None;
         for instant in 0..60 {
             for number in 0..setup.robot.channels.len() {
-                let own = match number == ft {
+                let quality = match number == ft {
                     true => Quality::DEVICE_FAULT,
                     false => Quality::GOOD,
                 };
                 let t = Nanos(PERIOD * instant);
-                pipeline.push(number, t, &reading(&setup, number), own);
+                pipeline.push(number, t, &reading(&setup, number), quality);
             }
             while let Some(estimate) = pipeline.poll() {
                 last = Some(estimate.clone());
@@ -299,7 +299,7 @@ fn a_joint_that_stands_is_not_frozen() {
     let sensor = setup.robot.channel(Kind::Wrench, "l_arm_ft_sensor");
     let deviates = normals(300);
     let count = std::f64::consts::TAU / 65536.0;
-    let of = |noisy: usize| {
+    let reasons = |noisy: usize| {
         let found = estimates(&setup, 400, |instant, channel, reading| {
             let jitter = deviates
                 .get(instant)
@@ -328,8 +328,12 @@ fn a_joint_that_stands_is_not_frozen() {
         let reasons = last.torques.joints().iter().map(|joint| joint.reason.get());
         reasons.collect::<Vec<_>>()
     };
-    assert!(of(joint).iter().all(|reason| *reason == Some(Reason::None)));
-    let frozen = of(sensor.unwrap());
+    assert!(
+        reasons(joint)
+            .iter()
+            .all(|reason| *reason == Some(Reason::None))
+    );
+    let frozen = reasons(sensor.unwrap());
     assert!(
         frozen.iter().all(|reason| *reason == Some(Reason::Frozen)),
         "{frozen:?}"
@@ -348,11 +352,11 @@ fn what_two_unknown_contacts_leave_open_is_undetermined() {
         second.presence = Occurrence::Always;
         config.contact.push(second);
     });
-    let of = |setup: &Setup| {
+    let last = |setup: &Setup| {
         let found = estimates(setup, 40, |_, _, _| Quality::GOOD);
         found.last().unwrap().clone()
     };
-    let (one, two) = (of(&one), of(&two));
+    let (one, two) = (last(&one), last(&two));
     assert!(one.torques.joints().iter().all(|joint| joint.valid == 1));
     let open = |reason: Code<Reason>, valid: u32| reason == Reason::Undetermined && valid == 0;
     let contacts = two.contacts.contacts().iter();

@@ -118,13 +118,13 @@ unsafe fn text(pointer: *const c_char) -> Option<String> {
 /// `to` is null or has room for `size` bytes.
 unsafe fn put_at(text: &str, to: *mut c_char, size: usize) {
     if !to.is_null() {
-        let mut own = [0; 512];
-        let size = size.min(own.len());
-        if let Some(part) = own.get_mut(..size) {
+        let mut buffer = [0; 512];
+        let size = size.min(buffer.len());
+        if let Some(part) = buffer.get_mut(..size) {
             put(text, part);
         }
-        // SAFETY: the caller's promise; `own` has as many.
-        unsafe { to.copy_from_nonoverlapping(own.as_ptr(), size) };
+        // SAFETY: the caller's promise; `buffer` has as many.
+        unsafe { to.copy_from_nonoverlapping(buffer.as_ptr(), size) };
     }
 }
 
@@ -137,14 +137,14 @@ unsafe fn give<T>(value: T, to: *mut T) {
     unsafe { give_at(value, to, 0) };
 }
 
-/// Writes `value` to the element `place` of an array of C, if it wants one.
+/// Writes `value` to the element `index` of an array of C, if it wants one.
 ///
 /// # Safety
 /// `to` is null or has this element.
-unsafe fn give_at<T>(value: T, to: *mut T, place: usize) {
+unsafe fn give_at<T>(value: T, to: *mut T, index: usize) {
     if !to.is_null() {
         // SAFETY: the caller's promise.
-        unsafe { to.wrapping_add(place).write(value) };
+        unsafe { to.wrapping_add(index).write(value) };
     }
 }
 
@@ -193,12 +193,12 @@ fn handle<H: Copy>(handles: &[H], number: u32) -> Result<H, Unavailable> {
 
 /// The number of `handle` in `handles`, where it is put if it is new.
 fn number<H: PartialEq>(handles: &mut Vec<H>, handle: H) -> u32 {
-    let place = handles.iter().position(|known| *known == handle);
-    let place = place.unwrap_or_else(|| {
+    let index = handles.iter().position(|known| *known == handle);
+    let index = index.unwrap_or_else(|| {
         handles.push(handle);
         handles.len() - 1
     });
-    u32::try_from(place).unwrap_or(u32::MAX)
+    u32::try_from(index).unwrap_or(u32::MAX)
 }
 
 /// The number of the handle that `handle` makes of a name of C; one that no handle has, if there is
@@ -436,13 +436,13 @@ pub unsafe extern "C" fn proprio_read_torques(
     acquired: *mut i64,
 ) -> usize {
     let (mut available, mut instant) = (0, 0);
-    for place in 0..count {
+    for index in 0..count {
         let mut found = proprio_torque::from(Err(()));
         let mut status = PROPRIO_UNKNOWN;
         if !joints.is_null() {
             // SAFETY: the caller's promise.
             unsafe {
-                let joint = *joints.wrapping_add(place);
+                let joint = *joints.wrapping_add(index);
                 status = proprio_read_torque(reader, joint, &raw mut found, std::ptr::null_mut());
             }
         }
@@ -451,9 +451,9 @@ pub unsafe extern "C" fn proprio_read_torques(
         }
         // SAFETY: the caller's promise.
         unsafe {
-            give_at(found.torque, torques, place);
-            give_at(found.standard_deviation, standard_deviations, place);
-            give_at(status, statuses, place);
+            give_at(found.torque, torques, index);
+            give_at(found.standard_deviation, standard_deviations, index);
+            give_at(status, statuses, index);
         }
     }
     // SAFETY: the caller's promise.

@@ -9,7 +9,7 @@
 use proprio_drivers::Frame;
 use proprio_gateway::bus::Bus;
 use proprio_gateway::clock::Monotonic;
-use proprio_gateway::decoder::Decoder;
+use proprio_gateway::devices::BusDevices;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, Received, send_by};
 use proprio_gateway::log;
@@ -141,16 +141,16 @@ fn main() {
             threads.push(thread::spawn(move || {
                 let plan = plan(bus);
                 let status = Arc::new(BusStatus::new(0, &plan.buses[0]));
-                let decoder = Decoder::new(0, &plan.buses[0], None, Arc::clone(&status));
-                let decoder = decoder.expect("devices");
+                let devices = BusDevices::new(0, &plan.buses[0], None, Arc::clone(&status));
+                let devices = devices.expect("devices");
                 let robot = if kind == "bare" { "bare" } else { "proprio" };
                 let mut writer =
                     Writer::<Sample>::create(&domain, robot, domain.epoch()).expect("a port");
-                let link = VirtualBus::open(&link_domain, bus, &decoder.claims()).expect("a bus");
+                let link = VirtualBus::open(&link_domain, bus, &devices.claims()).expect("a bus");
                 if kind == "proprio" {
                     let mut bus = Bus::new(
                         Box::new(link),
-                        decoder,
+                        devices,
                         SharedMemory::new(writer, "robot", Arc::default()),
                         status,
                     );

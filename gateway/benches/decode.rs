@@ -7,7 +7,7 @@
 use divan::Bencher;
 use divan::counter::ItemsCount;
 use proprio_drivers::{Board, DRIVERS, Decoded, Device, Frame, Frames, Mode};
-use proprio_gateway::decoder::build;
+use proprio_gateway::devices::build;
 use proprio_gateway::plan::{DevicePlan, Plan};
 use proprio_topics::{
     Gauges, Imu, JointState, Kind, Nanos, Quality, Reading, Skin, StampKind, Temperature, Wrench,

@@ -9,7 +9,7 @@ use divan::counter::ItemsCount;
 use proprio_drivers::Frame;
 use proprio_gateway::bus::{Bus, Turn};
 use proprio_gateway::clock::{Clock, Monotonic};
-use proprio_gateway::decoder::Decoder;
+use proprio_gateway::devices::BusDevices;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, LinkCounters, Received, TransmitError, send_by};
 use proprio_gateway::log;
@@ -183,13 +183,13 @@ fn frames_to_shared_memory(bencher: Bencher<'_, '_>) {
     let name = format!("bench{}", std::process::id());
     let plan = plan();
     let status = Arc::new(BusStatus::new(0, &plan.buses[0]));
-    let decoder = Decoder::new(0, &plan.buses[0], None, Arc::clone(&status)).unwrap();
+    let devices = BusDevices::new(0, &plan.buses[0], None, Arc::clone(&status)).unwrap();
     let writer = Writer::<Sample>::create(&domain, "bench", domain.epoch()).unwrap();
     let mut sender = VirtualBus::open(&name, "arm", &[]).unwrap();
-    let link = Waiting(VirtualBus::open(&name, "arm", &decoder.claims()).unwrap());
+    let link = Waiting(VirtualBus::open(&name, "arm", &devices.claims()).unwrap());
     let bus = std::cell::RefCell::new(Bus::new(
         Box::new(link),
-        decoder,
+        devices,
         SharedMemory::new(writer, "robot", Arc::default()),
         status,
     ));

@@ -20,7 +20,7 @@
 //! devices do not notice. Replies go back by the inbox too, with what was replaced.
 
 use crate::clock::Clock;
-use crate::decoder::Decoder;
+use crate::devices::BusDevices;
 use crate::inbox::Inbox;
 use crate::link::error_frame::ErrorFrame;
 use crate::link::{Link, Received, TransmitError};
@@ -50,7 +50,7 @@ pub const RETRY: Nanos = Nanos::from_millis(1);
 /// A running bus.
 pub struct Bus<S> {
     link: Box<dyn Link>,
-    decoder: Decoder,
+    devices: BusDevices,
     sink: S,
     status: Arc<BusStatus>,
     link_was_up: bool,
@@ -85,11 +85,11 @@ struct QueuedFrame {
 
 impl<S: Sink> Bus<S> {
     /// Combines link, devices and sink.
-    pub fn new(link: Box<dyn Link>, decoder: Decoder, sink: S, status: Arc<BusStatus>) -> Self {
+    pub fn new(link: Box<dyn Link>, devices: BusDevices, sink: S, status: Arc<BusStatus>) -> Self {
         let link_was_up = link.state() == LinkState::Up;
         Self {
             link,
-            decoder,
+            devices,
             sink,
             status,
             link_was_up,
@@ -118,7 +118,7 @@ impl<S: Sink> Bus<S> {
         let mut deadline = now + MAX_TURN;
         if self.link_was_up {
             self.send(now, clock);
-            let wake = self.decoder.next_wake().unwrap_or(Nanos::MAX);
+            let wake = self.devices.next_wake().unwrap_or(Nanos::MAX);
             deadline = deadline.min(wake);
             if !self.queue.waiting.is_empty() {
                 deadline = deadline.min(self.queue.retry);
@@ -128,7 +128,7 @@ impl<S: Sink> Bus<S> {
             Received::Frame(frame) => {
                 self.advance(frame.t, clock);
                 let (sink, status) = (&mut self.sink, &self.status);
-                self.decoder
+                self.devices
                     .on_frame(&frame, |sample| match sink.publish(sample, clock.now()) {
                         Ok(connections) => {
                             status.published.fetch_add(1, Relaxed);
@@ -175,18 +175,18 @@ impl<S: Sink> Bus<S> {
         }
         self.link_was_up = up;
         self.give_up();
-        self.decoder.restart(now);
+        self.devices.restart(now);
     }
 
     /// Takes requests from the inbox, and replies to those that have ended.
     fn serve(&mut self, now: Nanos) {
         let Some(inbox) = &mut self.inbox else { return };
         while let Some((device, request)) = inbox.take() {
-            if let Some(reply) = self.decoder.request(device, request, now) {
+            if let Some(reply) = self.devices.request(device, request, now) {
                 inbox.reply(device, reply);
             }
         }
-        self.decoder
+        self.devices
             .settle(self.link_was_up, |device, reply| inbox.reply(device, reply));
     }
 
@@ -197,7 +197,7 @@ impl<S: Sink> Bus<S> {
             return;
         }
         let (queue, status) = (&mut self.queue, &self.status);
-        self.decoder
+        self.devices
             .poll_transmit(then, |device, Transmit { frame, deadline }| {
                 // A device that lives in the past has as much time as it would have had then.
                 let behind = (clock.now() - then).max(Nanos::ZERO);
@@ -217,7 +217,7 @@ impl<S: Sink> Bus<S> {
                 }
             });
         for QueuedFrame { device, frame, .. } in queue.refused.drain(..) {
-            self.decoder.on_sent(device, &frame, Err(NotSent::Deadline));
+            self.devices.on_sent(device, &frame, Err(NotSent::Deadline));
         }
     }
 
@@ -226,12 +226,12 @@ impl<S: Sink> Bus<S> {
         if self.queue.waiting.is_empty() {
             return;
         }
-        let (decoder, status) = (&mut self.decoder, &self.status);
+        let (devices, status) = (&mut self.devices, &self.status);
         self.queue.waiting.retain(|waiting| {
             let in_time = now <= waiting.deadline;
             if !in_time {
                 status.send_failures.fetch_add(1, Relaxed);
-                decoder.on_sent(waiting.device, &waiting.frame, Err(NotSent::Deadline));
+                devices.on_sent(waiting.device, &waiting.frame, Err(NotSent::Deadline));
             }
             in_time
         });
@@ -263,7 +263,7 @@ impl<S: Sink> Bus<S> {
             };
             let (device, frame) = (waiting.device, waiting.frame);
             self.queue.waiting.pop_front();
-            self.decoder.on_sent(device, &frame, outcome);
+            self.devices.on_sent(device, &frame, outcome);
         }
     }
 
@@ -271,7 +271,7 @@ impl<S: Sink> Bus<S> {
     fn give_up(&mut self) {
         while let Some(QueuedFrame { device, frame, .. }) = self.queue.waiting.pop_front() {
             self.status.send_failures.fetch_add(1, Relaxed);
-            self.decoder.on_sent(device, &frame, Err(NotSent::LinkLost));
+            self.devices.on_sent(device, &frame, Err(NotSent::LinkLost));
         }
         self.queue.retry = Nanos::MIN;
     }
@@ -281,9 +281,9 @@ impl<S: Sink> Bus<S> {
         let now = clock.now();
         // A device that took over now would start its board again.
         self.inbox = None;
-        self.decoder.stop(now);
+        self.devices.stop(now);
         let end = now + STOP_TIME;
-        while !(self.decoder.stopped() && self.queue.waiting.is_empty())
+        while !(self.devices.stopped() && self.queue.waiting.is_empty())
             && clock.now() < end
             && self.link.state() == LinkState::Up
         {

@@ -489,8 +489,8 @@ mod tests {
             ),
         ] {
             let messages = messages(&format!("{text}\n{RIGHT}"));
-            let wrong = &messages[0];
-            let problem = wrong.id.as_ref().err().or(wrong
+            let message = &messages[0];
+            let problem = message.id.as_ref().err().or(message
                 .signals
                 .first()
                 .and_then(|signal| signal.bits.as_ref().err()));
@@ -540,18 +540,18 @@ mod tests {
             let messages = messages(&text.replace("BO_", message));
             format!("{:?}", messages[0].signals[0])
         };
-        let own = float("BO_\nSIG_VALTYPE_ 1 S : 1;\n");
-        assert_ne!(own, float("BO_\n"));
+        let expected = float("BO_\nSIG_VALTYPE_ 1 S : 1;\n");
+        assert_ne!(expected, float("BO_\n"));
         for text in [
             "BO_\nCM_ BO_ 1 \"text\"\n;\nSIG_VALTYPE_ 1 S : 1;\n",
             "CM_ \"text\" \r\n ;\r\nBO_\nSIG_VALTYPE_ 1 S : 1;\n",
             "BO_\nBA_DEF_ BO_ \"x\" INT 0 1; SIG_VALTYPE_ 1 S : 1;\n",
             "// made \"by hand; SIG_VALTYPE_ 2\nBO_ // \"\nSIG_VALTYPE_ 1 S : 1; // \"\n",
         ] {
-            assert_eq!(float(text), own, "{text}");
+            assert_eq!(float(text), expected, "{text}");
         }
         let old = float(&"BO_\nSIG_VALTYPE_ 1 S : 1;\n".replace('\n', "\r"));
-        assert_eq!(old, own);
+        assert_eq!(old, expected);
     }
 
     /// As cantools reads them.

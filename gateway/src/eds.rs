@@ -125,9 +125,9 @@ fn parse(text: &str) -> Result<Objects, String> {
     if objects.entries.is_empty() && objects.unreadable.is_empty() {
         return Err("has no objects: it is no EDS or DCF file".into());
     }
-    let of = |name: &str, key| sections.get(name).and_then(|section| number(section, key));
-    if of("deviceinfo", "compactpdo").is_some_and(|mask| mask != 0) {
-        let count = of("deviceinfo", "nroftxpdo").map_or(0, |count| count.min(4));
+    let value = |name: &str, key| sections.get(name).and_then(|section| number(section, key));
+    if value("deviceinfo", "compactpdo").is_some_and(|mask| mask != 0) {
+        let count = value("deviceinfo", "nroftxpdo").map_or(0, |count| count.min(4));
         for at in 0..count {
             #[allow(clippy::cast_possible_truncation)] // below 4
             let index = 0x1800 + at as u16;
@@ -139,11 +139,12 @@ fn parse(text: &str) -> Result<Objects, String> {
         }
     }
     // With one m in the standard.
-    let commissioning = |key| of("devicecomissioning", key).or(of("devicecommissioning", key));
+    let commissioning =
+        |key| value("devicecomissioning", key).or(value("devicecommissioning", key));
     let node = commissioning("nodeid").filter(|node| *node != 0);
     objects.node = node.map(|node| u8::try_from(node).unwrap_or(u8::MAX));
     objects.bit_rate = commissioning("baudrate").map(|kbit| kbit.saturating_mul(1000));
-    objects.vendor = of("deviceinfo", "vendornumber").filter(|vendor| *vendor != 0);
+    objects.vendor = value("deviceinfo", "vendornumber").filter(|vendor| *vendor != 0);
     Ok(objects)
 }
 

@@ -236,15 +236,15 @@ impl HealthLog {
             log_load(bus, &mut runs.full);
             log_blocked(bus, before, &mut runs.blocked);
             // One frame may report several causes: it is told once.
-            let mut told: Vec<ErrorFrame> = Vec::new();
+            let mut reported: Vec<ErrorFrame> = Vec::new();
             for (cause, run) in BusError::ALL.into_iter().zip(&mut runs.errors) {
-                let of = |b: &BusHealth| b.errors.get(cause as usize).copied();
-                let count = of(bus).unwrap_or(0);
-                if run.begins(increase(count, before.and_then(of)) > 0)
+                let total = |b: &BusHealth| b.errors.get(cause as usize).copied();
+                let count = total(bus).unwrap_or(0);
+                if run.begins(increase(count, before.and_then(total)) > 0)
                     && let Some(frame) = statuses.get(i).and_then(|s| s.newest_error(cause))
-                    && !told.contains(&frame)
+                    && !reported.contains(&frame)
                 {
-                    told.push(frame);
+                    reported.push(frame);
                     tracing::warn!(
                         bus = name,
                         "error frame: {frame} (further ones are only counted, in health)"
@@ -280,17 +280,17 @@ impl HealthLog {
                 use Counter::{Frames, Frozen, OutOfRange, Readings, Starts};
                 !matches!(c, Frames | Frozen | OutOfRange | Readings | Starts)
             }) {
-                let of = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
-                let count = of(device).unwrap_or(0);
-                let new = increase(count, before.and_then(of));
+                let total = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
+                let count = total(device).unwrap_or(0);
+                let new = increase(count, before.and_then(total));
                 // Who joins a stream hears parts of groups that began before.
                 let joins = before.is_none_or(|b| b.state != DeviceState::Streaming);
                 if joins && counter == Counter::Unpaired {
                     continue;
                 }
                 // A silence that goes on has been told by the state.
-                let told = counter == Counter::Silences && device.state == DeviceState::Silent;
-                if run.begins(new > 0) && !told {
+                let is_told = counter == Counter::Silences && device.state == DeviceState::Silent;
+                if run.begins(new > 0) && !is_told {
                     tracing::warn!(
                         device = name,
                         total = count,
@@ -367,8 +367,8 @@ fn log_doubts(device: &DeviceHealth, before: Option<&DeviceHealth>, runs: &mut D
         ),
     ];
     for ((counter, mask, what), doubted) in doubts.into_iter().zip(&mut runs.doubted) {
-        let of = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
-        let new = increase(of(device).unwrap_or(0), before.and_then(of));
+        let total = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
+        let new = increase(total(device).unwrap_or(0), before.and_then(total));
         let Some(run) = runs.faults.get_mut(counter as usize) else {
             continue;
         };
@@ -767,8 +767,8 @@ mod tests {
             "{lines:?}"
         );
         for (line, seconds) in lines.iter().skip(1).zip([60, 120, 240, 480]) {
-            let told = format!("WARN still refused for {seconds} s: it reports");
-            assert!(line.starts_with(&told), "{line}, not {told}");
+            let expected = format!("WARN still refused for {seconds} s: it reports");
+            assert!(line.starts_with(&expected), "{line}, not {expected}");
         }
     }
 

@@ -12,7 +12,7 @@
 //! - The motors of a coupling together give the states of its joints (`coupling`, `matrix`), which
 //!   are an input of the joints' shafts.
 //! - What belongs to a motor and not to a joint, its current and its drive's state, is found at the
-//!   joint of the same place in the coupling's list.
+//!   joint of the same index in the coupling's list.
 //!
 //! Three nouns: an *output* of a device is an *input* of a shaft ([`ShaftInput`]), and so is what a
 //! *coupling* makes of its motors. [`JointsPlan`] says which leads where; `Joints` does it while
@@ -34,7 +34,7 @@ pub use wrap::Wrap;
 
 use crate::config::JointQuantity;
 use coupling::CoupledMotors;
-use proprio_drivers::Output;
+use proprio_drivers::StampedReading;
 use proprio_topics::{JointState, Nanos, Quality};
 use shaft::{RunningInput, Shaft};
 
@@ -43,8 +43,8 @@ use shaft::{RunningInput, Shaft};
 pub struct ShaftInput {
     /// The number of the shaft in [`JointsPlan::shafts`].
     pub shaft: usize,
-    /// Its place among the shaft's inputs.
-    pub place: usize,
+    /// Its index among the shaft's inputs.
+    pub index: usize,
     /// The range of the device's angle, if its turns are to be counted.
     pub wrap: Option<Wrap>,
 }
@@ -83,7 +83,7 @@ impl ShaftPlan {
 pub enum ShaftRole {
     /// A joint: to the channel of this number.
     Joint(u32),
-    /// A motor of the coupling of this number, at this place among its motors.
+    /// A motor of the coupling of this number, at this index among its motors.
     Motor(usize, usize),
 }
 
@@ -130,7 +130,7 @@ impl JointsPlan {
     /// What an input is.
     #[must_use]
     pub fn input(&self, at: &ShaftInput) -> Option<&InputPlan> {
-        self.shafts.get(at.shaft)?.inputs.get(at.place)
+        self.shafts.get(at.shaft)?.inputs.get(at.index)
     }
 
     /// Whether a reading at this input can complete a sample: it gives a position that the channel
@@ -160,10 +160,10 @@ impl JointsPlan {
         };
         let (channels, motor) = match self.shafts.get(at.shaft)?.role {
             ShaftRole::Joint(channel) => (vec![channel], None),
-            ShaftRole::Motor(coupling, place) => {
+            ShaftRole::Motor(coupling, index) => {
                 let coupling = self.couplings.get(coupling)?;
                 let joints = coupling.joints.iter().map(|joint| channel(joint.shaft));
-                let motor = (coupling.matrix.clone(), place);
+                let motor = (coupling.matrix.clone(), index);
                 (joints.collect::<Option<_>>()?, Some(motor))
             }
         };
@@ -181,19 +181,19 @@ impl JointsPlan {
 pub struct Inverse {
     /// The channels of the joints that move its shaft.
     pub channels: Vec<u32>,
-    /// For a motor of a coupling, its matrix and the place of the motor.
+    /// For a motor of a coupling, its matrix and the index of the motor.
     motor: Option<(Matrix, usize)>,
     map: JointMap,
     wrap: Option<Wrap>,
 }
 
 impl Inverse {
-    /// Whether channel number `place` of [`Inverse::channels`] moves the shaft, and is moved by it.
+    /// Whether channel number `index` of [`Inverse::channels`] moves the shaft, and is moved by it.
     #[must_use]
-    pub fn moves(&self, place: usize) -> bool {
+    pub fn moves(&self, index: usize) -> bool {
         self.motor.as_ref().is_none_or(|(matrix, motor)| {
             matrix
-                .row(place)
+                .row(index)
                 .nth(*motor)
                 .is_some_and(|weight| weight != 0.0)
         })
@@ -204,7 +204,7 @@ impl Inverse {
     pub fn shaft(&self, joints: &[JointState]) -> JointState {
         match &self.motor {
             None => joints.first().copied().unwrap_or(JointState::ABSENT),
-            Some((matrix, place)) => matrix.motor(*place, joints.iter().copied()),
+            Some((matrix, index)) => matrix.motor(*index, joints.iter().copied()),
         }
     }
 
@@ -245,7 +245,7 @@ impl Joints {
 
     fn input(&mut self, at: &ShaftInput) -> Option<&mut RunningInput> {
         let (shaft, _) = self.shafts.get_mut(at.shaft)?;
-        shaft.inputs.get_mut(at.place)
+        shaft.inputs.get_mut(at.index)
     }
 
     /// The maximum silence of an input's device \[ns\].
@@ -276,25 +276,25 @@ impl Joints {
         }
     }
 
-    /// Takes the reading `output` of a device, with its `state`, through the gear `map`; calls
+    /// Takes the reading `stamped` of a device, with its `state`, through the gear `map`; calls
     /// `publish` with the channel of each sample that it completes. False: its stamp runs backward,
     /// and it was not taken.
     pub(crate) fn push(
         &mut self,
         at: &ShaftInput,
         map: &JointMap,
-        output: &Output,
+        stamped: &StampedReading,
         mut state: JointState,
         mut publish: impl FnMut(u32, &ShaftState),
     ) -> bool {
         let Some(input) = self.input(at) else {
             return true;
         };
-        if output.acquired < input.last {
+        if stamped.acquired < input.last {
             return false;
         }
-        input.last = output.acquired;
-        let mut quality = output.quality;
+        input.last = stamped.acquired;
+        let mut quality = stamped.quality;
         if std::mem::take(&mut input.replaced) {
             input.turns = wrap::Turns::default();
             quality |= Quality::GAP_BEFORE | Quality::ZERO_CHANGED;
@@ -303,24 +303,24 @@ impl Joints {
             let trusted = !quality.intersects(Quality::UNTRUSTED_ENCODER);
             let anew;
             (state.position, anew) =
-                (input.turns).unwrap(wrap, output.acquired, state.position, trusted);
+                (input.turns).unwrap(wrap, stamped.acquired, state.position, trusted);
             if anew {
                 quality |= Quality::GAP_BEFORE | Quality::ZERO_CHANGED;
             }
         }
         let measured = ShaftState {
-            acquired: output.acquired,
-            stamp: output.stamp,
-            device_time: output.device_time,
-            device_counter: output.device_counter,
+            acquired: stamped.acquired,
+            stamp: stamped.stamp,
+            device_time: stamped.device_time,
+            device_counter: stamped.device_counter,
             quality,
             state: map.joint(state),
             max_silence: input.max_silence,
         };
         match self.advance(at, measured) {
             Some((ShaftRole::Joint(channel), whole)) => publish(channel, &whole),
-            Some((ShaftRole::Motor(coupling, place), whole)) => {
-                self.couple(coupling, place, whole, publish);
+            Some((ShaftRole::Motor(coupling, index), whole)) => {
+                self.couple(coupling, index, whole, publish);
             }
             None => {}
         }
@@ -330,7 +330,7 @@ impl Joints {
     /// Takes what an input gives: the new state of its shaft, if there is one, and what that is.
     fn advance(&mut self, at: &ShaftInput, given: ShaftState) -> Option<(ShaftRole, ShaftState)> {
         let (shaft, role) = self.shafts.get_mut(at.shaft)?;
-        Some((*role, shaft.push(at.place, given)?))
+        Some((*role, shaft.push(at.index, given)?))
     }
 
     /// Takes the state of a motor, and gives those of the joints.

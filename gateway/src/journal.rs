@@ -23,7 +23,7 @@ const SOCKET: &str = "/run/systemd/journal/socket";
 /// counted, and the next line says how many.
 pub(crate) struct Journal {
     socket: UnixDatagram,
-    place: PathBuf,
+    path: PathBuf,
     lost: AtomicU64,
 }
 
@@ -38,12 +38,12 @@ impl Journal {
         Self::at(SOCKET.into()).ok()
     }
 
-    fn at(place: PathBuf) -> io::Result<Self> {
+    fn at(path: PathBuf) -> io::Result<Self> {
         let socket = UnixDatagram::unbound()?;
         socket.set_nonblocking(true)?;
         Ok(Self {
             socket,
-            place,
+            path,
             lost: AtomicU64::new(0),
         })
     }
@@ -54,7 +54,7 @@ impl Journal {
             line.fields.push(("lost_lines", lost.to_string()));
         }
         // Addressed each time, because a journal that was restarted has a new socket.
-        match self.socket.send_to(&line.entry(level), &self.place) {
+        match self.socket.send_to(&line.entry(level), &self.path) {
             Ok(_) => {}
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
                 self.lost.fetch_add(lost + 1, Ordering::Relaxed);
@@ -160,10 +160,10 @@ mod tests {
     #[test]
     fn nobody_waits_for_a_journal_that_hangs_and_lost_lines_are_counted() {
         let folder = tempfile::tempdir().unwrap();
-        let place = folder.path().join("socket");
-        let reader = UnixDatagram::bind(&place).unwrap();
+        let path = folder.path().join("socket");
+        let reader = UnixDatagram::bind(&path).unwrap();
         reader.set_nonblocking(true).unwrap();
-        let journal = Journal::at(place).unwrap();
+        let journal = Journal::at(path).unwrap();
         let log = || {
             let line = JournalEntry {
                 message: "x".repeat(1000),
@@ -180,8 +180,8 @@ mod tests {
         (0..10_000).for_each(|_| log());
         let taken = std::iter::from_fn(read).count();
         log();
-        let told = format!("LOST_LINES={}\n", 10_000 - taken);
-        assert!(taken > 0 && read().unwrap().ends_with(&told));
+        let expected = format!("LOST_LINES={}\n", 10_000 - taken);
+        assert!(taken > 0 && read().unwrap().ends_with(&expected));
         log();
         assert!(!read().unwrap().contains("LOST"));
     }

@@ -7,7 +7,7 @@ pub mod config;
 pub mod control;
 pub mod daemon;
 mod dbc;
-pub mod decoder;
+pub mod devices;
 mod dispatch;
 mod eds;
 mod health;

@@ -196,17 +196,17 @@ impl Meter {
             return self.load;
         };
         let seconds = (now - *then).seconds();
-        let of = |part: fn(&Totals) -> u64| part(&totals).saturating_sub(part(before)) as f64;
-        let (all, bytes) = (of(|t| t.all_frames), of(|t| t.all_bytes));
+        let growth = |part: fn(&Totals) -> u64| part(&totals).saturating_sub(part(before)) as f64;
+        let (all, bytes) = (growth(|t| t.all_frames), growth(|t| t.all_bytes));
         let share = rates.map_or(f64::NAN, |rates| {
             let (nominal, data) = (f64::from(rates.nominal), f64::from(rates.data));
-            let own = of(|t| t.nominal_bits) / nominal + of(|t| t.data_bits) / data;
+            let on_wire = growth(|t| t.nominal_bits) / nominal + growth(|t| t.data_bits) / data;
             // As `bits_on_wire`: 47 + 8 n bits and a quarter of 33 + 8 n.
             let hidden = (55.25 * all + 10.0 * bytes) / nominal;
-            own.max(hidden) / seconds
+            on_wire.max(hidden) / seconds
         });
         self.load = BusLoad {
-            frames: of(|t| t.frames).max(all) / seconds,
+            frames: growth(|t| t.frames).max(all) / seconds,
             share,
         };
         self.load

@@ -1,7 +1,7 @@
 //! Converts a recorded log to a table of samples and back: `proprio decode` and `proprio encode`.
 //! No daemon, no clock.
 
-use crate::decoder::Decoder;
+use crate::devices::BusDevices;
 use crate::joints::Inverse;
 use crate::link::replay::{self, Matching};
 use crate::log::{self, LogFormat, Stamps, candump};
@@ -226,15 +226,15 @@ pub fn decode_with(
             report.error_frames += 1;
             continue;
         }
-        let Some(decoder) = buses.decoder(record.interface) else {
+        let Some(devices) = buses.devices(record.interface) else {
             report.other_interface(record.interface);
             continue;
         };
         // As live: the devices see the time pass, so that silences are seen.
         if record.frame.stamp != StampKind::None {
-            decoder.poll_transmit(record.frame.t, |_, _| {});
+            devices.poll_transmit(record.frame.t, |_, _| {});
         }
-        decoder.on_frame(&record.frame, |sample| {
+        devices.on_frame(&record.frame, |sample| {
             let (t, mut write) = (sample.header.acquired, |s: &Sample| {
                 write_sample(&mut writer, s)
             });
@@ -267,7 +267,7 @@ pub fn decode_with(
     }
     for (bus, plan) in buses.all.iter().zip(&plan.buses) {
         report.unclaimed += bus.status.unclaimed.load(Relaxed);
-        report.devices.extend(bus.devices(plan));
+        report.devices.extend(bus.reports(plan));
     }
     Ok(report)
 }
@@ -276,7 +276,7 @@ pub fn decode_with(
 struct LogBus {
     /// `None`: all.
     matching: Option<Matching>,
-    decoder: Decoder,
+    devices: BusDevices,
     status: Arc<BusStatus>,
 }
 
@@ -286,10 +286,10 @@ impl LogBus {
     }
 
     /// The results per device.
-    fn devices(&self, plan: &BusPlan) -> impl Iterator<Item = DeviceReport> {
+    fn reports(&self, plan: &BusPlan) -> impl Iterator<Item = DeviceReport> {
         let devices = plan.devices.iter().zip(self.status.devices());
         devices
-            .zip(self.decoder.states())
+            .zip(self.devices.states())
             .map(|((device, health), state)| {
                 let count = |c: Counter| health.counters.get(c as usize).copied().unwrap_or(0);
                 let others = Counter::ALL.into_iter().skip(2).map(|c| (c, count(c)));
@@ -322,8 +322,8 @@ impl LogBuses {
         let mut all = Vec::new();
         for (bus, number) in plan.buses.iter().zip(0..) {
             let status = Arc::new(BusStatus::new(number, bus));
-            let decoder = Decoder::new(number, bus, Some(Mode::Listen), Arc::clone(&status));
-            let decoder = decoder.map_err(|cause| ConversionError::Device {
+            let devices = BusDevices::new(number, bus, Some(Mode::Listen), Arc::clone(&status));
+            let devices = devices.map_err(|cause| ConversionError::Device {
                 device: bus.name.clone(),
                 cause,
             })?;
@@ -331,20 +331,20 @@ impl LogBuses {
             let matching = matching.map_or(Ok(None), |matching| matching.in_log(reader))?;
             all.push(LogBus {
                 matching,
-                decoder,
+                devices,
                 status,
             });
         }
         Ok(Self { all, last: 0 })
     }
 
-    /// The decoder of the bus that takes the frames of this interface.
-    fn decoder(&mut self, interface: &str) -> Option<&mut Decoder> {
+    /// The devices of the bus that takes the frames of this interface.
+    fn devices(&mut self, interface: &str) -> Option<&mut BusDevices> {
         let takes = |bus: &LogBus| bus.takes(interface);
         if !self.all.get(self.last).is_some_and(takes) {
             self.last = self.all.iter().position(takes)?;
         }
-        self.all.get_mut(self.last).map(|bus| &mut bus.decoder)
+        self.all.get_mut(self.last).map(|bus| &mut bus.devices)
     }
 }
 

@@ -2,7 +2,7 @@
 //! buses, and answers when the devices have replied.
 
 use crate::control::{Asked, ControlOrder, refusal};
-use crate::decoder::build;
+use crate::devices::build;
 use crate::inbox::{Busy, Replacement, Reply, Request};
 use crate::plan::{Plan, did_you_mean};
 use crate::reload::{DeviceChange, changes};
@@ -155,8 +155,8 @@ impl Operator {
             tracing::warn!(device = name, "not done: {error}");
             refusal(&format!("device {name:?}: {error}"))
         });
-        let own = |waiting: &PendingOrder| waiting.open.contains(&(bus, device));
-        if let Some(at) = self.waiting.iter().position(own) {
+        let waits_for_it = |waiting: &PendingOrder| waiting.open.contains(&(bus, device));
+        if let Some(at) = self.waiting.iter().position(waits_for_it) {
             let _ = self.waiting.swap_remove(at).answer.send(answer);
         }
     }
@@ -350,13 +350,13 @@ impl Operator {
 
 /// The answer to a tare, which is told in the log.
 fn tared(name: &str, added: Option<Wrench>) -> Json {
-    let told = match added {
+    let text = match added {
         Some(Wrench { force, torque }) => format!("the board adds {force:?} N, {torque:?} Nm"),
         None => "the present load is its zero".to_owned(),
     };
     tracing::warn!(
         device = name,
-        "tared: {told} from now on; offsets identified before no longer hold"
+        "tared: {text} from now on; offsets identified before no longer hold"
     );
     let added = added.map(|added| json!({ "force_n": added.force, "torque_nm": added.torque }));
     json!({ "ok": true, "device": name, "added": added })

@@ -3,7 +3,7 @@
 use crate::bus::{Bus, Turn};
 use crate::clock::Monotonic;
 use crate::config::FrameSource;
-use crate::decoder::Decoder;
+use crate::devices::BusDevices;
 use crate::inbox::{Inbox, Requests, inbox};
 use crate::link::adapter::{self, Adapter};
 use crate::link::interface::{Interfaces, Netlink};
@@ -110,8 +110,8 @@ impl BusThread {
         // recording.
         let listens = bus.listen_only || matches!(bus.source, FrameSource::Replay { .. });
         let mode = listens.then_some(Mode::Listen);
-        let decoder = Decoder::new(number, bus, mode, Arc::clone(&status))?;
-        let (name, claims) = (&domain.config().name, decoder.claims());
+        let devices = BusDevices::new(number, bus, mode, Arc::clone(&status))?;
+        let (name, claims) = (&domain.config().name, devices.claims());
         let link = open_own(plan, bus, number, name, &claims, replay_start)?;
         let claim = match &bus.source {
             FrameSource::SocketCan(adapter) if !listens => claim_interface(adapter),
@@ -121,7 +121,7 @@ impl BusThread {
         let (ended, renewal) = (Arc::default(), Arc::default());
         let work = BusLoop {
             link,
-            decoder,
+            devices,
             inbox,
             status: Arc::clone(&status),
             renewal: Arc::clone(&renewal),
@@ -173,7 +173,7 @@ impl BusThread {
 /// What a bus thread works with.
 struct BusLoop {
     link: Box<dyn Link>,
-    decoder: Decoder,
+    devices: BusDevices,
     inbox: Inbox,
     status: Arc<BusStatus>,
     renewal: Arc<Renewal>,
@@ -185,7 +185,7 @@ impl BusLoop {
     /// Makes turns until it is told to stop, then stops the boards.
     fn run(self, writer: Writer<Sample>, robot: &str) {
         let sink = SharedMemory::new(writer, robot, self.renewal);
-        let mut bus = Bus::new(self.link, self.decoder, sink, self.status).with_inbox(self.inbox);
+        let mut bus = Bus::new(self.link, self.devices, sink, self.status).with_inbox(self.inbox);
         while !self.stop.load(Acquire) {
             if bus.turn(&Monotonic) == Turn::Ended {
                 if let Some(note) = bus.link_note() {
@@ -330,13 +330,13 @@ mod tests {
 
     #[test]
     fn an_interface_is_claimed_by_one_gateway_at_a_time() {
-        let own = Adapter::Interface(format!("none{}", std::process::id()));
+        let adapter = Adapter::Interface(format!("none{}", std::process::id()));
         let other = Adapter::Interface(format!("other{}", std::process::id()));
-        let first = claim_interface(&own);
-        assert!(first.is_some() && claim_interface(&own).is_none());
+        let first = claim_interface(&adapter);
+        assert!(first.is_some() && claim_interface(&adapter).is_none());
         assert!(claim_interface(&other).is_some());
         drop(first);
-        assert!(claim_interface(&own).is_some());
+        assert!(claim_interface(&adapter).is_some());
     }
 
     #[test]
@@ -350,7 +350,7 @@ mod tests {
             );
             Plan::parse(&text, Path::new(".")).unwrap()
         };
-        let told = |driver: &str, answer: Result<u32, Errno>| {
+        let check = |driver: &str, answer: Result<u32, Errno>| {
             let mut kernel = |_: &str| {
                 let health = |fd| InterfaceHealth {
                     fd,
@@ -360,14 +360,14 @@ mod tests {
             };
             check_fd(&plan(driver).buses[0], "can0", &mut kernel)
         };
-        let refused = told("moteus", Ok(0)).unwrap_err().to_string();
+        let refused = check("moteus", Ok(0)).unwrap_err().to_string();
         assert!(
             refused.contains("can0") && refused.contains("\"knee_drive\""),
             "{refused}"
         );
         assert!(refused.contains("fd on"), "{refused}");
-        assert!(told("moteus", Ok(1)).is_ok() && told("icub_motor", Ok(0)).is_ok());
-        assert!(told("moteus", Err(Errno::EPERM)).is_ok());
+        assert!(check("moteus", Ok(1)).is_ok() && check("icub_motor", Ok(0)).is_ok());
+        assert!(check("moteus", Err(Errno::EPERM)).is_ok());
     }
 
     /// The buses of one log begin at the instant that is common to all, not when each is opened.

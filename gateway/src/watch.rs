@@ -18,7 +18,7 @@
 
 use crate::clock::{Clock, Monotonic, sleep_until};
 use crate::config::FrameSource;
-use crate::decoder::Decoder;
+use crate::devices::BusDevices;
 use crate::link::adapter;
 use crate::link::socketcan::SocketCan;
 use crate::link::virtual_bus::VirtualBus;
@@ -55,7 +55,7 @@ pub(crate) fn start(
     stop: Arc<AtomicBool>,
 ) -> std::io::Result<()> {
     let body = move || {
-        let mut told = BTreeSet::new();
+        let mut reported = BTreeSet::new();
         let mut next = Monotonic.now() + FIRST;
         while !stop.load(Relaxed) {
             let now = Monotonic.now();
@@ -70,7 +70,7 @@ pub(crate) fn start(
                     continue;
                 };
                 for finding in look(&plan, number, &frames) {
-                    if told.insert((bus.name.clone(), finding.clone())) {
+                    if reported.insert((bus.name.clone(), finding.clone())) {
                         tracing::warn!(bus = bus.name, "{finding}");
                     }
                 }
@@ -135,13 +135,13 @@ fn strangers(bus: &BusPlan, frames: &[Frame]) -> Vec<String> {
     let mut all = Vec::new();
     for device in devices(&heard, "") {
         let finding = &device.finding;
-        let own = finding.explains.iter().map(|explained| explained.id);
+        let ids = finding.explains.iter().map(|explained| explained.id);
         let known = |id| claims.iter().any(|claim| claim.matches(id));
         let is_sure = finding.certainty() >= Some(Certainty::Likely);
-        if !is_sure || own.clone().any(known) || bus.has(finding.driver, finding.address) {
+        if !is_sure || ids.clone().any(known) || bus.has(finding.driver, finding.address) {
             continue;
         }
-        let ids: Vec<String> = own.map(|id| id.to_string()).collect();
+        let ids: Vec<String> = ids.map(|id| id.to_string()).collect();
         let (ids, s) = (ids.join(", "), if ids.len() == 1 { "s" } else { "" });
         let (driver, address, what) = (finding.driver, finding.address, &finding.what);
         all.push(format!(
@@ -197,13 +197,13 @@ fn alternate(readings: &[Vec<f64>]) -> bool {
 
 fn doubled(plan: &Plan, number: usize, bus: &BusPlan, frames: &[Frame]) -> Vec<String> {
     let status = Arc::new(BusStatus::new(0, bus));
-    let Ok(mut decoder) = Decoder::new(0, bus, Some(Mode::Listen), status) else {
+    let Ok(mut devices) = BusDevices::new(0, bus, Some(Mode::Listen), status) else {
         return Vec::new();
     };
     let mut channels: BTreeMap<u32, Vec<(Nanos, Vec<f64>)>> = BTreeMap::new();
     for frame in frames {
-        decoder.poll_transmit(frame.t, |_, _| {});
-        decoder.on_frame(frame, |sample| {
+        devices.poll_transmit(frame.t, |_, _| {});
+        devices.on_frame(frame, |sample| {
             if let Some(values) = sample.reading().and_then(|reading| values(&reading)) {
                 let channel = channels.entry(sample.channel).or_default();
                 channel.push((sample.header.acquired, values));
@@ -216,11 +216,11 @@ fn doubled(plan: &Plan, number: usize, bus: &BusPlan, frames: &[Frame]) -> Vec<S
         let Some(period) = board.and_then(|board| board.period()) else {
             continue;
         };
-        let own = channels.iter().filter(|(channel, _)| {
+        let counted = channels.iter().filter(|(channel, _)| {
             let channel = plan.channels.get(**channel as usize);
             channel.is_some_and(|of| (of.bus, of.device) == (number, place))
         });
-        let is_doubled = own.map(|(_, readings)| readings).any(|readings| {
+        let is_doubled = counted.map(|(_, readings)| readings).any(|readings| {
             let (Some((begin, _)), Some((end, _))) = (readings.first(), readings.last()) else {
                 return false;
             };
@@ -314,7 +314,7 @@ mod tests {
         }
     }
 
-    fn told(of: &[Vec<Frame>]) -> Vec<String> {
+    fn warnings(of: &[Vec<Frame>]) -> Vec<String> {
         let mut frames = of.concat();
         frames.sort_by_key(|frame| frame.t);
         look(&plan(), 0, &frames)
@@ -322,10 +322,10 @@ mod tests {
 
     #[test]
     fn a_device_that_nobody_reads_is_told() {
-        let own = board(("odrive", 5), 0.002, joint(0.0));
-        assert_eq!(told(std::slice::from_ref(&own)), [""; 0]);
+        let one = board(("odrive", 5), 0.002, joint(0.0));
+        assert_eq!(warnings(std::slice::from_ref(&one)), [""; 0]);
         let other = board(("odrive", 3), 0.004, joint(1.0));
-        let said = told(&[own, other]);
+        let said = warnings(&[one, other]);
         let [line] = &said[..] else {
             panic!("{said:?}")
         };
@@ -341,13 +341,13 @@ mod tests {
     fn two_devices_at_one_address_are_told() {
         let strain = |at, offset| board(("icub_strain", 13), at, wrench(offset));
         let odrive = |at, offset| board(("odrive", 5), at, joint(offset));
-        assert_eq!(told(&[strain(0.0, 5.0), odrive(0.001, 0.0)]), [""; 0]);
-        let said = told(&[strain(0.0, 5.0), odrive(0.001, 0.0), odrive(0.006, 2.0)]);
+        assert_eq!(warnings(&[strain(0.0, 5.0), odrive(0.001, 0.0)]), [""; 0]);
+        let said = warnings(&[strain(0.0, 5.0), odrive(0.001, 0.0), odrive(0.006, 2.0)]);
         assert!(
             said.len() == 1 && said[0].starts_with("o: two devices"),
             "{said:?}"
         );
-        let said = told(&[strain(0.0, 5.0), strain(0.004, -20.0), odrive(0.001, 0.0)]);
+        let said = warnings(&[strain(0.0, 5.0), strain(0.004, -20.0), odrive(0.001, 0.0)]);
         assert!(
             said.len() == 1 && said[0].starts_with("ft: two devices"),
             "{said:?}"

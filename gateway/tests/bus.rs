@@ -4,7 +4,7 @@
 use proprio_drivers::{Command, CommandFailed, CommandRefused, Frame, Id};
 use proprio_gateway::bus::{Bus, QUEUE, RETRY};
 use proprio_gateway::clock::Manual;
-use proprio_gateway::decoder::{Decoder, build};
+use proprio_gateway::devices::{BusDevices, build};
 use proprio_gateway::inbox::{Replacement, Reply, Request, Requests, inbox};
 use proprio_gateway::link::{Link, LinkCounters, ListenOnly, Received, TransmitError};
 use proprio_gateway::plan::{BusPlan, Plan};
@@ -94,11 +94,11 @@ impl Rig {
 
     fn of(plan: &BusPlan, link: impl Fn(Scripted) -> Box<dyn Link>) -> Self {
         let status = Arc::new(BusStatus::new(0, plan));
-        let decoder = Decoder::new(0, plan, None, Arc::clone(&status)).unwrap();
+        let devices = BusDevices::new(0, plan, None, Arc::clone(&status)).unwrap();
         let script = Arc::new(Mutex::new(Script::default()));
         let link = link(Scripted(Arc::clone(&script)));
         let (requests, inbox) = inbox(plan.devices.len());
-        let bus = Bus::new(link, decoder, Memory::default(), Arc::clone(&status));
+        let bus = Bus::new(link, devices, Memory::default(), Arc::clone(&status));
         let bus = bus.with_inbox(inbox);
         let now = Nanos::from_millis(1000);
         Self {
@@ -242,13 +242,13 @@ fn frames_that_find_no_place_in_the_queue_are_refused_and_told() {
     let surplus = (devices - QUEUE) as u64;
     assert_eq!(rig.unsent(), (surplus, surplus));
     // Of the last devices, not of those that have a place.
-    let told: Vec<u64> = rig
+    let unsent: Vec<u64> = rig
         .status
         .devices()
         .map(|d| d.counters[Counter::Unsent as usize])
         .collect();
     let expected = (0..devices).map(|number| u64::from(number >= QUEUE));
-    assert_eq!(told, expected.collect::<Vec<_>>());
+    assert_eq!(unsent, expected.collect::<Vec<_>>());
     assert_eq!(rig.sent(), []);
     for _ in 0..100 {
         rig.pass(RETRY);
@@ -442,8 +442,8 @@ fn a_replaced_device_stops_its_board_before_the_new_one_starts_it() {
     rig.pass(Nanos::from_millis(70));
     rig.turns(2);
     let silences = |rig: &Rig| -> Vec<u64> {
-        let of = |d: proprio_topics::DeviceHealth| d.counters[Counter::Silences as usize];
-        rig.status.devices().map(of).collect()
+        let silences = |d: proprio_topics::DeviceHealth| d.counters[Counter::Silences as usize];
+        rig.status.devices().map(silences).collect()
     };
     assert_eq!(silences(&rig), [0, 0]);
     rig.pass(Nanos::from_millis(8));
@@ -452,8 +452,9 @@ fn a_replaced_device_stops_its_board_before_the_new_one_starts_it() {
 
     let memory = rig.bus.into_sink();
     let gaps = |channel: u32| -> Vec<bool> {
-        let of = memory.samples.iter().filter(|s| s.channel == channel);
-        of.map(|s| s.header.quality.contains(Quality::GAP_BEFORE))
+        let samples = memory.samples.iter().filter(|s| s.channel == channel);
+        samples
+            .map(|s| s.header.quality.contains(Quality::GAP_BEFORE))
             .collect()
     };
     assert_eq!(gaps(0), [false, true, false, false]);

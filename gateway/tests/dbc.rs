@@ -3,7 +3,7 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::panic)]
 
 use proprio_drivers::{Decoded, Device, Format, Frame, Frames, Id};
-use proprio_gateway::decoder::build;
+use proprio_gateway::devices::build;
 use proprio_gateway::plan::Plan;
 use proprio_topics::{Nanos, Quality, Reading, StampKind};
 use std::collections::BTreeMap;

@@ -8,8 +8,8 @@
 )]
 
 use proprio_drivers::objects::Objects;
-use proprio_drivers::{Board, Decoded, Device, Frame, Frames, Id, Options, Output, State};
-use proprio_gateway::decoder::build;
+use proprio_drivers::{Board, Decoded, Device, Frame, Frames, Id, Options, StampedReading, State};
+use proprio_gateway::devices::build;
 use proprio_gateway::plan::{DevicePlan, Plan};
 use proprio_topics::{JointState, Nanos, Quality, Reading, Refusal, StampKind};
 use std::f64::consts::TAU;
@@ -147,14 +147,12 @@ fn joints(device: &mut dyn Device, frames: &[&str]) -> Vec<JointState> {
         if device.claims().iter().any(|claim| claim.matches(frame.id)) {
             device.on_frame(&frame, &mut out);
         }
-        joints.extend(
-            out.readings
-                .iter()
-                .filter_map(|Output { reading, .. }| match reading {
-                    Reading::Joint(joint) => Some(*joint),
-                    _ => None,
-                }),
-        );
+        joints.extend(out.readings.iter().filter_map(
+            |StampedReading { reading, .. }| match reading {
+                Reading::Joint(joint) => Some(*joint),
+                _ => None,
+            },
+        ));
     }
     joints
 }
@@ -303,7 +301,7 @@ fn start(keys: &str, board: &str) -> (Vec<JointState>, State) {
         let found = out
             .readings
             .iter()
-            .filter_map(|output| match output.reading {
+            .filter_map(|stamped| match stamped.reading {
                 Reading::Joint(joint) => Some(joint),
                 _ => None,
             });

@@ -234,11 +234,11 @@ fn one_bus_takes_the_frames_of_its_interface_if_the_log_has_it() {
     assert_eq!((report.samples, report.several), (2, None));
     let report = decoded(&(line("can0", 1) + &line("can1", 2)));
     assert_eq!((report.samples, report.other_interfaces), (2, 0));
-    let told = report.several.unwrap();
+    let text = report.several.unwrap();
     assert!(
-        told.starts_with("the log has the interfaces can0, can1, and the frames of all count")
-            && told.contains("interface or name of the bus in gateway.toml"),
-        "{told}"
+        text.starts_with("the log has the interfaces can0, can1, and the frames of all count")
+            && text.contains("interface or name of the bus in gateway.toml"),
+        "{text}"
     );
 }
 

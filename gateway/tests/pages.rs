@@ -92,15 +92,15 @@ fn the_keys_of_each_page_load() {
             "{driver} says how certain it is"
         );
         plan(driver, block, folder.path()).unwrap_or_else(|problem| panic!("{driver}: {problem}"));
-        let wrong = plan(driver, &format!("no_such_key = 1\n{block}"), folder.path());
-        assert!(wrong.unwrap_err().contains("no_such_key"), "{driver}");
+        let planned = plan(driver, &format!("no_such_key = 1\n{block}"), folder.path());
+        assert!(planned.unwrap_err().contains("no_such_key"), "{driver}");
     }
 }
 
 /// The fields of the structs that are read from the keys, at the place that a driver has for them.
 fn fields(driver: &str) -> Vec<String> {
-    let own = source(&format!("{driver}.rs"));
-    let text = own + &source(&format!("{driver}/options.rs"));
+    let module = source(&format!("{driver}.rs"));
+    let text = module + &source(&format!("{driver}/options.rs"));
     let mut fields = Vec::new();
     for part in text.split("#[derive(").skip(1) {
         let Some((head, body)) = part.split_once("pub struct ") else {

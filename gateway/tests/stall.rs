@@ -4,7 +4,7 @@
 use proprio_drivers::{Frame, Id};
 use proprio_gateway::bus::Bus;
 use proprio_gateway::clock::Manual;
-use proprio_gateway::decoder::Decoder;
+use proprio_gateway::devices::BusDevices;
 use proprio_gateway::link::{Link, LinkCounters, Received, TransmitError};
 use proprio_gateway::plan::Plan;
 use proprio_gateway::publish::Memory;
@@ -60,7 +60,7 @@ fn bus(times: impl Iterator<Item = Nanos>) -> (Bus<Memory>, Arc<BusStatus>) {
     "#;
     let plan = Plan::parse(text, Path::new(".")).unwrap();
     let status = Arc::new(BusStatus::new(0, &plan.buses[0]));
-    let decoder = Decoder::new(0, &plan.buses[0], None, Arc::clone(&status)).unwrap();
+    let devices = BusDevices::new(0, &plan.buses[0], None, Arc::clone(&status)).unwrap();
     let frames = times.flat_map(|t| {
         let force = Frame::new(Id::standard(0x31A), &[0, 0x80, 0, 0x80, 0, 0x80])
             .at(t, StampKind::Software);
@@ -74,7 +74,7 @@ fn bus(times: impl Iterator<Item = Nanos>) -> (Bus<Memory>, Arc<BusStatus>) {
         frames: frames.collect(),
         sent: 0,
     });
-    let bus = Bus::new(link, decoder, Memory::default(), Arc::clone(&status));
+    let bus = Bus::new(link, devices, Memory::default(), Arc::clone(&status));
     (bus, status)
 }
 

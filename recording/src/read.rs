@@ -117,8 +117,8 @@ fn is_whole_attachment(record: &[u8]) -> bool {
 
 /// The table that is being made.
 struct SampleTable<W: Write> {
-    /// Of each channel: the number of its series in the recording, its place among the columns once
-    /// they are known, and its kind.
+    /// Of each channel: the number of its series in the recording, its column once the columns are
+    /// known, and its kind.
     channels: BTreeMap<u16, (usize, Option<usize>, What)>,
     /// By their number in the recording.
     series: BTreeMap<usize, Series>,
@@ -144,8 +144,8 @@ pub fn to_table<W: Write>(recording: impl Read, output: W) -> Result<RecordingSu
         match record {
             Record::Channel(channel) => table.know(&channel),
             Record::Message { header, data } => {
-                if let Some((_, place, what)) = table.channels.get(&header.channel_id).copied() {
-                    table.take(header.channel_id, place, what, &data)?;
+                if let Some((_, column, what)) = table.channels.get(&header.channel_id).copied() {
+                    table.take(header.channel_id, column, what, &data)?;
                 }
             }
             _ => {}
@@ -163,9 +163,9 @@ impl<W: Write> SampleTable<W> {
         if let Some((number, series)) = number.zip(series_of(&channel.topic))
             && !self.channels.contains_key(&channel.id)
         {
-            let place = self.place(number);
+            let column = self.column(number);
             self.channels
-                .insert(channel.id, (number, place, series.what));
+                .insert(channel.id, (number, column, series.what));
             if self.writer.is_none() {
                 // A channel's main reading comes first.
                 self.series.entry(number).or_insert(series);
@@ -173,8 +173,8 @@ impl<W: Write> SampleTable<W> {
         }
     }
 
-    /// The place of a series among the columns, once they are known.
-    fn place(&self, number: usize) -> Option<usize> {
+    /// The column of a series, once the columns are known.
+    fn column(&self, number: usize) -> Option<usize> {
         let is_known = self.writer.is_some();
         (self.series.keys().position(|known| *known == number)).filter(|_| is_known)
     }
@@ -184,8 +184,8 @@ impl<W: Write> SampleTable<W> {
         if let Some(output) = self.output.take() {
             let series: Vec<Series> = self.series.values().cloned().collect();
             self.writer = Some(TableWriter::new(output, &series, Columns::All)?);
-            for (number, place, _) in self.channels.values_mut() {
-                *place = self.series.keys().position(|known| known == number);
+            for (number, column, _) in self.channels.values_mut() {
+                *column = self.series.keys().position(|known| known == number);
             }
         }
         Ok(())
@@ -194,7 +194,7 @@ impl<W: Write> SampleTable<W> {
     fn take(
         &mut self,
         channel: u16,
-        place: Option<usize>,
+        column: Option<usize>,
         what: What,
         message: &[u8],
     ) -> Result<(), ReadError> {
@@ -203,10 +203,10 @@ impl<W: Write> SampleTable<W> {
             return Ok(());
         };
         self.begin()?;
-        let place = place.or_else(|| self.channels.get(&channel)?.1);
-        match (&mut self.writer, place) {
-            (Some(writer), Some(place)) => {
-                writer.push(Some(t), place, &value)?;
+        let column = column.or_else(|| self.channels.get(&channel)?.1);
+        match (&mut self.writer, column) {
+            (Some(writer), Some(column)) => {
+                writer.push(Some(t), column, &value)?;
                 self.summary.values += 1;
             }
             _ => self.summary.without_column += 1,

@@ -33,11 +33,11 @@ pub fn wrong_urdf(
     relative: f64,
 ) -> Result<String, SimulatedRobotError> {
     let file = &robot.config.model;
-    let wrong = |cause| SimulatedRobotError::Model {
+    let error = |cause| SimulatedRobotError::Model {
         file: file.clone(),
         cause: Box::new(cause),
     };
-    let text = Model::read_text(file).map_err(wrong)?;
+    let text = Model::read_text(file).map_err(error)?;
     let truth = torques(robot, settings)?;
     let enough = ENOUGH.min(0.5 * relative);
     let mut best: Option<(f64, Model)> = None;
@@ -46,7 +46,7 @@ pub fn wrong_urdf(
         let mut other = robot.clone();
         for (link, inertia) in robot.model.inertias().iter().enumerate() {
             let body = another_body(inertia, relative, &mut random);
-            other.model.set_inertia(link, body).map_err(wrong)?;
+            other.model.set_inertia(link, body).map_err(error)?;
         }
         // The relative error of the joint with the smallest error.
         let least = torques(&other, settings)?
@@ -72,7 +72,7 @@ pub fn wrong_urdf(
         .map(|ft| ft.joint.as_str())
         .collect();
     let model = best.map_or_else(|| robot.model.clone(), |(_, model)| model);
-    Model::rewrite_urdf(&text, &keep, model.inertias()).map_err(wrong)
+    Model::rewrite_urdf(&text, &keep, model.inertias()).map_err(error)
 }
 
 /// Per joint, its torque at the instants compared, without pushes.
@@ -146,15 +146,15 @@ mod tests {
     fn the_wrong_urdf_is_of_bodies_that_exist_and_is_as_wrong_as_asked() {
         let robot = SimulatedRobot::open("icub_left_arm").unwrap();
         let text = wrong_urdf(&robot, &SimulationSettings::default(), 0.2).unwrap();
-        let wrong = model(&robot, &text);
-        assert_eq!(wrong.link_count(), robot.model.link_count());
-        for (link, (body, truth)) in wrong
+        let wrong_model = model(&robot, &text);
+        assert_eq!(wrong_model.link_count(), robot.model.link_count());
+        for (link, (body, truth)) in wrong_model
             .inertias()
             .iter()
             .zip(robot.model.inertias())
             .enumerate()
         {
-            let name = wrong.link_name(link);
+            let name = wrong_model.link_name(link);
             if truth.mass == 0.0 {
                 assert_eq!(body, truth, "{name}");
                 continue;
@@ -177,7 +177,7 @@ mod tests {
             );
         }
         // Everything else is unchanged: geometry, limits, sensors.
-        assert_eq!(wrong.joints(), robot.model.joints());
+        assert_eq!(wrong_model.joints(), robot.model.joints());
     }
 
     #[test]

@@ -6,7 +6,7 @@ use crate::settings::SimulationSettings;
 use crate::simulator::{BusCounts, BusSimulator, Simulator, SimulatorError};
 use crate::truth::Simulation;
 use proprio_drivers::{Frame, State};
-use proprio_gateway::decoder::Decoder;
+use proprio_gateway::devices::BusDevices;
 use proprio_gateway::log::candump::write_log_line;
 use proprio_gateway::plan::BusPlan;
 use proprio_gateway::status::BusStatus;
@@ -77,10 +77,10 @@ pub fn record(
     while now < end {
         for (bus, host) in hosts.iter_mut().enumerate() {
             let mut commands = Vec::new();
-            host.decoder
+            host.devices
                 .poll_transmit(now, |device, t| commands.push((device, t.frame)));
             for (device, command) in commands {
-                host.decoder.on_sent(device, &command, Ok(now));
+                host.devices.on_sent(device, &command, Ok(now));
                 let command = host.transfer(command, now);
                 host.commands += 1;
                 simulator.on_frame(bus, &command, now);
@@ -93,13 +93,13 @@ pub fn record(
             };
             let frame = host.transfer(frame, now);
             host.sent += 1;
-            host.decoder.on_frame(&frame, |_| {});
+            host.devices.on_frame(&frame, |_| {});
             waiting.push(bus, frame);
         }
         waiting.write_until(now, &hosts, &mut log)?;
         let wakes = hosts
             .iter()
-            .filter_map(|h| h.decoder.next_wake())
+            .filter_map(|h| h.devices.next_wake())
             .chain(simulator.next_wake());
         // A device that must be called at once is answering an event: the next nanosecond is early
         // enough.
@@ -115,7 +115,7 @@ pub fn record(
             sent: host.sent,
             commands: host.commands,
             counts,
-            states: host.decoder.states().collect(),
+            states: host.devices.states().collect(),
         })
         .collect())
 }
@@ -151,7 +151,7 @@ impl FrameQueue {
 
 /// The gateway's side of a bus.
 struct Host<'a> {
-    decoder: Decoder,
+    devices: BusDevices,
     interface: &'a str,
     /// Time when the bus is free again.
     free: Nanos,
@@ -162,9 +162,9 @@ struct Host<'a> {
 impl<'a> Host<'a> {
     fn new(plan: &'a BusPlan, number: u32) -> Result<Self, RecordError> {
         let status = Arc::new(BusStatus::new(number, plan));
-        let decoder = Decoder::new(number, plan, None, status);
+        let devices = BusDevices::new(number, plan, None, status);
         Ok(Self {
-            decoder: decoder.map_err(|cause| RecordError::Device {
+            devices: devices.map_err(|cause| RecordError::Device {
                 bus: plan.name.clone(),
                 cause,
             })?,

@@ -401,9 +401,9 @@ fn sources(
         return Err(RunOptionsError::Seconds(seconds));
     }
     let plans = &robot.plan.buses;
-    let own: Vec<FrameSource> = plans.iter().map(|b| b.source.clone()).collect();
+    let sources: Vec<FrameSource> = plans.iter().map(|b| b.source.clone()).collect();
     let sources = if options.buses.is_empty() {
-        own
+        sources
     } else {
         options.buses.clone()
     };
@@ -442,7 +442,7 @@ fn create(path: &Path) -> anyhow::Result<BufWriter<File>> {
 mod tests {
     use super::*;
     use proprio_drivers::Frame;
-    use proprio_gateway::decoder::Decoder;
+    use proprio_gateway::devices::BusDevices;
     use proprio_gateway::link::TransmitError;
     use proprio_gateway::status::BusStatus;
     use proprio_topics::{Counter, LinkState};
@@ -460,11 +460,11 @@ mod tests {
         }
     }
 
-    /// A bus on which a frame takes longer than all boards' periods, with a gateway's decoder at
+    /// A bus on which a frame takes longer than all boards' periods, with a gateway's devices at
     /// its other end.
     struct SlowLink {
         clock: Slow,
-        gateway: Decoder,
+        gateway: BusDevices,
         commands: VecDeque<(u16, Frame)>,
         sent: Arc<AtomicU64>,
         stop: Arc<AtomicBool>,
@@ -525,7 +525,7 @@ mod tests {
             );
             let link = SlowLink {
                 clock: clock.clone(),
-                gateway: Decoder::new(number, plan, None, Arc::clone(&status)).unwrap(),
+                gateway: BusDevices::new(number, plan, None, Arc::clone(&status)).unwrap(),
                 commands: VecDeque::new(),
                 sent: Arc::clone(&sent),
                 stop: Arc::clone(&stop),

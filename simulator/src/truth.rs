@@ -730,9 +730,9 @@ mod tests {
             let last = touches.last().unwrap().t;
             touches.push(simulation.next_touch(last).unwrap());
         }
-        let told: Vec<_> = touches.iter().map(|t| (t.t, t.contact, t.begins)).collect();
+        let actual: Vec<_> = touches.iter().map(|t| (t.t, t.contact, t.begins)).collect();
         assert_eq!(
-            told,
+            actual,
             [
                 (4.0, 1, true),
                 (6.0, 1, false),
@@ -742,13 +742,13 @@ mod tests {
         );
         let push = simulation.push().unwrap();
         assert_eq!((push.contact, push.cycle), (1, 10.0));
-        for (told, expected) in [
+        for (actual, expected) in [
             (push.force, PUSH.0),
             (push.torque, PUSH.1),
             (push.from, 4.0),
             (push.until, 6.0),
         ] {
-            assert!((told - expected).abs() < 1e-9, "{push:?}");
+            assert!((actual - expected).abs() < 1e-9, "{push:?}");
         }
         let calm = SimulationSettings {
             push: false,

@@ -1,8 +1,8 @@
-//! The simulated boards against the gateway's own decoders, without links or clocks: decoded
+//! The simulated boards against the gateway's own devices, without links or clocks: decoded
 //! readings equal the truth, boards need to be started, and each fault has its effect.
 
 use proprio_drivers::{Frame, State};
-use proprio_gateway::decoder::Decoder;
+use proprio_gateway::devices::BusDevices;
 use proprio_gateway::plan::Plan;
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::simulator::{
@@ -55,7 +55,7 @@ struct Session {
     frames: Vec<(usize, Frame)>,
     counts: Vec<BusCounts>,
     states: Vec<Vec<State>>,
-    /// Per device, its decoder's counters.
+    /// Per device, the gateway's counters.
     health: HashMap<String, Vec<u64>>,
     channels: Vec<String>,
 }
@@ -89,11 +89,11 @@ fn session_from(
     start: Nanos,
 ) -> Session {
     let mut simulator = Simulator::new(robot, settings, T0).expect("a simulator");
-    let mut hosts: Vec<(Decoder, Arc<BusStatus>)> = Vec::new();
+    let mut hosts: Vec<(BusDevices, Arc<BusStatus>)> = Vec::new();
     for (plan, number) in robot.plan.buses.iter().zip(0..) {
         let status = Arc::new(BusStatus::new(number, plan));
         hosts.push((
-            Decoder::new(number, plan, None, Arc::clone(&status)).expect("a decoder"),
+            BusDevices::new(number, plan, None, Arc::clone(&status)).expect("devices"),
             status,
         ));
     }
@@ -101,11 +101,11 @@ fn session_from(
     let (mut now, end) = (T0, T0 + Nanos::from_seconds(seconds));
     while now < end {
         if now >= start {
-            for (bus, (decoder, _)) in hosts.iter_mut().enumerate() {
+            for (bus, (devices, _)) in hosts.iter_mut().enumerate() {
                 let mut commands = Vec::new();
-                decoder.poll_transmit(now, |device, t| commands.push((device, t.frame)));
+                devices.poll_transmit(now, |device, t| commands.push((device, t.frame)));
                 for (device, command) in commands {
-                    decoder.on_sent(device, &command, Ok(now));
+                    devices.on_sent(device, &command, Ok(now));
                     simulator.on_frame(bus, &command, now);
                 }
             }
@@ -408,7 +408,7 @@ fn a_silent_board_does_not_listen() {
     let robot = robot();
     let started = |fault: &[&str]| {
         let mut simulator = Simulator::new(&robot, &settings(fault), T0).unwrap();
-        let mut decoder = Decoder::new(
+        let mut devices = BusDevices::new(
             0,
             &robot.plan.buses[0],
             None,
@@ -426,9 +426,9 @@ fn a_silent_board_does_not_listen() {
                 // Each is given when the one before has been sent.
                 while {
                     let before = all.len();
-                    decoder.poll_transmit(now, |device, t| all.push((device, t.frame)));
+                    devices.poll_transmit(now, |device, t| all.push((device, t.frame)));
                     for (device, frame) in &all[before..] {
-                        decoder.on_sent(*device, frame, Ok(now));
+                        devices.on_sent(*device, frame, Ok(now));
                     }
                     all.len() > before
                 } {}

@@ -2,7 +2,7 @@
 
 use proprio_gateway::clock::{Clock, Monotonic};
 use proprio_gateway::config::FrameSource;
-use proprio_gateway::decoder::Decoder;
+use proprio_gateway::devices::BusDevices;
 use proprio_gateway::link::adapter::Adapter;
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, Received};
@@ -164,28 +164,28 @@ fn listen(
 ) -> (u64, Vec<(String, Vec<u64>)>) {
     let plan = &robot.plan.buses[bus];
     let status = Arc::new(BusStatus::new(0, plan));
-    let mut decoder = Decoder::new(0, plan, None, Arc::clone(&status)).unwrap();
+    let mut devices = BusDevices::new(0, plan, None, Arc::clone(&status)).unwrap();
     let mut link = VirtualBus::open(domain, name, &[]).unwrap();
     let clock = Monotonic;
     while !stop.load(Relaxed) {
         let mut sent = Vec::new();
-        decoder.poll_transmit(clock.now(), |device, t| {
+        devices.poll_transmit(clock.now(), |device, t| {
             link.send(&t.frame).unwrap();
             sent.push((device, t.frame));
         });
         for (device, frame) in sent {
-            decoder.on_sent(device, &frame, Ok(clock.now()));
+            devices.on_sent(device, &frame, Ok(clock.now()));
         }
         let deadline = clock.now() + Nanos::from_millis(10);
         if let Received::Frame(frame) =
-            link.recv(decoder.next_wake().map_or(deadline, |w| w.min(deadline)))
+            link.recv(devices.next_wake().map_or(deadline, |w| w.min(deadline)))
         {
-            decoder.on_frame(&frame, |_| {});
+            devices.on_frame(&frame, |_| {});
         }
     }
     // Read the rest of the buffer.
     while let Received::Frame(frame) = link.recv(clock.now() + Nanos::from_millis(100)) {
-        decoder.on_frame(&frame, |_| {});
+        devices.on_frame(&frame, |_| {});
     }
     assert_eq!(link.counters().dropped, 0);
     let devices = status
@@ -283,13 +283,13 @@ fn the_skin_tells_of_each_touch_ahead_of_it() {
         seconds: Some(2.0),
         ..RunOptions::default()
     };
-    let mut told = Vec::new();
+    let mut heard_touches = Vec::new();
     let mut skin = |contact: &str, at: Nanos, touches: bool| {
-        told.push((contact.to_owned(), at, touches, Monotonic.now()));
+        heard_touches.push((contact.to_owned(), at, touches, Monotonic.now()));
     };
     let summary =
         run_with_skin(&robot(), &options, Some(&mut skin), &AtomicBool::new(false)).unwrap();
-    let told: Vec<_> = told
+    let touches: Vec<_> = heard_touches
         .iter()
         .map(|(contact, at, touches, heard)| {
             (
@@ -300,8 +300,8 @@ fn the_skin_tells_of_each_touch_ahead_of_it() {
             )
         })
         .collect();
-    let [(_, from, ..), (_, until, ..)] = told[..] else {
-        panic!("{told:?}");
+    let [(_, from, ..), (_, until, ..)] = touches[..] else {
+        panic!("{touches:?}");
     };
     // The push of a run of 2 s, from 40 % to 60 % of it.
     assert_eq!(
@@ -309,14 +309,15 @@ fn the_skin_tells_of_each_touch_ahead_of_it() {
         (Nanos::from_millis(800), Nanos::from_millis(1200))
     );
     assert!(
-        told.iter().all(|(contact, ..)| *contact == "hand"),
-        "{told:?}"
+        touches.iter().all(|(contact, ..)| *contact == "hand"),
+        "{touches:?}"
     );
-    assert_eq!([told[0].2, told[1].2], [true, false]);
+    assert_eq!([touches[0].2, touches[1].2], [true, false]);
     assert!(
-        told.iter()
+        touches
+            .iter()
             .all(|(.., ahead)| (Nanos::ZERO..=Nanos::from_millis(100)).contains(ahead)),
-        "{told:?}"
+        "{touches:?}"
     );
     // A stop request in the meantime is obeyed.
     let options = RunOptions {

@@ -145,10 +145,10 @@ fn main() {
         }
         if let Some(recorder) = &mut recorder {
             recorder.wait();
-            let told = recorder.output();
-            println!("{}", told.trim());
+            let output = recorder.output();
+            println!("{}", output.trim());
             // The recorder's last line of frames: `N frames, M lost`.
-            let lost = told
+            let lost = output
                 .split(" frames, ")
                 .nth(1)
                 .and_then(|it| it.split(' ').next());

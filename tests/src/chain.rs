@@ -28,7 +28,7 @@ use crate::truth::random::Random;
 use proprio_estimator::pipeline::Pipeline;
 use proprio_gateway::bus::Bus;
 use proprio_gateway::clock::Clock;
-use proprio_gateway::decoder::{Decoder, build};
+use proprio_gateway::devices::{BusDevices, build};
 use proprio_gateway::plan::{ChannelPlan, DevicePlan, Plan};
 use proprio_gateway::publish::SharedMemory;
 use proprio_gateway::status::BusStatus;
@@ -249,8 +249,8 @@ impl Chain {
             let target = device_of(plan, family.kind, &mut random.clone());
             let name = |(bus, device): (usize, usize)| plan.buses[bus].devices[device].name.clone();
             let faults = target.map(name).into_iter().flat_map(|device| {
-                let own = |trouble| board_fault(trouble, device.clone());
-                troubles.iter().filter_map(own).collect::<Vec<_>>()
+                let fault = |trouble| board_fault(trouble, device.clone());
+                troubles.iter().filter_map(fault).collect::<Vec<_>>()
             });
             SimulationSettings {
                 seed,
@@ -290,8 +290,8 @@ impl Chain {
             .into_iter()
             .enumerate()
             .map(|(bus, boards)| {
-                let own = troubles.iter().filter(|_| bus == target.0);
-                let planned = own.map(|trouble| Planned {
+                let of_bus = troubles.iter().filter(|_| bus == target.0);
+                let planned = of_bus.map(|trouble| Planned {
                     fault: trouble.fault,
                     from: at(trouble.from),
                     until: at(trouble.until),
@@ -313,9 +313,9 @@ impl Chain {
             .map(|c| setup.channel(c.kind, &c.name))
             .collect();
         let is_concerned = |name: &str| {
-            let mut own = plan.channels.iter().filter(|c| c.name == name);
+            let mut channels = plan.channels.iter().filter(|c| c.name == name);
             let is_of_device = troubles.iter().all(|trouble| trouble.fault.is_of_device());
-            own.any(|c| c.bus == target.0 && (!is_of_device || c.device == target.1))
+            channels.any(|c| c.bus == target.0 && (!is_of_device || c.device == target.1))
         };
         let concerned = setup
             .channels()
@@ -358,14 +358,15 @@ impl Chain {
     fn start(&mut self, epoch: u64) {
         for (number, plan) in (0..).zip(&self.plan.buses) {
             let status = Arc::new(BusStatus::new(number, plan));
-            let decoder = Decoder::new(number, plan, None, Arc::clone(&status)).expect("devices");
+            let devices =
+                BusDevices::new(number, plan, None, Arc::clone(&status)).expect("devices");
             let writer = Writer::create(&self.domain, &self.plan.robot, epoch).expect("a port");
             let sink = SharedMemory::new(writer, &self.plan.robot, Arc::new(Renewal::default()));
             let end = self.wires[number as usize].clone();
             self.buses.push(Running {
                 before: end.with(|wire| wire.passed.delivered),
                 clock: end.with(|wire| wire.clock.clone()),
-                bus: Bus::new(Box::new(end), decoder, sink, Arc::clone(&status)),
+                bus: Bus::new(Box::new(end), devices, sink, Arc::clone(&status)),
                 status,
             });
         }

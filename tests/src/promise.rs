@@ -68,10 +68,11 @@ impl Outcome {
         let Some(channel) = &self.channel else {
             return f64::NAN;
         };
-        let own = self.withheld.iter();
-        let own = own.filter(|(why, _)| why.split_once(':').is_some_and(|(_, c)| c == channel));
+        let counts = self.withheld.iter();
+        let counts =
+            counts.filter(|(why, _)| why.split_once(':').is_some_and(|(_, c)| c == channel));
         let all: usize = self.withheld.values().sum();
-        own.map(|(_, count)| count).sum::<usize>() as f64 / all as f64
+        counts.map(|(_, count)| count).sum::<usize>() as f64 / all as f64
     }
 
     /// The share of late torques that are valid.

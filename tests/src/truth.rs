@@ -191,7 +191,7 @@ fn readings(
         false => value,
     };
     let mut all = Vec::new();
-    let mut of =
+    let mut add =
         |kind: Kind, name: &str, period: f64, phase: f64, read: &mut dyn FnMut(f64) -> Vec<f64>| {
             let mut rows = Vec::new();
             let mut slot = 0.0;
@@ -205,7 +205,7 @@ fn readings(
         };
     for (number, (kind, name)) in setup.channels().enumerate() {
         let mut noise = Random::new(number as u64 ^ random.below(1 << 30) as u64, "noise");
-        let own = if together {
+        let first = if together {
             phase
         } else {
             random.uniform(0.0, period)
@@ -221,7 +221,7 @@ fn readings(
                         turn,
                     )]
                 };
-                of(kind, name, period, own, &mut read);
+                add(kind, name, period, first, &mut read);
             }
             Kind::Wrench => {
                 let role = setup.robot.channels.get(number).map(|channel| channel.role);
@@ -241,7 +241,7 @@ fn readings(
                     });
                     noisy.collect()
                 };
-                of(kind, name, 0.01, random.uniform(0.0, 0.01), &mut read);
+                add(kind, name, 0.01, random.uniform(0.0, 0.01), &mut read);
             }
             Kind::Imu => {
                 let mut read = |t| {
@@ -253,7 +253,7 @@ fn readings(
                     });
                     noisy.collect()
                 };
-                of(kind, name, 0.01, random.uniform(0.0, 0.01), &mut read);
+                add(kind, name, 0.01, random.uniform(0.0, 0.01), &mut read);
             }
             _ => {}
         }

@@ -22,7 +22,7 @@ use proprio_estimator::propagation::{Covariance, Propagation};
 use proprio_estimator::setup::Setup;
 use proprio_gateway::bus::{Bus, Turn};
 use proprio_gateway::clock::{Clock, Monotonic};
-use proprio_gateway::decoder::{Decoder, build};
+use proprio_gateway::devices::{BusDevices, build};
 use proprio_gateway::inbox::{Replacement, Reply, Request, inbox};
 use proprio_gateway::link::virtual_bus::VirtualBus;
 use proprio_gateway::link::{Link, Received, send_by};
@@ -126,7 +126,7 @@ struct BadFrames {
 impl BadFrames {
     fn new(robot: &SimulatedRobot, bus: usize) -> Self {
         let plan = &robot.plan.buses[bus];
-        let decoder = Decoder::new(
+        let devices = BusDevices::new(
             0,
             plan,
             Some(Mode::Listen),
@@ -134,7 +134,7 @@ impl BadFrames {
         )
         .expect("devices");
         Self {
-            claims: decoder.claims(),
+            claims: devices.claims(),
             state: bus as u64,
         }
     }
@@ -205,15 +205,15 @@ fn run_bus<S: Sink>(
     let robot = robot();
     let plan = &robot.plan.buses[number];
     let status = Arc::new(BusStatus::new(0, plan));
-    let decoder = Decoder::new(0, plan, None, Arc::clone(&status)).expect("devices");
+    let devices = BusDevices::new(0, plan, None, Arc::clone(&status)).expect("devices");
     // A separate bus, because tests run in parallel in this process and others.
     let (domain, name) = (
         format!("allocation-{}", std::process::id()),
         format!("{test}-{number}"),
     );
-    let link = VirtualBus::open(&domain, &name, &decoder.claims()).expect("a virtual bus");
-    let devices = plan.devices.len();
-    let (mut requests, inbox) = inbox(devices);
+    let link = VirtualBus::open(&domain, &name, &devices.claims()).expect("a virtual bus");
+    let device_count = plan.devices.len();
+    let (mut requests, inbox) = inbox(device_count);
     let mut replacements: Vec<_> = (plan.devices.iter().zip(0_u16..))
         .map(|(device, number)| {
             let replacement = Replacement {
@@ -224,7 +224,7 @@ fn run_bus<S: Sink>(
             (number, Request::Replace(replacement))
         })
         .collect();
-    let mut bus = Bus::new(Box::new(link), decoder, sink(), Arc::clone(&status)).with_inbox(inbox);
+    let mut bus = Bus::new(Box::new(link), devices, sink(), Arc::clone(&status)).with_inbox(inbox);
     let clock = Monotonic;
     let (nonsense, stop) = (AtomicBool::new(false), AtomicBool::new(false));
     let result = std::thread::scope(|scope| {
@@ -240,17 +240,17 @@ fn run_bus<S: Sink>(
         turn_until(&mut || status.devices().all(|d| readings(&d) > 10));
         nonsense.store(true, Relaxed);
         let (frames, published) = (status.frames.load(Relaxed), status.published.load(Relaxed));
-        let mut replies = Vec::with_capacity(2 * devices);
+        let mut replies = Vec::with_capacity(2 * device_count);
         let allocated = counted(|| {
             for (device, request) in replacements.drain(..) {
                 assert_eq!(requests.send(device, request), Ok(()));
             }
             turn_until(&mut || {
                 replies.extend(requests.take());
-                replies.len() == devices
+                replies.len() == device_count
             });
             turn_until(&mut || status.frames.load(Relaxed) >= frames + FRAMES / 2);
-            for device in 0..devices {
+            for device in 0..device_count {
                 let command = Request::Command {
                     command: Command::Tare,
                     until: Nanos::MAX,
@@ -259,13 +259,13 @@ fn run_bus<S: Sink>(
             }
             turn_until(&mut || {
                 replies.extend(requests.take());
-                replies.len() == 2 * devices
+                replies.len() == 2 * device_count
             });
             turn_until(&mut || status.frames.load(Relaxed) >= frames + FRAMES);
         });
         let replaced = |(_, reply): &&(u16, Reply)| matches!(reply, Reply::Replaced(_));
-        assert_eq!(replies.len(), 2 * devices);
-        assert_eq!(replies.iter().filter(replaced).count(), devices);
+        assert_eq!(replies.len(), 2 * device_count);
+        assert_eq!(replies.iter().filter(replaced).count(), device_count);
         let received = status.frames.load(Relaxed) - frames;
         let published_there = status.published.load(Relaxed) - published;
         let stopped = counted(|| bus.stop(&clock));
@@ -334,7 +334,7 @@ fn joints_of_several_devices_allocate_nothing() {
     let plan = Plan::parse(&text, Path::new(".")).expect("a plan");
     let bus = &plan.buses[0];
     let status = Arc::new(BusStatus::new(0, bus));
-    let mut decoder = Decoder::new(0, bus, None, status).expect("devices");
+    let mut devices = BusDevices::new(0, bus, None, status).expect("devices");
     let mut samples = 0;
     let allocated = counted(|| {
         for k in 0..1000_u16 {
@@ -343,7 +343,7 @@ fn joints_of_several_devices_allocate_nothing() {
                 let id = Id::standard(0x100 | address << 4);
                 let frame = Frame::new(id, &[0, 0, low, 0, 0, low, high, 0]);
                 let t = Nanos::from_millis(i64::from(k));
-                decoder.on_frame(&frame.at(t, StampKind::Software), |_| samples += 1);
+                devices.on_frame(&frame.at(t, StampKind::Software), |_| samples += 1);
             }
         }
     });
@@ -408,12 +408,12 @@ fn session(robot: &SimulatedRobot, seconds: f64) -> Vec<(usize, Frame)> {
     frames
 }
 
-fn decoders(robot: &SimulatedRobot) -> Vec<Decoder> {
+fn devices_of_buses(robot: &SimulatedRobot) -> Vec<BusDevices> {
     let status = |(bus, number)| Arc::new(BusStatus::new(number, bus));
     let buses = robot.plan.buses.iter().zip(0..);
     buses
         .map(|(bus, number)| {
-            Decoder::new(number, bus, Some(Mode::Listen), status((bus, number))).unwrap()
+            BusDevices::new(number, bus, Some(Mode::Listen), status((bus, number))).unwrap()
         })
         .collect()
 }
@@ -422,8 +422,8 @@ fn decoders(robot: &SimulatedRobot) -> Vec<Decoder> {
 fn decoding_allocates_nothing() {
     let robot = robot();
     let frames = session(&robot, 3.0);
-    let mut decoders = decoders(&robot);
-    let mut bad: Vec<_> = (0..decoders.len())
+    let mut buses = devices_of_buses(&robot);
+    let mut bad: Vec<_> = (0..buses.len())
         .map(|bus| BadFrames::new(&robot, bus))
         .collect();
     let (mut samples, mut at) = (0_u64, Nanos::ZERO);
@@ -431,12 +431,12 @@ fn decoding_allocates_nothing() {
     // Measured from the first frame on: no warm-up is needed.
     let allocated = counted(|| {
         for (bus, frame) in &frames {
-            decoders[*bus].on_frame(frame, |_| samples += 1);
+            buses[*bus].on_frame(frame, |_| samples += 1);
             at = frame.t;
             for bad in [bad[*bus].next(), bad[*bus].next()] {
-                decoders[*bus].on_frame(&bad.at(at, frame.stamp), |_| {});
+                buses[*bus].on_frame(&bad.at(at, frame.stamp), |_| {});
             }
-            decoders[*bus].poll_transmit(at, |device, t| commands.push((device, t.frame)));
+            buses[*bus].poll_transmit(at, |device, t| commands.push((device, t.frame)));
             for (device, command) in commands.drain(..) {
                 let refused = samples % 2 == 0;
                 let outcome = if refused {
@@ -444,12 +444,12 @@ fn decoding_allocates_nothing() {
                 } else {
                     Ok(at)
                 };
-                decoders[*bus].on_sent(device, &command, outcome);
+                buses[*bus].on_sent(device, &command, outcome);
             }
-            std::hint::black_box(decoders[*bus].next_wake());
+            std::hint::black_box(buses[*bus].next_wake());
         }
-        decoders[0].restart(at);
-        decoders[0].stop(at);
+        buses[0].restart(at);
+        buses[0].stop(at);
     });
     assert_eq!(allocated, (0, 0));
     assert!(
@@ -476,10 +476,10 @@ fn identification_in_the_pipeline_allocates_nothing_but_in_its_jobs() {
         .map(|c| setup.robot.channel(c.kind, &c.name))
         .collect();
     let hand = setup.robot.contact("hand").expect("the hand is a contact");
-    let mut decoders = decoders(&robot);
+    let mut buses = devices_of_buses(&robot);
     let mut samples = Vec::new();
     for (bus, frame) in session(&robot, 8.0) {
-        decoders[bus].on_frame(&frame, |sample| samples.push(*sample));
+        buses[bus].on_frame(&frame, |sample| samples.push(*sample));
     }
     let mut pipeline = Pipeline::new(setup);
     assert!(pipeline.identification_refused().is_none());
@@ -548,10 +548,10 @@ fn the_pipeline_allocates_nothing_once_it_runs() {
         .map(|c| setup.robot.channel(c.kind, &c.name))
         .collect();
     let hand = setup.robot.contact("hand").expect("the hand is a contact");
-    let mut decoders = decoders(&robot);
+    let mut buses = devices_of_buses(&robot);
     let mut samples = Vec::new();
     for (bus, frame) in session(&robot, 6.0) {
-        decoders[bus].on_frame(&frame, |sample| samples.push(*sample));
+        buses[bus].on_frame(&frame, |sample| samples.push(*sample));
     }
     let mut pipeline = Pipeline::new(setup);
     let run = |pipeline: &mut Pipeline, samples: &[Sample], trouble: bool| {
@@ -776,13 +776,13 @@ fn the_dynamics_allocate_nothing_after_construction() {
     );
 
     let unknown = [f64::NAN; 64];
-    let wrong = JointState {
+    let too_short = JointState {
         velocity: &unknown[..velocity.len()],
         ..state
     };
     let refused = counted(|| {
         assert!(stacked.update(&kinematics, &[], &all, &[]).is_err());
-        assert!(kinematics.update(model, wrong, motion).is_err());
+        assert!(kinematics.update(model, too_short, motion).is_err());
         assert!(kinematics.set_base(model, model.link_count()).is_err());
         assert!(
             solver

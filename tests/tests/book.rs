@@ -43,7 +43,7 @@ proprio help topics
 
 == first.md
 proprio demo
-    elsewhere tests/tests/command/demo.rs: fn a_demonstration_ends_well: needs the machine for itself
+    elsewhere tests/tests/command/demo.rs: fn a_demonstration_ends_well: needs the machine alone
 proprio status
     shows device l_elbow_motor streaming
     shows estimates/s
@@ -290,11 +290,11 @@ sudo proprio install
 
 == figures/truth.md
 cargo run
-    elsewhere tests/tests/command/demo.rs: fn a_demonstration_with_faults: needs the machine for itself
+    elsewhere tests/tests/command/demo.rs: fn a_demonstration_with_faults: needs the machine alone
 
 == ../../../README.md
 cargo run
-    elsewhere tests/tests/command/demo.rs: fn a_demonstration_ends_well: needs the machine for itself
+    elsewhere tests/tests/command/demo.rs: fn a_demonstration_ends_well: needs the machine alone
 cargo install cargo-deb
     elsewhere tests/run: cargo-deb --version: builds for minutes
 cargo deb

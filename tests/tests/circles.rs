@@ -140,12 +140,12 @@ impl Sources {
     }
 
     fn items(&mut self, file: usize, items: &[Item], folder: &Path, module: Vec<String>) {
-        let mut own = Module {
+        let mut this = Module {
             file,
             ..Module::default()
         };
         for item in items.iter().filter(|item| !is_test(attributes(item))) {
-            own.items.extend(name(item));
+            this.items.extend(name(item));
             match item {
                 Item::Mod(child) => {
                     let name = child.ident.to_string();
@@ -159,7 +159,7 @@ impl Sources {
                             self.file(&file, &folder.join(&name), path);
                         }
                     }
-                    own.children.insert(name);
+                    this.children.insert(name);
                 }
                 Item::Use(import) => {
                     let mut found = Vec::new();
@@ -169,9 +169,9 @@ impl Sources {
                             self.named.push((file, module.clone(), path.clone()));
                         }
                         if name == "*" {
-                            own.globs.push(path);
+                            this.globs.push(path);
                         } else {
-                            own.imports.insert(name, path);
+                            this.imports.insert(name, path);
                         }
                     }
                 }
@@ -183,7 +183,7 @@ impl Sources {
                 }
             }
         }
-        self.modules.insert(module, own);
+        self.modules.insert(module, this);
     }
 
     /// The file that defines `path`, seen from `module`; `None` if it is no file of this crate.
@@ -203,23 +203,23 @@ impl Sources {
     }
 
     fn below(&self, module: &[String], path: &[String], depth: usize) -> Option<usize> {
-        let own = self.modules.get(module)?;
+        let this = self.modules.get(module)?;
         let Some((first, rest)) = path.split_first() else {
-            return Some(own.file);
+            return Some(this.file);
         };
         if first == "super" {
             return self.below(module.split_last()?.1, rest, depth);
         }
-        if own.children.contains(first) {
+        if this.children.contains(first) {
             return self.below(&[module, std::slice::from_ref(first)].concat(), rest, depth);
         }
-        if own.items.contains(first) {
-            return Some(own.file);
+        if this.items.contains(first) {
+            return Some(this.file);
         }
-        if let Some(import) = own.imports.get(first) {
+        if let Some(import) = this.imports.get(first) {
             return self.defined(module, &[import, rest].concat(), depth + 1);
         }
-        let through = own.globs.iter().map(|glob| [&glob[..], path].concat());
+        let through = this.globs.iter().map(|glob| [&glob[..], path].concat());
         through
             .filter_map(|path| self.defined(module, &path, depth + 1))
             .next()
@@ -251,7 +251,7 @@ impl Sources {
             seen
         };
         let reached: Vec<BTreeSet<usize>> = (0..self.files.len()).map(reach).collect();
-        let mut told = BTreeSet::new();
+        let mut found = BTreeSet::new();
         for file in 0..self.files.len() {
             let circle: Vec<usize> = reached[file]
                 .iter()
@@ -271,10 +271,10 @@ impl Sources {
                 let arrows: Vec<String> = arrows
                     .map(|(a, b)| format!("{} -> {}", name(a), name(b)))
                     .collect();
-                told.insert(arrows.join("\n"));
+                found.insert(arrows.join("\n"));
             }
         }
-        told.into_iter().collect()
+        found.into_iter().collect()
     }
 }
 
@@ -361,9 +361,10 @@ fn written(files: &[(&str, &str)]) -> tempfile::TempDir {
 /// The circles of a crate of these files.
 fn example(files: &[(&str, &str)]) -> Vec<String> {
     let folder = written(files);
-    let told = Sources::read(&folder.path().join("lib.rs")).circles();
+    let circles = Sources::read(&folder.path().join("lib.rs")).circles();
     let place = format!("{}/", folder.path().display());
-    told.into_iter()
+    circles
+        .into_iter()
         .map(|circle| circle.replace(&place, ""))
         .collect()
 }

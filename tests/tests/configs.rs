@@ -92,11 +92,11 @@ fn every_robot_loads_and_its_files_fit_each_other() {
                 .unwrap()
                 .to_string_lossy()
                 .into_owned();
-            let told = text
+            let is_named = text
                 .lines()
                 .any(|l| l.starts_with('#') && l.contains(&name));
             assert!(
-                told,
+                is_named,
                 "{at}: there is no {}, and no comment says where it comes from",
                 config.model.display()
             );

@@ -240,17 +240,18 @@ fn it_says_what_it_runs() {
 
 /// The wrenches of the sensor after `since`.
 fn wrenches(samples: &[Sample], channel: u32, since: Nanos) -> Vec<([f64; 6], Quality)> {
-    let of = samples
+    let later = samples
         .iter()
         .filter(|s| s.channel == channel && s.header.acquired > since);
-    of.filter_map(|sample| match sample.reading() {
-        Some(Reading::Wrench(w)) => {
-            let ([a, b, c], [d, e, f]) = (w.force, w.torque);
-            Some(([a, b, c, d, e, f], sample.header.quality))
-        }
-        _ => None,
-    })
-    .collect()
+    later
+        .filter_map(|sample| match sample.reading() {
+            Some(Reading::Wrench(w)) => {
+                let ([a, b, c], [d, e, f]) = (w.force, w.torque);
+                Some(([a, b, c, d, e, f], sample.header.quality))
+            }
+            _ => None,
+        })
+        .collect()
 }
 
 #[test]
@@ -445,12 +446,12 @@ fn a_frozen_sensor_is_in_health_and_in_the_log() {
         .filter(|d| d["frozen"] == "fx, fy, fz, tx, ty, tz")
         .count();
     assert_eq!(named, 1, "{answer}");
-    let told = until(PATIENCE, || {
+    let line = until(PATIENCE, || {
         let log = running.gateway.log();
         log.contains("fx, fy, fz, tx, ty, tz repeats itself")
             .then_some(())
     });
-    told.expect("a line of the log");
+    line.expect("a line of the log");
     let output = running
         .rig
         .command(&["status", "--json"])

@@ -179,7 +179,7 @@ fn found(arm: &Arm, parameters: &Parameters, summary: &Json) {
         ];
         for (number, found) in own.parameters.into_iter().enumerate() {
             let deviation = own.deviations()[number];
-            let told = format!(
+            let what = format!(
                 "{} {number}: {found} +- {deviation}, {expected:?}",
                 own.joint
             );
@@ -187,7 +187,7 @@ fn found(arm: &Arm, parameters: &Parameters, summary: &Json) {
             assert!(
                 (found - expected[number]).abs() < 4.0 * deviation
                     || own.parameters[3] == 0.0 && (1..5).contains(&number),
-                "{told}"
+                "{what}"
             );
         }
         let relative = |i: usize| own.parameters[i] / expected[i] - 1.0;
@@ -206,9 +206,9 @@ fn found(arm: &Arm, parameters: &Parameters, summary: &Json) {
             own.joint,
             own.noise
         );
-        let told = &summary["drives"][&own.joint];
-        assert_eq!(told["constant"].as_f64(), Some(own.parameters[0]));
-        assert_eq!(told["signal"], "current");
+        let listed = &summary["drives"][&own.joint];
+        assert_eq!(listed["constant"].as_f64(), Some(own.parameters[0]));
+        assert_eq!(listed["signal"], "current");
     }
     let file = arm.rig.path("again.toml");
     parameters.save(&file).unwrap();
@@ -234,12 +234,12 @@ fn quiet(arm: &Arm, parameters: &Parameters) {
         arm.setup("estimator.toml", parameters),
         &log,
         |t, pipeline| {
-            let own = format!("{:?}", pipeline.last_estimate());
-            assert_eq!(Some(own), without.next().map(|other| format!("{other:?}")));
+            let text = format!("{:?}", pipeline.last_estimate());
+            assert_eq!(Some(text), without.next().map(|other| format!("{other:?}")));
             let said = pipeline.drives().unwrap();
-            for own in said.drives() {
-                assert_ne!(own.agreement, Agreement::Disagrees, "{t} {own:?}");
-                compared += usize::from(own.agreement == Agreement::Agrees);
+            for text in said.drives() {
+                assert_ne!(text.agreement, Agreement::Disagrees, "{t} {text:?}");
+                compared += usize::from(text.agreement == Agreement::Agrees);
             }
             assert!(said.candidates().is_empty());
         },
@@ -263,8 +263,8 @@ fn pushed(arm: &Arm, parameters: &Parameters) {
         let is_on = joints.iter().any(|joint| joint == "l_shoulder_pitch");
         if first.is_infinite() && (is_on || t > FROM + 0.5) {
             first = t;
-            let wrong = torque.torque - truth.at(t).joints[0].torque;
-            error = wrong.abs() / torque.standard_deviation;
+            let off = torque.torque - truth.at(t).joints[0].torque;
+            error = off.abs() / torque.standard_deviation;
         }
         if joints.is_empty() {
             return;
@@ -391,9 +391,9 @@ fn the_drive_of_a_real_leg_is_found() {
     let rows = drive_rows(&setup, &log[..]).unwrap();
     let part = |joint: &str, from: f64, to: f64| {
         let rows = &rows[setup.robot.model.dof(joint).unwrap()];
-        let own = rows.iter().copied();
-        let own = own.filter(|row| (from..to).contains(&row.t.seconds()));
-        drive::fit(joint, &[own.collect()])
+        let part = rows.iter().copied();
+        let part = part.filter(|row| (from..to).contains(&row.t.seconds()));
+        drive::fit(joint, &[part.collect()])
     };
     // The hip bears no more than its friction.
     assert!(matches!(
@@ -406,14 +406,14 @@ fn the_drive_of_a_real_leg_is_found() {
     let halves = [(0.0, 12.0), (12.0, 24.0)];
     let halves = halves.map(|(from, to)| part("knee", from, to).unwrap().unwrap());
     let [first, second] = [0, 1].map(|half: usize| {
-        let own: &DriveModel = &halves[half];
+        let model: &DriveModel = &halves[half];
         println!(
             "knee, half {half}: constant {:.3} +- {:.3}, noise {:.3} Nm",
-            own.parameters[0],
-            own.deviations()[0],
-            own.noise
+            model.parameters[0],
+            model.deviations()[0],
+            model.noise
         );
-        (own.parameters[0], own.deviations()[0])
+        (model.parameters[0], model.deviations()[0])
     });
     assert!((first.0 - second.0).abs() < 2.0 * first.1.hypot(second.1));
     assert!((0.8..1.2).contains(&first.0) && first.1 < 0.05);

@@ -163,9 +163,9 @@ fn every_format_gives_the_same_table() {
     };
     let table = |config: &str, log: &str| {
         let ran = decode(&rig, config, log);
-        let told = String::from_utf8_lossy(&ran.stderr).into_owned();
-        assert!(ran.status.success(), "{told}");
-        assert!(told.contains("0 of other interfaces, 0 "), "{told}");
+        let text = String::from_utf8_lossy(&ran.stderr).into_owned();
+        assert!(ran.status.success(), "{text}");
+        assert!(text.contains("0 of other interfaces, 0 "), "{text}");
         String::from_utf8(ran.stdout).expect("text")
     };
     let truth = table(&arm.gateway, &write("a", &log));
@@ -241,12 +241,12 @@ fn a_misleading_file_gives_one_message() {
         std::fs::write(&path, log).expect("a file in a temporary folder");
         let path = path.to_str().expect("a path in UTF-8");
         let ran = decode(&rig, &arm.gateway, path);
-        let told = String::from_utf8_lossy(&ran.stderr).into_owned();
-        assert_eq!(ran.status.code(), Some(1), "{told}");
-        assert_eq!(told.lines().count(), 1, "{told}");
+        let text = String::from_utf8_lossy(&ran.stderr).into_owned();
+        assert_eq!(ran.status.code(), Some(1), "{text}");
+        assert_eq!(text.lines().count(), 1, "{text}");
         assert!(
-            told.contains("the log holds no frame") && told.contains(what),
-            "{told}"
+            text.contains("the log holds no frame") && text.contains(what),
+            "{text}"
         );
     }
 }
@@ -303,9 +303,9 @@ fn a_gateway_replays_every_format() {
             process.log()
         );
         samples.take();
-        let told = process.log();
-        assert!(!told.contains("skipped"), "{told}");
-        let ends = told
+        let log = process.log();
+        assert!(!log.contains("skipped"), "{log}");
+        let ends = log
             .lines()
             .filter_map(|line| line.split_once("the log has ended "));
         let ends: BTreeSet<String> = ends.map(|(_, end)| end.to_owned()).collect();

@@ -547,12 +547,12 @@ fn a_wrong_cad_is_put_right_from_logs_of_the_simulated_arm() {
         "--out",
         "t.csv",
     ];
-    let told = String::from_utf8(place.run(&args).stderr).unwrap();
+    let text = String::from_utf8(place.run(&args).stderr).unwrap();
     assert!(
-        told.contains(
+        text.contains(
             "warning: turned.csv: wrench/l_arm_ft_sensor fits only with the opposite sign"
         ),
-        "{told}"
+        "{text}"
     );
 
     // A second run gives the same result, and --json prints the contents of the file.

@@ -4,7 +4,7 @@
 #![allow(missing_docs)]
 
 use proprio_drivers::State;
-use proprio_gateway::decoder::Decoder;
+use proprio_gateway::devices::BusDevices;
 use proprio_gateway::status::BusStatus;
 use proprio_simulator::simulator::JOINT_NOISE;
 use proprio_simulator::{SimulatedRobot, Simulation, SimulationSettings, Simulator};
@@ -121,23 +121,23 @@ fn coupled_wrapped_and_merged_joints_are_the_truth() {
     let mut simulator = Simulator::new(&robot, &settings, t0).expect("a simulator");
     let plan = &robot.plan.buses[1];
     let status = Arc::new(BusStatus::new(1, plan));
-    let mut decoder = Decoder::new(1, plan, None, status).expect("devices");
+    let mut devices = BusDevices::new(1, plan, None, status).expect("devices");
     let end = t0 + Nanos::from_seconds(8.0);
     let (mut samples, mut now) = (Vec::new(), t0);
     while now < end {
         while let Some((bus, frame)) = simulator.poll(now) {
             if bus == 1 {
                 let frame = frame.at(now, StampKind::Software);
-                decoder.on_frame(&frame, |sample| samples.push(*sample));
+                devices.on_frame(&frame, |sample| samples.push(*sample));
             }
         }
-        decoder.poll_transmit(now, |_, _| {});
-        let wakes = [simulator.next_wake(), decoder.next_wake()]
+        devices.poll_transmit(now, |_, _| {});
+        let wakes = [simulator.next_wake(), devices.next_wake()]
             .into_iter()
             .flatten();
         now = wakes.min().unwrap_or(end).max(now + Nanos(1));
     }
-    assert!(decoder.states().all(|state| state == State::Streaming));
+    assert!(devices.states().all(|state| state == State::Streaming));
     let at = |name: &str, t: f64| {
         let joint = simulation.joint(name).expect("a joint");
         simulation.motion(joint, t).expect("a motion")
@@ -211,13 +211,13 @@ fn a_gateway_publishes_one_channel_for_each_joint() {
     let rig = Rig::new();
     let folder = rig.path("robot");
     // Buses of its own: other tests' arms are on the virtual bus, too.
-    let own = rig
+    let name = rig
         .path("")
         .file_name()
         .and_then(|name| name.to_str())
         .expect("a name")
         .to_owned();
-    let robot = write(&folder, &own, "");
+    let robot = write(&folder, &name, "");
     let text = |path: &Path| path.to_str().expect("a path in UTF-8").to_owned();
     let gateway = text(&folder.join("gateway.toml"));
     let check = rig.run(&["gateway", "--config", &gateway, "--check"]);

@@ -265,10 +265,10 @@ fn a_sensor_the_wrong_way_round_is_told_live() {
     let mut gateway = rig.start(&["gateway", "--config", gateway]);
     let mut estimator = rig.start(&["estimator", "--config", file]);
     let words = "l_arm_ft_sensor fits only with the opposite sign";
-    let told = until(PATIENCE + Nanos::from_millis(20_000), || {
+    let line = until(PATIENCE + Nanos::from_millis(20_000), || {
         estimator.log().contains(words).then_some(())
     });
-    assert!(told.is_some(), "{}", estimator.log());
+    assert!(line.is_some(), "{}", estimator.log());
     [&mut estimator, &mut gateway, &mut simulator]
         .into_iter()
         .for_each(Process::end);

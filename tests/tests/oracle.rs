@@ -224,11 +224,11 @@ impl<'a> Robot<'a> {
             String::from_utf8_lossy(&ran.stderr),
         );
         assert!(ran.status.success(), "{what}: {err}");
-        let told: Json = serde_json::from_str(out.trim()).unwrap();
+        let report: Json = serde_json::from_str(out.trim()).unwrap();
         assert_eq!(
-            (&told["estimates"], &told["torques_withheld"]),
+            (&report["estimates"], &report["torques_withheld"]),
             (&rows.len().into(), &0.into()),
-            "{what}: {told}"
+            "{what}: {report}"
         );
 
         let estimates = table(&fs::read_to_string(rig.path("estimates.csv")).unwrap());

@@ -5,7 +5,7 @@
 use proprio_dynamics::spatial::{Pose, RigidInertia, Vec3};
 use proprio_dynamics::{FrameMotion, JointState, Kinematics};
 use proprio_estimator::config::Config;
-use proprio_estimator::reading;
+use proprio_estimator::sample_log;
 use proprio_estimator::setup::Setup;
 use proprio_identification::forecast::SensorNoise;
 use proprio_identification::prior::cad_root;
@@ -192,7 +192,7 @@ fn record(
 fn identified(robot: &Robot, logs: &[String]) -> Outcome {
     let datasets = logs
         .iter()
-        .map(|log| reading::dataset(robot, "log.csv", LogRole::Train, log.as_bytes()).unwrap());
+        .map(|log| sample_log::dataset(robot, "log.csv", LogRole::Train, log.as_bytes()).unwrap());
     identify(robot, datasets.collect(), &[], &mut |_| {}).unwrap()
 }
 
@@ -518,8 +518,8 @@ fn a_written_motion_keeps_limits_and_box() {
     ];
     let (is_good, told, error) = proprio(&[&args[..], &limits[..], &["--json"]].concat());
     assert!(is_good, "{error}");
-    let told: serde_json::Value = serde_json::from_str(&told).unwrap();
-    for torque in told["torques"].as_array().unwrap() {
+    let report: serde_json::Value = serde_json::from_str(&told).unwrap();
+    for torque in report["torques"].as_array().unwrap() {
         let [before, after] = ["before", "after"].map(|key| torque[key].as_f64().unwrap());
         assert!(torque["wanted"] == true && after < before / 5.0, "{torque}");
     }
@@ -538,7 +538,7 @@ fn a_written_motion_keeps_limits_and_box() {
             let mut position = vec![0.0; 3];
             for (name, [q, v, a]) in &joints {
                 let at = |values: &[f64]| [values[row], values[row + 1]];
-                let own = between(h, at(q), at(v), s);
+                let middle = between(h, at(q), at(v), s);
                 let velocity = between(h, at(v), at(a), s);
                 let (dof, joint) = (model.dof(name).unwrap(), model.joint(name).unwrap());
                 let range = model.limits(joint).unwrap();
@@ -547,8 +547,8 @@ fn a_written_motion_keeps_limits_and_box() {
                     _ => ([range.lower, range.upper], [2.5, 5.0]),
                 };
                 assert!(
-                    own > range[0] && own < range[1],
-                    "{name}: {own} at {}",
+                    middle > range[0] && middle < range[1],
+                    "{name}: {middle} at {}",
                     t[row]
                 );
                 assert!(velocity.abs() < most[0], "{name}: {velocity} at {}", t[row]);
@@ -557,7 +557,7 @@ fn a_written_motion_keeps_limits_and_box() {
                     "{name} at {}",
                     t[row]
                 );
-                position[dof] = own;
+                position[dof] = middle;
             }
             let still = [0.0; 3];
             let state = JointState {
@@ -653,8 +653,8 @@ fn what_is_identifiable_is_told() {
     ];
     let (is_good, told, error) = proprio(&args);
     assert!(is_good, "{error}");
-    let told: serde_json::Value = serde_json::from_str(&told).unwrap();
-    let set = &told["sets"][0];
+    let report: serde_json::Value = serde_json::from_str(&told).unwrap();
+    let set = &report["sets"][0];
     assert_eq!(
         (set["rank"].as_u64(), set["unknowns"].as_u64()),
         (Some(44), Some(96))
@@ -686,8 +686,8 @@ fn what_is_identifiable_is_told() {
         ] {
             args.extend(["--sensors", sensors]);
         }
-        let told: serde_json::Value = serde_json::from_str(&proprio(&args).1).unwrap();
-        let ranks = told["sets"]
+        let report: serde_json::Value = serde_json::from_str(&proprio(&args).1).unwrap();
+        let ranks = report["sets"]
             .as_array()
             .unwrap()
             .iter()

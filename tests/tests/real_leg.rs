@@ -6,7 +6,7 @@
 use proprio_estimator::config::{Config, Occurrence};
 use proprio_estimator::export::parameters;
 use proprio_estimator::offline::estimate;
-use proprio_estimator::reading;
+use proprio_estimator::sample_log;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::link::send_by;
 use proprio_gateway::link::virtual_bus::VirtualBus;
@@ -412,17 +412,17 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
         .sum();
     assert_eq!(received, frames, "every frame that was played");
     health.fresh();
-    let told = health.fresh();
+    let last = health.fresh();
     assert_eq!(
-        (recorder.lost(), told.lost),
+        (recorder.lost(), last.lost),
         (0, 0),
         "nothing lost on the way here or to the estimator"
     );
     gateway.end();
     estimator.end();
     // User-mode Linux often stalls for longer than half the wait.
-    if told.late > 0 && !uml() {
-        println!("{} samples were late: trying again", told.late);
+    if last.late > 0 && !uml() {
+        println!("{} samples were late: trying again", last.late);
         return false;
     }
 
@@ -454,7 +454,7 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
         .count();
     assert!(
         before * 10 < offline.len()
-            && live.len() + before + 5 + told.late as usize >= offline.len(),
+            && live.len() + before + 5 + last.late as usize >= offline.len(),
         "{} live, {} offline, {before} of them before the first that is live",
         live.len(),
         offline.len()
@@ -473,11 +473,11 @@ fn one_live_is_replay(buses: [&str; 2], play: Play<'_>) -> bool {
     println!(
         "{different} of {} live estimates differ, {} samples were late",
         live.len(),
-        told.late
+        last.late
     );
     // Late samples change the estimates around them. Beyond the longest window the estimates agree
     // again.
-    let may_differ = if told.late > 0 { live.len() * 2 / 3 } else { 0 };
+    let may_differ = if last.late > 0 { live.len() * 2 / 3 } else { 0 };
     assert!(
         different <= may_differ,
         "{different} of {} live estimates",
@@ -570,7 +570,8 @@ fn on_line_the_torques_of_a_real_leg_are_what_they_are_from_its_log() {
     let identified = {
         let setup = leg.setup();
         let log = texts[1].as_bytes();
-        let dataset = reading::dataset(&setup.robot, spans[1], LogRole::Train, log).expect("a log");
+        let dataset =
+            sample_log::dataset(&setup.robot, spans[1], LogRole::Train, log).expect("a log");
         let outcome = identify(&setup.robot, vec![dataset], &[], &mut |_| ()).expect("an outcome");
         let mut with = setup.clone();
         with.apply(&parameters(&outcome, &setup.robot, "this test").expect("parameters"))

@@ -174,8 +174,8 @@ fn a_recording_with_frames_and_configuration_is_enough() {
     ]);
     recorder.wait();
     split.wait();
-    let told = recorder.output();
-    assert!(told.contains(" frames, 0 lost"), "{told}");
+    let output = recorder.output();
+    assert!(output.contains(" frames, 0 lost"), "{output}");
 
     let table = |recording: &str, more: &[&str]| {
         let out = path("table.csv");
@@ -382,8 +382,8 @@ fn a_black_box_writes_when_something_happens() {
     let id = Pid::from_raw(i32::try_from(recorder.id()).expect("a process number"));
     kill(id, Signal::SIGTERM).expect("the signal is sent");
     recorder.wait();
-    let told = recorder.output();
-    assert!(told.contains(" 0 lost"), "{told}");
+    let output = recorder.output();
+    assert!(output.contains(" 0 lost"), "{output}");
     let ends = |entry: &fs::DirEntry| entry.path().extension().is_some_and(|it| it == "mcap");
     let entries = fs::read_dir(&folder).expect("the folder").flatten();
     assert!(

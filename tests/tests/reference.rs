@@ -40,18 +40,18 @@ fn kind(schema: &Value) -> String {
         Some("number") => "a number".into(),
         Some("object") => "a table".into(),
         Some("array") => {
-            let of = kind(&schema["items"]);
-            let of = match of.split_once(' ') {
+            let items = kind(&schema["items"]);
+            let items = match items.split_once(' ') {
                 Some(("a", noun)) => noun.replacen("list", "lists", 1),
-                _ => of.replacen("list", "lists", 1),
+                _ => items.replacen("list", "lists", 1),
             };
-            let many = if of.ends_with('s') { "" } else { "s" };
+            let many = if items.ends_with('s') { "" } else { "s" };
             match schema["minItems"]
                 .as_u64()
                 .filter(|n| schema["maxItems"] == *n)
             {
-                Some(count) => format!("a list of {count} {of}{many}"),
-                None => format!("a list of {of}{many}"),
+                Some(count) => format!("a list of {count} {items}{many}"),
+                None => format!("a list of {items}{many}"),
             }
         }
         _ => panic!("no kind: {schema}"),

@@ -1,5 +1,5 @@
 //! A skin from the bus to the contact wrench: the simulated boards of an arm and of the skin on its
-//! forearm, the gateway's decoders, and the estimator.
+//! forearm, the gateway's devices, and the estimator.
 #![allow(missing_docs)]
 
 use proprio_simulator::record::record;
@@ -197,11 +197,11 @@ fn a_touch_on_the_bus_becomes_a_wrench_where_it_is() {
     };
     let (touched, detected) = (first(skin, "located"), first(blind, "detected"));
     let explains = |row: &usize| {
-        let told = blind
+        let reasons = blind
             .iter()
             .filter(|(name, _)| name.starts_with("residual/"));
-        let mut told = told.filter(|(name, _)| name.ends_with("/reason"));
-        seconds(*row) > FROM && told.any(|(_, cells)| !cells[*row].is_empty())
+        let mut reasons = reasons.filter(|(name, _)| name.ends_with("/reason"));
+        seconds(*row) > FROM && reasons.any(|(_, cells)| !cells[*row].is_empty())
     };
     let unexplained = (0..rows).find(explains).map(|row| seconds(row) - FROM);
     let hand = (0..rows).filter(|&row| (FROM..FROM + 2.0).contains(&seconds(row)));
@@ -227,15 +227,15 @@ fn a_touch_on_the_bus_becomes_a_wrench_where_it_is() {
             "{}",
             seconds(row)
         );
-        let of = |part: &str| number(skin, &format!("contact/forearm/{part}"), row);
-        farthest = farthest.max(away([of("px"), of("py"), of("pz")]));
+        let value = |part: &str| number(skin, &format!("contact/forearm/{part}"), row);
+        farthest = farthest.max(away([value("px"), value("py"), value("pz")]));
         for (part, truth) in parts.iter().zip(truth()) {
-            let std = of(&format!("{part}_std"));
+            let std = value(&format!("{part}_std"));
             compared += 1;
-            beyond += usize::from((of(part) - truth).abs() > 3.0 * std);
+            beyond += usize::from((value(part) - truth).abs() > 3.0 * std);
             if part.starts_with('f') {
                 stated = stated.max(std);
-                worst = worst.max((of(part) - truth).abs());
+                worst = worst.max((value(part) - truth).abs());
                 let blind = number(blind, &format!("contact/forearm/{part}"), row);
                 blind_worst = blind_worst.max((blind - truth).abs());
             }

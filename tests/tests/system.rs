@@ -329,10 +329,10 @@ fn what_fell_silent_was_last_seen_and_withholds_torques() {
     // Who waits for its samples is told.
     let mut echo = rig.command(&["echo", "l_elbow"]);
     let mut echo = echo.stderr(Stdio::piped()).spawn().expect("it runs");
-    let mut told = [0; 8];
+    let mut word = [0; 8];
     let mut log = echo.stderr.take().expect("a pipe");
-    log.read_exact(&mut told).expect("a line");
-    assert_eq!(&told, b"waiting:");
+    log.read_exact(&mut word).expect("a line");
+    assert_eq!(&word, b"waiting:");
     kill(
         Pid::from_raw(i32::try_from(echo.id()).expect("a process")),
         Signal::SIGINT,
@@ -503,9 +503,9 @@ fn a_status_that_differs_from_its_schema_is_noticed() {
             "status.robots[]: no robot",
         ),
     ] {
-        let mut wrong = right.clone();
-        wrong[key] = value;
-        let found = violations(&wrong, &schema(), "status");
+        let mut altered = right.clone();
+        altered[key] = value;
+        let found = violations(&altered, &schema(), "status");
         assert!(found[0].starts_with(expected), "{found:?}");
     }
 }

@@ -72,12 +72,12 @@ fn log(unit: &str) -> String {
 /// Waits until `condition` holds.
 fn eventually(what: &str, limit: Nanos, mut condition: impl FnMut() -> bool) {
     // Each look starts processes, of which every one costs the services time.
-    let mut look = || {
+    let mut check = || {
         let holds = condition();
         std::thread::sleep(std::time::Duration::from_millis(200));
         holds.then_some(())
     };
-    let holds = until(limit, &mut look).is_some();
+    let holds = until(limit, &mut check).is_some();
     let logs = || UNITS.map(log).join("\n");
     assert!(holds, "not within {limit} s: {what}\n{}", logs());
 }
@@ -165,10 +165,10 @@ impl Machine {
         fs::write(program, format!("#!/bin/sh\n{line}\n")).expect("a program");
         fs::set_permissions(program, fs::Permissions::from_mode(0o755)).expect("a program");
         let unit = format!("/usr/share/doc/proprio/examples/{LOOP}");
-        let own = Path::new("/etc/systemd/system").join(LOOP);
+        let unit_file = Path::new("/etc/systemd/system").join(LOOP);
         // systemd takes seconds to read all units again.
-        if !own.exists() {
-            fs::copy(unit, own).expect("the example");
+        if !unit_file.exists() {
+            fs::copy(unit, unit_file).expect("the example");
             sh("systemctl daemon-reload");
         }
         sh(&format!("systemctl restart {LOOP}"));
@@ -224,8 +224,8 @@ fn a_package_waits_for_a_configuration_and_a_purge_leaves_nothing() {
         "rm -f {READ} /usr/local/bin/control-loop /etc/systemd/system/{LOOP}"
     ));
     assert_eq!(leftovers(PROGRAM), "", "before");
-    let told = sh(&format!("dpkg -i {package}"));
-    assert!(told.contains("no robot is configured"), "{told}");
+    let output = sh(&format!("dpkg -i {package}"));
+    assert!(output.contains("no robot is configured"), "{output}");
     for unit in UNITS {
         assert_eq!(property(unit, "UnitFileState"), "enabled", "{unit}");
         assert_eq!(property(unit, "ConditionResult"), "no", "{unit}");
@@ -401,7 +401,7 @@ fn a_wrong_configuration_is_told_once_and_a_reload_refuses_it() {
     for (unit, file) in UNITS.into_iter().zip(["gateway.toml", "estimator.toml"]) {
         machine.configure(file, |text| "bogus = 1\n".to_owned() + &text);
         let errors = || journal(&format!("-p err -u {unit}"));
-        let told = errors().matches("bogus = 1").count();
+        let before = errors().matches("bogus = 1").count();
         let (_, restarted) = attempt(&format!("systemctl restart {unit}"));
         assert!(!restarted, "{unit} starts with a wrong file");
         std::thread::sleep(std::time::Duration::from_secs(2));
@@ -410,7 +410,7 @@ fn a_wrong_configuration_is_told_once_and_a_reload_refuses_it() {
         assert_eq!(property(unit, "NRestarts"), "0", "{unit}: a loop");
         assert_eq!(
             errors().matches("bogus = 1").count(),
-            told + 1,
+            before + 1,
             "{unit}: {}",
             attempt("journalctl --no-pager -o verbose --grep 'bogus = 1'").0
         );
@@ -441,7 +441,7 @@ fn a_full_disk_costs_the_state_of_identification_and_nothing_else() {
     let estimator = UNITS[1];
     sh("mount -t tmpfs -o size=1m,uid=proprio,gid=proprio,mode=755 tmpfs /var/lib/proprio");
     let _ = attempt("cat /dev/zero >/var/lib/proprio/full");
-    let told = log(estimator).len();
+    let before = log(estimator).len();
     let learn = |table: &mut toml::Table| {
         for contact in table["contact"].as_array_mut().expect("contacts") {
             let contact = contact.as_table_mut().expect("a table");
@@ -457,7 +457,7 @@ fn a_full_disk_costs_the_state_of_identification_and_nothing_else() {
     let id = process(estimator);
     let counted = |what| {
         let text = log(estimator);
-        text[told..].matches(what).count()
+        text[before..].matches(what).count()
     };
     eventually("the full disk is told", PATIENCE, || {
         counted("No space left") > 0

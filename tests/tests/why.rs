@@ -313,8 +313,9 @@ fn what_is_not_configured_well_is_named() {
 fn what_contradicts_the_configuration_is_named() {
     let reverse = |device: &mut Table| {
         let joints = device.get_mut("joint").and_then(Value::as_array_mut)?;
-        let own = joints.first_mut()?.as_table_mut()?;
-        (own.get("name")?.as_str()? == "l_elbow").then(|| own.insert("sign".into(), (-1).into()))
+        let joint = joints.first_mut()?.as_table_mut()?;
+        (joint.get("name")?.as_str()? == "l_elbow")
+            .then(|| joint.insert("sign".into(), (-1).into()))
     };
     let reversed = identifying().each_device(|_, device| {
         let _ = reverse(device);

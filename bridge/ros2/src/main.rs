@@ -142,7 +142,7 @@ fn run(args: &Ros2Args, options: NodeOptions) -> anyhow::Result<()> {
     messages.know(listener.series())?;
     messages.announce()?;
     let mut next = monotonic();
-    let mut told = String::new();
+    let mut last_text = String::new();
     while !stop.load(Relaxed) {
         let now = monotonic();
         messages.sink().turn(now)?;
@@ -156,9 +156,9 @@ fn run(args: &Ros2Args, options: NodeOptions) -> anyhow::Result<()> {
             // The listener mends itself, or goes on when the robot's daemons do.
             Err(Failure::Listen(error)) => {
                 let text = error.to_string();
-                if text != told {
+                if text != last_text {
                     eprintln!("{text}");
-                    told = text;
+                    last_text = text;
                 }
                 sleep_until(now + WAIT);
             }

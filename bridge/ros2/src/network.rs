@@ -65,27 +65,28 @@ mod tests {
 
     #[test]
     fn the_variables_of_ros_count() {
-        let of = |name: &'static str, value: &'static str| {
+        let addresses_with = |name: &'static str, value: &'static str| {
             addresses(&[], move |asked| (asked == name).then(|| value.to_owned()))
         };
         let loopback = Some(vec![IpAddr::V4(Ipv4Addr::LOCALHOST)]);
-        assert_eq!(of("", "").unwrap(), None);
-        assert_eq!(of("ROS_LOCALHOST_ONLY", "0").unwrap(), None);
-        assert_eq!(of("ROS_LOCALHOST_ONLY", "1").unwrap(), loopback);
+        assert_eq!(addresses_with("", "").unwrap(), None);
+        assert_eq!(addresses_with("ROS_LOCALHOST_ONLY", "0").unwrap(), None);
+        assert_eq!(addresses_with("ROS_LOCALHOST_ONLY", "1").unwrap(), loopback);
         let range = "ROS_AUTOMATIC_DISCOVERY_RANGE";
-        assert_eq!(of(range, "SUBNET").unwrap(), None);
-        assert_eq!(of(range, "LOCALHOST").unwrap(), loopback);
-        assert!(of(range, "OFF").is_err());
-        assert!(of(range, "EVERYWHERE").is_err());
+        assert_eq!(addresses_with(range, "SUBNET").unwrap(), None);
+        assert_eq!(addresses_with(range, "LOCALHOST").unwrap(), loopback);
+        assert!(addresses_with(range, "OFF").is_err());
+        assert!(addresses_with(range, "EVERYWHERE").is_err());
     }
 
     #[test]
     fn interfaces_are_named_or_addressed() {
-        let of = |interface: &str| addresses(&[interface.to_owned()], |_| Some("1".to_owned()));
+        let addresses_at =
+            |interface: &str| addresses(&[interface.to_owned()], |_| Some("1".to_owned()));
         let loopback = Some(vec![IpAddr::V4(Ipv4Addr::LOCALHOST)]);
-        assert_eq!(of("lo").unwrap(), loopback);
-        assert_eq!(of("127.0.0.1").unwrap(), loopback);
-        let error = of("none0").unwrap_err().to_string();
+        assert_eq!(addresses_at("lo").unwrap(), loopback);
+        assert_eq!(addresses_at("127.0.0.1").unwrap(), loopback);
+        let error = addresses_at("none0").unwrap_err().to_string();
         assert!(error.contains("lo (127.0.0.1)"), "{error}");
     }
 }

@@ -197,20 +197,20 @@ mod tests {
         let file = Path::new(env!("CARGO_MANIFEST_DIR"));
         let file = file.join("../../config/icub_left_arm/model.urdf");
         let model = ShownModel::read(&file, BTreeMap::new()).expect("a model");
-        let of = |unknown: &str| {
+        let children = |unknown: &str| {
             let transforms = model.transforms(|name| match name {
                 name if name == unknown => f64::NAN,
                 _ => 0.1,
             });
             transforms.iter().map(|it| it.child).collect::<Vec<_>>()
         };
-        let all = of("");
+        let all = children("");
         assert_eq!(all.len(), 10);
         let some: Vec<_> = all
             .iter()
             .copied()
             .filter(|it| *it != "l_forearm")
             .collect();
-        assert_eq!(of("l_wrist_prosup"), some);
+        assert_eq!(children("l_wrist_prosup"), some);
     }
 }

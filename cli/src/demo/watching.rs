@@ -334,7 +334,7 @@ impl LiveTable {
                 Nanos::from_millis(1000)
             };
         let elapsed = (now - begin).seconds();
-        let of = |i: usize| last.joints.get(i);
+        let estimate = |i: usize| last.joints.get(i);
         let moves = elapsed >= self.still;
         if !self.terminal {
             if moves && !std::mem::replace(&mut self.has_told, true) {
@@ -344,7 +344,7 @@ impl LiveTable {
                 .joints
                 .iter()
                 .map(|(i, j)| {
-                    of(*i).map_or_else(String::new, |t| {
+                    estimate(*i).map_or_else(String::new, |t| {
                         if t.valid == 1 {
                             format!("{j} {:.2}", t.torque)
                         } else {
@@ -358,7 +358,7 @@ impl LiveTable {
         }
         let mut text = String::new();
         for (i, joint) in &self.joints {
-            let Some(torque) = of(*i) else { continue };
+            let Some(torque) = estimate(*i) else { continue };
             let value = if torque.valid == 1 {
                 format!(
                     "{:>9.3} Nm  +- {:.3}",

@@ -45,11 +45,11 @@ pub(super) fn identify(
     }
     let robot = &setup.robot;
     let of_joint = |dof: usize| {
-        let own: Vec<Vec<DriveRow>> = (logs.iter_mut())
+        let rows: Vec<Vec<DriveRow>> = (logs.iter_mut())
             .filter_map(|log| log.get_mut(dof).map(std::mem::take))
             .collect();
         let joint = robot.model.dof_name(dof);
-        Some((joint.to_owned(), drive::fit(joint, &own)?))
+        Some((joint.to_owned(), drive::fit(joint, &rows)?))
     };
     Ok(robot.published().filter_map(of_joint).collect())
 }

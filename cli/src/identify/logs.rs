@@ -1,9 +1,9 @@
 //! Opens and reads recorded logs, and names them.
 
-use crate::convert::check_columns;
+use crate::convert::check_header;
 use crate::samples;
 use anyhow::Context;
-use proprio_estimator::reading;
+use proprio_estimator::sample_log;
 use proprio_estimator::setup::Setup;
 use proprio_identification::{Dataset, LogRole};
 use std::fs::File;
@@ -28,7 +28,7 @@ pub(super) fn open(
             break;
         }
     }
-    check_columns(&header, file, config, setup)?;
+    check_header(&header, file, config, setup)?;
     Ok(Cursor::new(header).chain(table))
 }
 
@@ -39,7 +39,7 @@ pub(super) fn read(
     role: LogRole,
     table: &mut (impl Read + Send),
 ) -> anyhow::Result<Dataset> {
-    let dataset = reading::dataset_or_unreadable(&setup.robot, name, role, table);
+    let dataset = sample_log::dataset_or_unreadable(&setup.robot, name, role, table);
     dataset.with_context(|| name.to_owned())
 }
 
@@ -65,8 +65,8 @@ pub(super) fn names(files: &[(&PathBuf, LogRole)]) -> Vec<String> {
                     .count()
                     == 1
             };
-            let told = (1..=most).find(alone).map(|parts| short(file, parts));
-            told.unwrap_or_else(|| file.display().to_string())
+            let name = (1..=most).find(alone).map(|parts| short(file, parts));
+            name.unwrap_or_else(|| file.display().to_string())
         })
         .collect()
 }

@@ -204,10 +204,10 @@ mod tests {
     #[test]
     fn nothing_identified_is_told_first() {
         let html = made(&example::nothing());
-        let told = html
+        let reason = html
             .find("Nothing was identified: no joint moved in any log.")
             .expect("the reason");
-        assert!(html.find("<figure>").is_none_or(|figure| told < figure));
+        assert!(html.find("<figure>").is_none_or(|figure| reason < figure));
         assert!(html.contains("record the robot moving") && !html.contains("NaN"));
     }
 
@@ -257,7 +257,7 @@ mod tests {
 
     #[test]
     fn a_browser_finds_what_is_wrong() {
-        let wrong = report::page(
+        let faulty = report::page(
             "wrong",
             &[
                 "<p style=\"width:2000px\">wide</p><p style=\"font-size:6px\">small</p>\
@@ -266,7 +266,7 @@ mod tests {
                     .to_owned(),
             ],
         );
-        if let Some(faults) = browse(&[("wrong", &wrong)]) {
+        if let Some(faults) = browse(&[("wrong", &faulty)]) {
             for fault in [
                 "px wide",
                 "smaller than 10 px",

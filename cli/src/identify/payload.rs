@@ -33,7 +33,7 @@ pub(super) fn run(
     as_json: bool,
 ) -> anyhow::Result<()> {
     let mut configured = None;
-    let (config, mut setup) = proprio_estimator::daemon::load(config_file, |config| {
+    let (config, mut setup) = Setup::load(config_file, |config| {
         configured = config.parameters.take();
         config.identification.enabled = false;
     })?;
@@ -127,7 +127,7 @@ fn json(name: &str, found: &Payload) -> serde_json::Value {
     let (mass, mass_std) = found.mass();
     let ((centre, centre_std), (tensor, tensor_std)) = (found.centre(), found.about_centre());
     let six = |m: &Mat3| COMPONENTS.map(|(_, place)| m[place]);
-    let told = |value: serde_json::Value| {
+    let if_significant = |value: serde_json::Value| {
         if found.is_significant() {
             value
         } else {
@@ -139,11 +139,11 @@ fn json(name: &str, found: &Payload) -> serde_json::Value {
         "is_significant": found.is_significant(),
         "mass_kg": mass,
         "mass_std_kg": mass_std,
-        "centre_m": told(<[f64; 3]>::from(centre).to_vec().into()),
-        "centre_std_m": told(<[f64; 3]>::from(centre_std).to_vec().into()),
+        "centre_m": if_significant(<[f64; 3]>::from(centre).to_vec().into()),
+        "centre_std_m": if_significant(<[f64; 3]>::from(centre_std).to_vec().into()),
         "first_moment_kgm": found.parameters[1..4],
-        "inertia_kgm2": told(six(&tensor).to_vec().into()),
-        "inertia_std_kgm2": told(six(&tensor_std).to_vec().into()),
+        "inertia_kgm2": if_significant(six(&tensor).to_vec().into()),
+        "inertia_std_kgm2": if_significant(six(&tensor_std).to_vec().into()),
         "instants": found.instants,
     })
 }

@@ -161,7 +161,7 @@ impl BlackBox {
         let time = time.strftime("%Y%m%dT%H%M%S%.3fZ");
         let is_word = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
         let why: String = (why.chars().map(|c| if is_word(c) { c } else { '_' })).collect();
-        let place = self
+        let path = self
             .folder
             .join(format!("{}_{time}_{why}.mcap", self.robot));
         let snapshot = self.ring.snapshot(series).map_err(io::Error::other)?;
@@ -169,18 +169,18 @@ impl BlackBox {
         let writing = thread::Builder::new()
             .name("snapshot".into())
             .spawn(move || {
-                let written = write(&snapshot, &place);
+                let written = write(&snapshot, &path);
                 let written = written
-                    .map_err(|error| format!("{}: cannot be written: {error}", place.display()));
+                    .map_err(|error| format!("{}: cannot be written: {error}", path.display()));
                 match &written {
-                    Ok(()) => tracing::info!("{} is written", place.display()),
+                    Ok(()) => tracing::info!("{} is written", path.display()),
                     Err(error) => tracing::error!("{error}"),
                 }
                 if written.is_ok() {
-                    keep(&all, place.clone());
+                    keep(&all, path.clone());
                 }
                 if let Some(client) = client {
-                    let file = written.as_ref().map(|()| place.as_path());
+                    let file = written.as_ref().map(|()| path.as_path());
                     client.answer(file.map_err(String::as_str));
                 }
             })?;
@@ -208,18 +208,18 @@ impl BlackBox {
 }
 
 /// Writes a file: it has its name when it is complete, and outlives a loss of power then.
-fn write(snapshot: &RingSnapshot, place: &Path) -> io::Result<()> {
-    let file = BufWriter::new(files::begin(place)?);
+fn write(snapshot: &RingSnapshot, path: &Path) -> io::Result<()> {
+    let file = BufWriter::new(files::begin(path)?);
     let file = snapshot.write(file).map_err(io::Error::other)?;
-    files::end(file.into_inner()?, place, 0o644)
+    files::end(file.into_inner()?, path, 0o644)
 }
 
 /// Adds a file to those that are there; the oldest is deleted if there are enough.
-fn keep(written: &Mutex<VecDeque<PathBuf>>, place: PathBuf) {
+fn keep(written: &Mutex<VecDeque<PathBuf>>, path: PathBuf) {
     let Ok(mut written) = written.lock() else {
         return;
     };
-    written.push_back(place);
+    written.push_back(path);
     if written.len() > KEPT
         && let Some(oldest) = written.pop_front()
     {

@@ -286,15 +286,15 @@ impl Plot {
             );
         }
         for (at, text) in &self.marks {
-            let place = x.at(*at);
-            if !(0.0..=1.0).contains(&place) {
+            let fraction = x.at(*at);
+            if !(0.0..=1.0).contains(&fraction) {
                 continue;
             }
             // Above the plot, extending towards its middle, so that the text stays inside.
-            let (side, percent) = if place > 0.5 {
-                ("right", 1.0 - place)
+            let (side, percent) = if fraction > 0.5 {
+                ("right", 1.0 - fraction)
             } else {
-                ("left", place)
+                ("left", fraction)
             };
             let _ = write!(
                 html,
@@ -345,7 +345,7 @@ impl Plot {
 
     fn draw(&self, series: &Trace, x: &Range, y: &Range, html: &mut String) {
         let class = series.ink.class();
-        let place = |px: f64, py: f64| (x.at(px) * WIDE, (1.0 - y.at(py)) * HIGH);
+        let point = |px: f64, py: f64| (x.at(px) * WIDE, (1.0 - y.at(py)) * HIGH);
         match &series.shape {
             Shape::Line(points) => {
                 let points = thin(points, if self.most == 0 { 1000 } else { self.most });
@@ -353,7 +353,7 @@ impl Plot {
                 for (px, py) in points {
                     if py.is_finite() && px.is_finite() && !(y.scale == AxisScale::Log && py <= 0.0)
                     {
-                        path.to(place(px, py));
+                        path.to(point(px, py));
                     } else {
                         path.lift();
                     }
@@ -374,10 +374,10 @@ impl Plot {
                 for run in points.split(|(_, low, high)| !low.is_finite() || !high.is_finite()) {
                     path.lift();
                     run.iter()
-                        .for_each(|(px, _, high)| path.to(place(*px, *high)));
+                        .for_each(|(px, _, high)| path.to(point(*px, *high)));
                     run.iter()
                         .rev()
-                        .for_each(|(px, low, _)| path.to(place(*px, *low)));
+                        .for_each(|(px, low, _)| path.to(point(*px, *low)));
                     if !run.is_empty() {
                         path.text.push('z');
                     }
@@ -393,14 +393,14 @@ impl Plot {
                     {
                         continue;
                     }
-                    let (cx, cy) = place(px, py);
+                    let (cx, cy) = point(px, py);
                     let _ = write!(dots, "M{cx:.0} {cy:.0}h0");
                     if low.is_finite() && high.is_finite() && low < high {
                         let _ = write!(
                             bars,
                             "M{cx:.0} {:.0}V{:.0}",
-                            place(px, low).1,
-                            place(px, high).1
+                            point(px, low).1,
+                            point(px, high).1
                         );
                     }
                 }

@@ -79,21 +79,21 @@ pub(super) struct VarianceShare {
 
 /// What the drive of a joint says of its torque, in a sentence; `None` if its drive is not known.
 pub(super) fn opinion(estimate: &DriveEstimate, joint: u32, unit: &str) -> Option<String> {
-    let own = estimate.of_joint(joint)?;
-    let torque = match own.torque.is_finite() {
+    let drive = estimate.of_joint(joint)?;
+    let torque = match drive.torque.is_finite() {
         true => format!(
             "{} +- {} {unit}",
-            digits(own.torque),
-            digits(own.standard_deviation)
+            digits(drive.torque),
+            digits(drive.standard_deviation)
         ),
         false => "nothing".to_owned(),
     };
-    let verdict = match own.agreement.get().unwrap_or_default() {
+    let verdict = match drive.agreement.get().unwrap_or_default() {
         Agreement::Unknown => return Some(format!("its drive says {torque}")),
         Agreement::Agrees => "within both deviations".to_owned(),
         Agreement::Disagrees => {
             let candidates = estimate.candidates().iter();
-            let candidates = candidates.filter(|other| other.joint == own.group);
+            let candidates = candidates.filter(|other| other.joint == drive.group);
             let candidates = candidates.map(|candidate| {
                 let name = candidate.name.as_str();
                 match candidate.kind.get() {
@@ -107,7 +107,7 @@ pub(super) fn opinion(estimate: &DriveEstimate, joint: u32, unit: &str) -> Optio
                 true => String::new(),
                 false => format!("; it may be {}", candidates.join("; or ")),
             };
-            format!("{:.0} deviations away{it_may_be}", own.deviate.abs())
+            format!("{:.0} deviations away{it_may_be}", drive.deviate.abs())
         }
     };
     Some(format!("its drive says {torque}, {verdict}"))
@@ -171,55 +171,55 @@ impl TorqueCase {
     fn withheld(&self, budget: &TorqueBudget, reason: Reason) -> Story {
         let channel = self.cause.as_deref().unwrap_or("a channel");
         let (likelier, residual) = (budget.likelier.as_str(), budget.unexplained.as_str());
-        let told = |head: String, because: &[&str], advice: &str| Story {
+        let story = |head: String, because: &[&str], advice: &str| Story {
             head,
             because: because.iter().map(|text| (*text).to_owned()).collect(),
             advice: advice.to_owned(),
         };
-        let own = match reason {
+        let story = match reason {
             Reason::NeverSeen | Reason::Stale => return self.silent(channel),
-            Reason::Saturated => told(
+            Reason::Saturated => story(
                 format!("{channel} is saturated"),
                 &["a reading at the end of its range says only that the load is at least that"],
                 "lessen the load; if this load is usual, use a larger range of the sensor",
             ),
-            Reason::DeviceFault => told(
+            Reason::DeviceFault => story(
                 format!("the board of {channel} reports a fault"),
                 &[],
                 "its manual tells what its fault means and how to clear it; `proprio status` has \
                  its counters",
             ),
-            Reason::Frozen => told(
+            Reason::Frozen => story(
                 format!("{channel} is frozen: it repeats its readings instead of measuring"),
                 &[],
                 "switch its board off and on; if it freezes again, its firmware or its amplifier \
                  is at fault",
             ),
-            Reason::Implausible => told(
+            Reason::Implausible => story(
                 format!("{channel} sends readings that contradict the ones before and after"),
                 &[],
                 "look for loose connectors at the sensor, and for error frames on its bus \
                  (`proprio status`)",
             ),
-            Reason::Starting => told(
+            Reason::Starting => story(
                 format!(
                     "{channel} has too few samples without a gap for velocity and acceleration"
                 ),
                 &[],
                 "wait for some tens of samples; if it lasts, the channel loses samples or is slow",
             ),
-            Reason::NoStance => told(
+            Reason::NoStance => story(
                 "no link is known to stand still".to_owned(),
                 &["the base moves, and no IMU measures how"],
                 "declare the foot that stands (<robot>/contact/declared), or configure an IMU",
             ),
-            Reason::NotFinite => told(
+            Reason::NotFinite => story(
                 "the result is no finite number".to_owned(),
                 &[],
                 "look for readings or parameters without sense: `proprio echo`, `proprio \
                  estimator --check`",
             ),
-            Reason::Undetermined => told(
+            Reason::Undetermined => story(
                 format!(
                     "the contacts that are present have more unknowns than the F/T sensors have \
                      equations: {}",
@@ -231,7 +231,7 @@ impl TorqueCase {
                  those that can not exert a torque",
             ),
             Reason::Uncertain => self.uncertain(budget),
-            Reason::Unexplained => told(
+            Reason::Unexplained => story(
                 format!(
                     "an undeclared contact or load, another F/T offset, or F/T readings that are \
                      late: {residual}"
@@ -240,12 +240,12 @@ impl TorqueCase {
                 "let go of the robot; if something may touch it there, configure a [[contact]]; \
                  if nothing does, tare the sensor or identify again",
             ),
-            Reason::Contradicted if !likelier.is_empty() => told(
+            Reason::Contradicted if !likelier.is_empty() => story(
                 format!("the readings contradict the configuration: {likelier}"),
                 &["this explains them far better than what is configured"],
                 "correct the configuration or the wiring, and restart the estimator",
             ),
-            Reason::Contradicted => told(
+            Reason::Contradicted => story(
                 format!(
                     "the readings have contradicted the configuration since the start: {residual}"
                 ),
@@ -256,18 +256,18 @@ impl TorqueCase {
                 "move the robot without a contact for some seconds; if it stays, check the F/T \
                  offset, then base and mounting in estimator.toml",
             ),
-            Reason::Absent | Reason::None => told(reason.word().to_owned(), &[], ""),
+            Reason::Absent | Reason::None => story(reason.word().to_owned(), &[], ""),
         };
-        self.with_board(own)
+        self.with_board(story)
     }
 
     /// The same, with the board and bus of the channel at fault.
     fn with_board(&self, mut story: Story) -> Story {
-        let own = self
+        let channel = self
             .cause
             .as_deref()
             .and_then(|name| self.system.channel(name));
-        if let Some(channel) = own.filter(|channel| !channel.device.is_empty()) {
+        if let Some(channel) = channel.filter(|channel| !channel.device.is_empty()) {
             story.because.insert(0, channel.comes_from());
             story.because.extend(self.system.conspicuous(channel));
         }
@@ -372,12 +372,12 @@ impl TorqueCase {
     /// Why a channel is silent.
     fn silent(&self, name: &str) -> Story {
         let system = &self.system;
-        let own = system.channel(name);
-        let since = match own.and_then(|own| own.age) {
+        let channel = system.channel(name);
+        let since = match channel.and_then(|channel| channel.age) {
             Some(age) => format!("no sample of {name} for {age:.1} s"),
             None => format!("no sample of {name}"),
         };
-        let Some(own) = own else {
+        let Some(channel) = channel else {
             return Story {
                 head: since,
                 because: Vec::new(),
@@ -385,7 +385,7 @@ impl TorqueCase {
                     .to_owned(),
             };
         };
-        if !own.is_silent && own.age.is_some() {
+        if !channel.is_silent && channel.age.is_some() {
             return Story {
                 head: format!("samples of {name} come too rarely"),
                 because: vec![
@@ -397,8 +397,8 @@ impl TorqueCase {
             };
         }
         let mut because = vec![since.clone()];
-        if !own.device.is_empty() {
-            because.push(own.comes_from());
+        if !channel.device.is_empty() {
+            because.push(channel.comes_from());
         }
         let story = |head: String, advice: &str| Story {
             head,
@@ -408,33 +408,42 @@ impl TorqueCase {
         if let Some(trouble) = &system.trouble {
             return story(trouble.clone(), RESTART);
         }
-        let bus = system.buses.iter().find(|bus| bus.name == own.bus);
-        let on_bus = || system.channels.iter().filter(|other| other.bus == own.bus);
+        let bus = system.buses.iter().find(|bus| bus.name == channel.bus);
+        let on_bus = || {
+            system
+                .channels
+                .iter()
+                .filter(|other| other.bus == channel.bus)
+        };
         let boards: BTreeSet<&str> = on_bus().map(|other| other.device.as_str()).collect();
-        let all_silent = !own.bus.is_empty() && on_bus().all(|other| other.is_silent);
+        let all_silent = !channel.bus.is_empty() && on_bus().all(|other| other.is_silent);
         if let Some(bus) = bus.filter(|bus| bus.level == Level::Error) {
             return story(format!("bus {} is {}", bus.name, bus.state), CHECK_BUS);
         }
         if all_silent && boards.len() > 1 {
-            let head = format!("all {} boards of bus {} are silent", boards.len(), own.bus);
+            let head = format!(
+                "all {} boards of bus {} are silent",
+                boards.len(),
+                channel.bus
+            );
             return story(head, CHECK_BUS);
         }
         let advice = match boards.len() > 1 && !all_silent {
             true => "check its power, cable and address; other boards of the bus are heard",
             false => "check its power, cable and address",
         };
-        let device = system.device(own);
+        let device = system.device(channel);
         match device.filter(|device| device.level == Level::Error) {
             Some(HardwareState { name, state, .. }) => story(
-                format!("board {name} on bus {} is {state}", own.bus),
+                format!("board {name} on bus {} is {state}", channel.bus),
                 advice,
             ),
-            None if own.device.is_empty() => Story {
+            None if channel.device.is_empty() => Story {
                 because: Vec::new(),
                 ..story(since, advice)
             },
             None => {
-                let head = format!("board {} on bus {} is silent", own.device, own.bus);
+                let head = format!("board {} on bus {} is silent", channel.device, channel.bus);
                 story(head, advice)
             }
         }
@@ -583,8 +592,8 @@ pub(super) fn name(part: &BudgetPart) -> String {
 
 /// The names of the parts from a source, in the order of their names.
 pub(super) fn names(budget: &TorqueBudget, source: Source) -> Vec<&str> {
-    let own = budget.parts().iter().filter(|part| part.source == source);
-    let mut names: Vec<&str> = own.map(|part| part.name.as_str()).collect();
+    let parts = budget.parts().iter().filter(|part| part.source == source);
+    let mut names: Vec<&str> = parts.map(|part| part.name.as_str()).collect();
     names.sort_unstable();
     names
 }
@@ -742,8 +751,8 @@ mod tests {
         let heads: BTreeSet<String> = Reason::ALL
             .into_iter()
             .map(|reason| {
-                let own = withheld(reason, budget(&[(Source::Offset, "ft", 4.0)]));
-                let story = known(Some(own), Some("ft"), System::default()).story();
+                let case = withheld(reason, budget(&[(Source::Offset, "ft", 4.0)]));
+                let story = known(Some(case), Some("ft"), System::default()).story();
                 let needs_none = matches!(reason, Reason::None | Reason::Absent);
                 assert!(needs_none || !story.advice.is_empty(), "{reason}");
                 story.head
@@ -755,17 +764,17 @@ mod tests {
 
     #[test]
     fn what_is_uncertain_names_what_to_move() {
-        let mut own = withheld(Reason::Uncertain, budget(&[(Source::Link, "hand", 4.0)]));
-        own.bound = 1.0;
+        let mut case = withheld(Reason::Uncertain, budget(&[(Source::Link, "hand", 4.0)]));
+        case.bound = 1.0;
         for (name, travel) in [("wrist", 0.01), ("elbow", 1.0)] {
-            own.add(BudgetPart {
+            case.add(BudgetPart {
                 source: Source::Position.in_memory(),
                 name: Name::new(name).unwrap_or(Name::EMPTY),
                 travel,
                 ..BudgetPart::NONE
             });
         }
-        let story = known(Some(own), None, System::default()).story();
+        let story = known(Some(case), None, System::default()).story();
         assert!(
             story.head.contains("2.00 Nm exceeds the bound of 1.00 Nm"),
             "{story:?}"
@@ -777,8 +786,8 @@ mod tests {
             "{story:?}"
         );
         assert_eq!(story.advice, "move wrist, without a contact");
-        own.deviation = f64::INFINITY;
-        let story = known(Some(own), None, System::default()).story();
+        case.deviation = f64::INFINITY;
+        let story = known(Some(case), None, System::default()).story();
         assert!(
             story
                 .head

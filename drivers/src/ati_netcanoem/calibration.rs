@@ -131,8 +131,8 @@ impl CalibrationQuery {
             (opcode::SELECT, 1) if self.mode == Mode::Listen => self.forget(),
             (opcode::SELECT, 1) => out.fault(Counter::Value, 1, frame.id),
             (opcode::COUNTS, 8) => {
-                let told = [u32_be(data, 0), u32_be(data, 4)].map(f64::from);
-                self.take(0, told.map(|c| (c > 0.0).then_some(c)), frame, out);
+                let counts = [u32_be(data, 0), u32_be(data, 4)].map(f64::from);
+                self.take(0, counts.map(|c| (c > 0.0).then_some(c)), frame, out);
             }
             (opcode::UNITS, 2) => {
                 let &[force, torque] = data else { return };
@@ -197,7 +197,7 @@ impl CalibrationQuery {
         let (Some(values), Some(known)) = (self.matrix.get_mut(at), self.known.get_mut(at)) else {
             return;
         };
-        let told = [0, 4].map(|at| f64::from(f32::from_bits(u32_be(data, at))));
+        let entries = [0, 4].map(|at| f64::from(f32::from_bits(u32_be(data, at))));
         let bit = 1 << pair;
         if !self.configured[2] {
             let Some(columns) = values.get_mut(2 * pair..2 * pair + 2) else {
@@ -206,12 +206,12 @@ impl CalibrationQuery {
             // By bits: not a number differs from itself.
             let same = columns
                 .iter()
-                .zip(told)
+                .zip(entries)
                 .all(|(a, b)| a.to_bits() == b.to_bits());
             if *known & bit != 0 && !same {
                 // An answer that was long on its way, as after a loss of the link, is that of
                 // another row: the row is asked for again.
-                let differing = Some((row, pair, told.map(f64::to_bits)));
+                let differing = Some((row, pair, entries.map(f64::to_bits)));
                 if self.mode == Mode::Supervise && self.differing != differing {
                     self.differing = differing;
                     self.answered = false;
@@ -222,7 +222,7 @@ impl CalibrationQuery {
                 out.fault(Counter::Changed, 1, frame.id);
                 return self.refuse(Refusal::Changed, frame);
             }
-            columns.copy_from_slice(&told);
+            columns.copy_from_slice(&entries);
             *known |= bit;
         }
         if *known != 0b111 {

@@ -5,11 +5,11 @@ use super::frames::{STATUS_ANY, STATUS_BUS, STATUS_FAULTS, id, opcode, opcode_of
 use super::options::AtiNetcanoemOptions;
 use crate::bringup::Bringup;
 use crate::bytes::{self, i16_be, u16_be};
-use crate::family::{Family, Supervised, Supervision, next_in_step};
+use crate::family::{Family, Session, Supervised, next_in_step};
 use crate::pairing::within;
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Driver, Frame,
-    Mode, NotSent, Output, OutputInfo, Spec, SpecError,
+    Mode, NotSent, OutputInfo, Spec, SpecError, StampedReading,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -64,13 +64,13 @@ impl Netcanoem {
     /// Drops the halves that wait.
     fn drop_all(
         &mut self,
-        link: &mut Supervision<CalibrationQuery>,
+        session: &mut Session<CalibrationQuery>,
         frame: &Frame,
         out: &mut Decoded,
     ) {
         let halves = self.firsts.len() + self.seconds.len();
         if halves > 0 {
-            link.bringup.lost();
+            session.bringup.lost();
             out.fault(
                 Counter::Unpaired,
                 u32::try_from(halves).unwrap_or(1),
@@ -85,7 +85,7 @@ impl Netcanoem {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<CalibrationQuery>,
+        session: &mut Session<CalibrationQuery>,
         out: &mut Decoded,
     ) {
         self.joined = false;
@@ -103,7 +103,7 @@ impl Netcanoem {
             .first()
             .is_none_or(|first| within((first.t, first.stamp), (frame.t, frame.stamp), LIMIT));
         if self.firsts.is_full() || !in_time {
-            self.drop_all(link, frame, out);
+            self.drop_all(session, frame, out);
         }
         let first = First {
             t: frame.t,
@@ -118,7 +118,7 @@ impl Netcanoem {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<CalibrationQuery>,
+        session: &mut Session<CalibrationQuery>,
         out: &mut Decoded,
     ) {
         let in_time = self
@@ -127,9 +127,9 @@ impl Netcanoem {
             .is_some_and(|first| within((first.t, first.stamp), (frame.t, frame.stamp), LIMIT));
         if !in_time {
             if !core::mem::take(&mut self.joined) {
-                link.lost(Counter::Unpaired, 1, frame, out);
+                session.lost(Counter::Unpaired, 1, frame, out);
             }
-            return self.drop_all(link, frame, out);
+            return self.drop_all(session, frame, out);
         }
         let _ = self.seconds.try_push([0, 2, 4].map(|at| i16_be(data, at)));
         if self.seconds.len() < self.firsts.len() {
@@ -139,23 +139,23 @@ impl Netcanoem {
         let (firsts, seconds) = (self.firsts.take(), self.seconds.take());
         for (first, second) in firsts.into_iter().zip(seconds) {
             let is_trusted = frame.t >= self.untrusted;
-            give(first, second, is_trusted, frame, link, out);
+            add(first, second, is_trusted, frame, session, out);
         }
     }
 }
 
 /// The reading of two halves.
-fn give(
+fn add(
     first: First,
     second: [i16; 3],
     is_trusted: bool,
     frame: &Frame,
-    link: &mut Supervision<CalibrationQuery>,
+    session: &mut Session<CalibrationQuery>,
     out: &mut Decoded,
 ) {
-    let Some(per_count) = link.questions.per_count() else {
-        if link.bringup.mode() == Mode::Listen {
-            link.questions.missed();
+    let Some(per_count) = session.questions.per_count() else {
+        if session.bringup.mode() == Mode::Listen {
+            session.questions.missed();
         }
         return;
     };
@@ -175,12 +175,12 @@ fn give(
     if first.status & STATUS_FAULTS != 0 || unnamed || !is_trusted {
         quality |= Quality::DEVICE_FAULT;
     }
-    let output = Output {
+    let stamped = StampedReading {
         acquired: first.t,
         stamp: first.stamp,
-        ..Output::new(0, frame, quality, reading)
+        ..StampedReading::new(0, frame, quality, reading)
     };
-    link.give(output, frame, out);
+    session.add(stamped, frame, out);
 }
 
 impl Driver for AtiNetcanoemOptions {
@@ -222,7 +222,7 @@ impl Family for Netcanoem {
     fn on_frame(
         &mut self,
         frame: &Frame,
-        link: &mut Supervision<CalibrationQuery>,
+        session: &mut Session<CalibrationQuery>,
         out: &mut Decoded,
     ) {
         let Some(opcode) = opcode_of(frame.id, self.base) else {
@@ -234,15 +234,15 @@ impl Family for Netcanoem {
         match (opcode, data) {
             (opcode::GAUGES, []) => self.asked = Some((self.asked.unwrap_or(0) + 1).min(DEPTH)),
             (opcode::COUNTS | opcode::UNITS, []) => {}
-            (opcode::GAUGES, data) if data.len() == 8 => self.first(data, frame, link, out),
+            (opcode::GAUGES, data) if data.len() == 8 => self.first(data, frame, session, out),
             (opcode::GAUGES_SECOND, data) if data.len() == 6 => {
-                self.second(data, frame, link, out);
+                self.second(data, frame, session, out);
             }
             (opcode::GAUGES | opcode::GAUGES_SECOND, _) => out.fault(Counter::Length, 1, frame.id),
-            (opcode::MATRIX, &[row]) if self.mode == Mode::Listen => link.questions.asked(row),
+            (opcode::MATRIX, &[row]) if self.mode == Mode::Listen => session.questions.asked(row),
             (opcode::MATRIX, [_]) => {}
             (opcode::MATRIX..=opcode::MATRIX_LAST | opcode::SELECT..=opcode::UNITS, data) => {
-                link.questions.answer(opcode, data, frame, out);
+                session.questions.answer(opcode, data, frame, out);
             }
             // Serial number, diagnosis, and what others change.
             _ => {}
@@ -258,7 +258,7 @@ impl Family for Netcanoem {
     fn request(
         &mut self,
         now: Nanos,
-        link: &mut Supervision<CalibrationQuery>,
+        session: &mut Session<CalibrationQuery>,
         out: &mut Decoded,
     ) -> Option<Frame> {
         if now < self.request_at()? {
@@ -266,7 +266,7 @@ impl Family for Netcanoem {
         }
         if self.open.take().is_some() {
             // Not answered: what may still come of its answer must not meet the next.
-            link.bringup.lost();
+            session.bringup.lost();
             out.fault(Counter::Lost, 1, id(self.base, opcode::GAUGES));
             self.reset();
             self.next = now + LATE;
@@ -299,12 +299,12 @@ impl Family for Netcanoem {
         &mut self,
         command: Command,
         _now: Nanos,
-        link: &Supervision<CalibrationQuery>,
+        session: &Session<CalibrationQuery>,
     ) -> Result<(), CommandRefused> {
         if command != Command::Calibration {
             return Err(CommandRefused::Unsupported);
         }
-        let known = link.questions.in_use();
+        let known = session.questions.in_use();
         let known = known.ok_or(CommandRefused::Unknown("its calibration"))?;
         self.outcome = Some(CommandOutcome::Calibration(known));
         Ok(())
@@ -312,7 +312,7 @@ impl Family for Netcanoem {
 
     fn outcome(
         &mut self,
-        _link: &Supervision<CalibrationQuery>,
+        _session: &Session<CalibrationQuery>,
     ) -> Option<Result<CommandOutcome, CommandFailed>> {
         self.outcome.take().map(Ok)
     }

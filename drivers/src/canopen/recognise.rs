@@ -48,7 +48,7 @@ const fn identity(sub: u8) -> Object {
 }
 
 /// The value that node `node` has told of `object`.
-fn told(seen: &Traffic, node: u8, object: Object) -> Option<u32> {
+fn answered(seen: &Traffic, node: u8, object: Object) -> Option<u32> {
     let stream = seen.stream(sdo_from(node))?;
     stream.kept().find_map(|frame| match *frame.data() {
         // Of four bytes so many are unused.
@@ -65,9 +65,9 @@ fn told(seen: &Traffic, node: u8, object: Object) -> Option<u32> {
 fn needs_sync(seen: &Traffic, node: u8) -> bool {
     let by_sync = |number| {
         let is_on = |id: u32| id >> 31 == 0;
-        let by_sync = told(seen, node, object::tpdo_transmission(number));
+        let by_sync = answered(seen, node, object::tpdo_transmission(number));
         by_sync.is_some_and(|transmission| transmission <= 240)
-            && told(seen, node, object::tpdo_id(number)).is_none_or(is_on)
+            && answered(seen, node, object::tpdo_id(number)).is_none_or(is_on)
     };
     seen.stream(SYNC).is_none_or(|sync| sync.frames == 0) && (0..4).any(by_sync)
 }
@@ -98,13 +98,13 @@ pub(crate) fn recognise(seen: &Traffic) -> impl Iterator<Item = Recognised<'_>> 
         if beats.is_none() && answers.is_none() {
             return None;
         }
-        let device_type = told(seen, node, object::DEVICE_TYPE);
+        let device_type = answered(seen, node, object::DEVICE_TYPE);
         let mut words = String::new();
         if device_type.is_some() {
             evidence.add(OBJECT);
         }
         for (sub, name) in IDENTITY {
-            if let Some(value) = told(seen, node, identity(sub)) {
+            if let Some(value) = answered(seen, node, identity(sub)) {
                 evidence.add(OBJECT);
                 words += &format!(", {name} {value:#x}");
             }
@@ -143,7 +143,7 @@ pub(crate) fn questions(seen: &Traffic) -> Vec<Frame> {
     let mut questions = Vec::new();
     for node in 1..=127 {
         questions.push(read(node, object::DEVICE_TYPE));
-        let device_type = told(seen, node, object::DEVICE_TYPE);
+        let device_type = answered(seen, node, object::DEVICE_TYPE);
         if device_type.is_some() {
             questions.extend(IDENTITY.map(|(sub, _)| read(node, identity(sub))));
         }

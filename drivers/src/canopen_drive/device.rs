@@ -7,10 +7,10 @@ use crate::bringup::Bringup;
 use crate::canopen::{
     self, Cycle, NMT, NodeState, Rates, SYNC, Script, StartPlan, nmt, node_of, sdo_from, tpdo,
 };
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::objects::Objects;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, Output, OutputInfo, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, Id, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -160,10 +160,10 @@ impl CanopenDrive {
     }
 
     /// A reading ends without some of its values.
-    fn abandon(&mut self, id: Id, link: &mut Supervision<Script<DriveStart>>, out: &mut Decoded) {
+    fn abandon(&mut self, id: Id, session: &mut Session<Script<DriveStart>>, out: &mut Decoded) {
         if core::mem::take(&mut self.have) != 0 {
             out.fault(Counter::Unpaired, 1, id);
-            link.bringup.lost();
+            session.bringup.lost();
             self.suspect = true;
         }
         self.measured = None;
@@ -173,15 +173,15 @@ impl CanopenDrive {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<Script<DriveStart>>,
+        session: &mut Session<Script<DriveStart>>,
         out: &mut Decoded,
     ) {
         if self.table.is_none() {
-            self.prepare(&link.questions.plan);
+            self.prepare(&session.questions.plan);
         }
         let has_sync = self.sync.is_some_and(|t| self.is_fresh(t, frame.t));
         let Some(table) = &self.table else {
-            return link.questions.missed();
+            return session.questions.missed();
         };
         let Some(used) = table.used.iter().find(|used| used.id == frame.id) else {
             return;
@@ -209,7 +209,8 @@ impl CanopenDrive {
                 encoder: self.last.status,
                 faults: self.last.error.unwrap_or(u32::from(self.state.error)),
             });
-            out.push(Output::new(0, frame, self.quality(), reading), frame.id);
+            let stamped = StampedReading::new(0, frame, self.quality(), reading);
+            out.push(stamped, frame.id);
         }
         if table.alone & bit != 0 {
             let at = |bit: u8| bit.trailing_zeros() as usize;
@@ -217,10 +218,10 @@ impl CanopenDrive {
             let is_better = |other| rank_of(other).is_none_or(|other| rank > other.rank);
             let is_first = self.rates.is_first(at(bit), is_better);
             if is_first && !self.synced.is_some_and(|t| self.is_fresh(t, frame.t)) {
-                self.give(None, frame, link, out);
+                self.add(None, frame, session, out);
             }
         } else if group & bit != 0 {
-            self.add_to_group(bit, group, frame, link, out);
+            self.add_to_group(bit, group, frame, session, out);
         }
     }
 
@@ -230,12 +231,12 @@ impl CanopenDrive {
         bit: u8,
         group: u8,
         frame: &Frame,
-        link: &mut Supervision<Script<DriveStart>>,
+        session: &mut Session<Script<DriveStart>>,
         out: &mut Decoded,
     ) {
         let too_long = self.have != 0 && !self.is_fresh(self.began, frame.t);
         if self.have & bit != 0 || too_long {
-            self.abandon(frame.id, link, out);
+            self.abandon(frame.id, session, out);
         }
         if self.have == 0 {
             self.began = frame.t;
@@ -248,11 +249,11 @@ impl CanopenDrive {
         }
         self.have = 0;
         if core::mem::take(&mut self.suspect) {
-            return link.lost(Counter::Unpaired, 1, frame, out);
+            return session.lost(Counter::Unpaired, 1, frame, out);
         }
         self.synced = Some(frame.t);
         let measured = self.measured.take();
-        self.give(measured, frame, link, out);
+        self.add(measured, frame, session, out);
     }
 
     fn quality(&self) -> Quality {
@@ -273,11 +274,11 @@ impl CanopenDrive {
     }
 
     /// Makes a reading, measured when `frame` came, or at another time.
-    fn give(
+    fn add(
         &mut self,
         measured: Option<(Nanos, StampKind)>,
         frame: &Frame,
-        link: &mut Supervision<Script<DriveStart>>,
+        session: &mut Session<Script<DriveStart>>,
         out: &mut Decoded,
     ) {
         let values = self.last.joint.map(|value| match value {
@@ -296,9 +297,9 @@ impl CanopenDrive {
             current,
             ..JointState::ABSENT
         });
-        let mut output = Output::new(0, frame, self.quality(), reading);
-        (output.acquired, output.stamp) = measured.unwrap_or((frame.t, frame.stamp));
-        link.give(output, frame, out);
+        let mut stamped = StampedReading::new(0, frame, self.quality(), reading);
+        (stamped.acquired, stamped.stamp) = measured.unwrap_or((frame.t, frame.stamp));
+        session.add(stamped, frame, out);
     }
 }
 
@@ -356,10 +357,10 @@ impl Family for CanopenDrive {
     fn on_frame(
         &mut self,
         frame: &Frame,
-        link: &mut Supervision<Script<DriveStart>>,
+        session: &mut Session<Script<DriveStart>>,
         out: &mut Decoded,
     ) {
-        if self.state.on_frame(self.node, frame, link, out) {
+        if self.state.on_frame(self.node, frame, session, out) {
             // An answer may have changed the mapping.
             if frame.id == sdo_from(self.node) {
                 self.table = None;
@@ -371,13 +372,13 @@ impl Family for CanopenDrive {
         };
         if frame.id == SYNC {
             if self.table.as_ref().is_some_and(|table| table.group != 0) {
-                self.abandon(frame.id, link, out);
+                self.abandon(frame.id, session, out);
             }
             self.cycle.sync(frame);
             self.sync = Some(frame.t);
             self.since_sync = [const { None }; 4];
         } else {
-            self.pdo(data, frame, link, out);
+            self.pdo(data, frame, session, out);
         }
     }
 

@@ -99,16 +99,16 @@ impl PdoMapping {
     pub(super) fn of_keys(node: u8, pdos: &[PdoKeys]) -> Result<Self, SpecError> {
         let mut this = Self::default();
         for keys in pdos {
-            let wrong = |expected| SpecError::Keys {
+            let error = |expected| SpecError::Keys {
                 key: "pdos",
                 expected,
             };
             let number = keys.number.wrapping_sub(1);
             let Some(pdo) = this.pdos.get_mut(usize::from(number)) else {
-                return Err(wrong("numbers 1 to 4"));
+                return Err(error("numbers 1 to 4"));
             };
             if pdo.is_on() || keys.sync > 240 {
-                return Err(wrong("each number once, with sync from 0 to 240"));
+                return Err(error("each number once, with sync from 0 to 240"));
             }
             pdo.id = Some(keys.id.map_or(tpdo(node, number).raw(), u32::from));
             pdo.transmission = if keys.sync == 0 { BY_EVENT } else { keys.sync };
@@ -116,7 +116,7 @@ impl PdoMapping {
             for index in &keys.objects {
                 let object = Object::new(*index, 0);
                 let Some((_, length)) = DriveQuantity::of(object) else {
-                    return Err(wrong(
+                    return Err(error(
                         "of objects 0x6041, 0x6061, 0x6063, 0x6064, 0x606C, 0x6077, 0x6078, 0x603F",
                     ));
                 };
@@ -127,7 +127,7 @@ impl PdoMapping {
                 }
             }
             if bits > 64 || bits == 0 {
-                return Err(wrong("of 1 to 8 bytes per number"));
+                return Err(error("of 1 to 8 bytes per number"));
             }
         }
         if !pdos.is_empty() && this.position().is_none() {

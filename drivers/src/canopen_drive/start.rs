@@ -268,13 +268,13 @@ impl DriveStart {
         if let Some(unit) = self.options.velocity_unit {
             return Some(unit.unit());
         }
-        let told = self.known().value(VELOCITY_UNIT);
-        told.map_or(Some(StepUnit::Positions(1.0)), StepUnit::of_code)
+        let code = self.known().value(VELOCITY_UNIT);
+        code.map_or(Some(StepUnit::Positions(1.0)), StepUnit::of_code)
     }
 
     fn rated_torque(&self) -> Option<f64> {
-        let told = self.known().rated_torque(self.options.rated_torque_unit);
-        self.options.rated_torque.or(told)
+        let rated = self.known().rated_torque(self.options.rated_torque_unit);
+        self.options.rated_torque.or(rated)
     }
 
     fn rated_current(&self) -> Option<f64> {
@@ -415,7 +415,7 @@ impl DriveStart {
     ) -> Result<(), Refusal> {
         // What only other values depend on may change.
         let is_fixed = matches!(object, COUNTS | TURNS | RATED_TORQUE | RATED_CURRENT);
-        let told = match answer {
+        let value = match answer {
             _ if !self.counts(object) => return Ok(()),
             Ok(None) => return Ok(()),
             Ok(Some(0)) if self.needs(object) => {
@@ -432,10 +432,10 @@ impl DriveStart {
                 None => return Ok(()),
             },
         };
-        if is_fixed && self.told.value(object).is_some_and(|known| known != told) {
+        if is_fixed && self.told.value(object).is_some_and(|known| known != value) {
             return Err(Refusal::Changed);
         }
-        self.told.set(object, told);
+        self.told.set(object, value);
         Ok(())
     }
 }

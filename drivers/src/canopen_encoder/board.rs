@@ -18,7 +18,7 @@ const HARDWARE: u16 = 0x5000;
 #[derive(Debug)]
 struct EncoderBoard {
     node: SimulatedNode,
-    place: PositionMapping,
+    mapping: PositionMapping,
     counts: u32,
     quality: Quality,
 }
@@ -37,9 +37,9 @@ impl EncoderBoard {
         let fault = self.quality.contains(Quality::DEVICE_FAULT);
         self.node.report(if fault { HARDWARE } else { 0 }, out);
         let mut data = [0; 8];
-        self.place.bits.set(self.counts.into(), &mut data);
-        let data = data.get(..self.place.bits.reach()).unwrap_or_default();
-        let _ = out.try_push(Frame::new(self.place.id, data));
+        self.mapping.bits.set(self.counts.into(), &mut data);
+        let data = data.get(..self.mapping.bits.reach()).unwrap_or_default();
+        let _ = out.try_push(Frame::new(self.mapping.id, data));
     }
 }
 
@@ -50,8 +50,8 @@ impl Simulate for CanopenEncoderOptions {
         self.check()?;
         let id = node_of(spec)?;
         canopen::check_file(id, self.objects.as_ref())?;
-        let places = PositionMapping::all(id, self)?;
-        let place = places.first().copied().ok_or(SpecError::Keys {
+        let mappings = PositionMapping::all(id, self)?;
+        let mapping = mappings.first().copied().ok_or(SpecError::Keys {
             key: "eds",
             expected: "a file in which a TPDO has the position (6004), if configure = false",
         })?;
@@ -64,7 +64,7 @@ impl Simulate for CanopenEncoderOptions {
         } else {
             (TPDO_OFF, 0)
         };
-        let transmission = match place.sync {
+        let transmission = match mapping.sync {
             0 => BY_EVENT,
             n => n,
         };
@@ -81,7 +81,7 @@ impl Simulate for CanopenEncoderOptions {
         ];
         Ok(Box::new(EncoderBoard {
             node: SimulatedNode::new(id, spec.mode == Mode::Listen, &entries),
-            place,
+            mapping,
             counts: 0,
             quality: Quality::GOOD,
         }))

@@ -57,8 +57,8 @@ impl Board for CubemarsBoard {
                 let effort = if effort.is_nan() { 0.0 } else { effort };
                 let values = [joint.position, joint.velocity, effort];
                 board::finite(&values)?;
-                let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
-                if quality_of(self.stage.error).0 != quality.0 & told.0 {
+                let carried = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
+                if quality_of(self.stage.error).0 != quality.0 & carried.0 {
                     self.stage.error = if quality.contains(Quality::DEVICE_FAULT) {
                         ENCODER_ERROR
                     } else if quality.contains(Quality::DRIVE_FAULT) {

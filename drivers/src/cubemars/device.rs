@@ -3,10 +3,11 @@
 use super::frames::{DRIVE, ENCODER_ERROR, JOINT, PayloadLayout, Stage, quality_of};
 use super::options::{CubemarsKeys, CubemarsOptions, Effort};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Supervised, Supervision, temperature};
+use crate::family::{Family, Session, Supervised, temperature};
 use crate::held::OnChange;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading,
+    bytes, mit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -33,7 +34,8 @@ impl CubemarsMotor {
             faults: u32::from(stage.error),
         });
         let quality = quality_of(stage.error);
-        out.push(Output::new(JOINT, frame, quality, actuator), frame.id);
+        let stamped = StampedReading::new(JOINT, frame, quality, actuator);
+        out.push(stamped, frame.id);
         temperature(DRIVE, stage.celsius, frame, out);
     }
 }
@@ -64,7 +66,7 @@ impl Driver for CubemarsOptions {
 impl Family for CubemarsMotor {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         if frame.id != self.keys.id {
             return;
         }
@@ -89,7 +91,7 @@ impl Family for CubemarsMotor {
             state.current = state.torque;
             state.torque = self.keys.torque_constant.unwrap_or(f64::NAN) * state.current;
         }
-        link.joint(JOINT, frame, quality, state, out);
+        session.joint(JOINT, frame, quality, state, out);
     }
 
     fn reset(&mut self) {

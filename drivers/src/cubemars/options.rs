@@ -159,18 +159,18 @@ pub(super) struct CubemarsKeys {
 impl CubemarsKeys {
     pub(super) fn new(spec: &Spec, options: &CubemarsOptions) -> Result<Self, SpecError> {
         let number = address(spec, 0..=NUMBER_MOST)? as u8;
-        let wrong = |key, value, expected| SpecError::Key {
+        let error = |key, value, expected| SpecError::Key {
             key,
             value,
             expected,
         };
         if options.host_id > 0x7FF {
             let host_id = f64::from(options.host_id);
-            return Err(wrong("host_id", host_id, "0 to 2047"));
+            return Err(error("host_id", host_id, "0 to 2047"));
         }
         if !(-100.0..=100.0).contains(&options.celsius_at_zero) {
             let celsius = options.celsius_at_zero;
-            return Err(wrong("celsius_at_zero", celsius, "-100 to 100"));
+            return Err(error("celsius_at_zero", celsius, "-100 to 100"));
         }
         let torque_constant = (options.torque_constant)
             .map(|constant| above_zero("torque_constant", constant))

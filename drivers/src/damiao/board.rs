@@ -33,8 +33,8 @@ impl DamiaoBoard {
     fn measure(&mut self, joint: &JointState, quality: Quality) -> Result<(), EncodeError> {
         board::finite(&[joint.position, joint.velocity])?;
         board::finite_or_absent(&[joint.torque])?;
-        let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
-        if quality_of(self.state.state).0 != quality.0 & told.0 {
+        let carried = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
+        if quality_of(self.state.state).0 != quality.0 & carried.0 {
             self.state.state = if quality.contains(Quality::DEVICE_FAULT) {
                 SENSOR
             } else if quality.contains(Quality::DRIVE_FAULT) {

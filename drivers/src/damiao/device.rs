@@ -6,10 +6,11 @@ use super::frames::{
 use super::options::{DamiaoKeys, DamiaoOptions};
 use super::ranges::Ranges;
 use crate::bringup::{Bringup, Timing};
-use crate::family::{Family, Rounds, Supervised, Supervision, temperature};
+use crate::family::{Family, Rounds, Session, Supervised, temperature};
 use crate::held::OnChange;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading,
+    bytes, mit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -29,10 +30,10 @@ impl DamiaoMotor {
         &mut self,
         told: &DamiaoState,
         frame: &Frame,
-        link: &mut Supervision<Ranges>,
+        session: &mut Session<Ranges>,
         out: &mut Decoded,
     ) {
-        let Some(scales) = link.questions.scales() else {
+        let Some(scales) = session.questions.scales() else {
             return out.fault(Counter::Unexpected, 1, frame.id);
         };
         let state = told.state;
@@ -45,13 +46,14 @@ impl DamiaoMotor {
                 encoder: u32::from(state == SENSOR),
                 faults: u32::from(faults),
             });
-            out.push(Output::new(JOINT, frame, quality, actuator), frame.id);
+            let stamped = StampedReading::new(JOINT, frame, quality, actuator);
+            out.push(stamped, frame.id);
             for (output, celsius) in [FET, MOTOR].into_iter().zip(told.celsius) {
                 temperature(output, f64::from(celsius), frame, out);
             }
         }
         let (state, saturated) = mit::measured(scales, told.raw);
-        link.joint(JOINT, frame, quality | saturated, state, out);
+        session.joint(JOINT, frame, quality | saturated, state, out);
     }
 }
 
@@ -89,7 +91,7 @@ impl Driver for DamiaoOptions {
 impl Family for DamiaoMotor {
     type Questions = Ranges;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<Ranges>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<Ranges>, out: &mut Decoded) {
         if frame.id != self.keys.id {
             return;
         }
@@ -100,9 +102,9 @@ impl Family for DamiaoMotor {
             return out.fault(Counter::Length, 1, frame.id);
         }
         match DamiaoMessage::parse(self.keys.address, data) {
-            Some(DamiaoMessage::State(state)) => self.state(&state, frame, link, out),
+            Some(DamiaoMessage::State(state)) => self.state(&state, frame, session, out),
             Some(DamiaoMessage::Register(register, value)) => {
-                link.questions.answer(register, value, frame, out);
+                session.questions.answer(register, value, frame, out);
             }
             // Answers to other programs, and frames of other motors.
             Some(DamiaoMessage::Other) | None => {}
@@ -116,7 +118,7 @@ impl Family for DamiaoMotor {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Supervision<Ranges>,
+        _session: &mut Session<Ranges>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         let command = self.questions.ask(&[STATE], now)?;

@@ -30,12 +30,12 @@ impl Ranges {
         }
     }
 
-    /// The end of range `place`, if it is known.
-    fn end(&self, place: usize) -> Option<f64> {
-        let of = |ends: &[Option<f64>; 3]| ends.get(place).copied().flatten();
-        of(&self.keys.stated)
-            .or_else(|| of(&self.told))
-            .or_else(|| of(&self.keys.of_model))
+    /// The end of range `index`, if it is known.
+    fn end(&self, index: usize) -> Option<f64> {
+        let end = |ends: &[Option<f64>; 3]| ends.get(index).copied().flatten();
+        end(&self.keys.stated)
+            .or_else(|| end(&self.told))
+            .or_else(|| end(&self.keys.of_model))
     }
 
     /// Position, velocity and torque, if all are known.
@@ -50,7 +50,7 @@ impl Ranges {
 
     /// The motor has told the value of a register in `frame`.
     pub(super) fn answer(&mut self, register: u8, value: f32, frame: &Frame, out: &mut Decoded) {
-        let Some(place) = RANGES.iter().position(|range| *range == register) else {
+        let Some(index) = RANGES.iter().position(|range| *range == register) else {
             // Another program's question.
             return;
         };
@@ -58,23 +58,23 @@ impl Ranges {
             return out.fault(Counter::Value, 1, frame.id);
         }
         let value = f64::from(value);
-        let told = self
+        let before = self
             .told
-            .get_mut(place)
+            .get_mut(index)
             .and_then(|told| told.replace(value));
-        if told.is_some_and(|told| told != value) {
+        if before.is_some_and(|told| told != value) {
             out.fault(Counter::Changed, 1, frame.id);
         }
-        if place == self.next && self.mode == Mode::Supervise {
+        if index == self.next && self.mode == Mode::Supervise {
             self.next += 1;
             self.attempts.begin();
         }
     }
 
-    /// The next range to ask for, from `place` on.
-    fn unstated(&self, place: usize) -> usize {
-        let later = self.keys.stated.iter().skip(place);
-        place + later.take_while(|stated| stated.is_some()).count()
+    /// The next range to ask for, from `index` on.
+    fn unstated(&self, index: usize) -> usize {
+        let later = self.keys.stated.iter().skip(index);
+        index + later.take_while(|stated| stated.is_some()).count()
     }
 }
 

@@ -122,8 +122,8 @@ fn motor(
         evidence.add(-3.0);
     }
     evidence.sends_as(IdUse::Sends(shared), stream.id, |frame| {
-        let own = frame.data().first().map(|first| first & 0xF);
-        own.is_some_and(|own| halves.contains(&own) && message(frame, own).is_some())
+        let number = frame.data().first().map(|first| first & 0xF);
+        number.is_some_and(|number| halves.contains(&number) && message(frame, number).is_some())
     })?;
     let is_its =
         |frame: &Frame| frame.data().first().map(|first| first & 0xF) == Some(address & 0xF);

@@ -4,11 +4,12 @@
 use super::layout::{DbcLayout, ReadingLayout, SignalGroup, SignalRole, UsedSignal};
 use super::options::{DbcOptions, ReadingKeys};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::pairing::within;
 use crate::signal::Message;
 use crate::{
-    Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, Output, OutputInfo, Spec, SpecError,
+    Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, OutputInfo, Spec, SpecError,
+    StampedReading,
 };
 use alloc::borrow::Cow;
 use alloc::boxed::Box;
@@ -222,7 +223,7 @@ impl Assembly {
         after_silence: bool,
         frame: &Frame,
         out: &mut Decoded,
-    ) -> Option<Output> {
+    ) -> Option<StampedReading> {
         let mut quality = Quality::GOOD;
         if self.fault {
             quality |= Quality::DEVICE_FAULT;
@@ -265,11 +266,11 @@ impl Assembly {
         };
         #[allow(clippy::cast_possible_truncation)] // the number of such a device's readings
         let device_counter = self.count.unwrap_or(0) as u32;
-        Some(Output {
+        Some(StampedReading {
             acquired: self.t,
             stamp: self.stamp,
             device_counter,
-            ..Output::new(number, frame, quality, reading)
+            ..StampedReading::new(number, frame, quality, reading)
         })
     }
 }
@@ -329,7 +330,7 @@ impl Driver for DbcOptions {
 impl Family for DbcDevice {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         // Who asks for a frame of the device says nothing of it.
         if matches!(frame.format, Format::Error | Format::Remote) {
             return;
@@ -357,10 +358,10 @@ impl Family for DbcDevice {
             if !has || !assembly.take(part, sender, frame, out) {
                 continue;
             }
-            let after_silence = link.bringup.reading(frame.t);
+            let after_silence = session.bringup.reading(frame.t);
             let number = u8::try_from(part.reading).unwrap_or(u8::MAX);
-            if let Some(output) = assembly.finish(number, after_silence, frame, out) {
-                out.push(output, frame.id);
+            if let Some(stamped) = assembly.finish(number, after_silence, frame, out) {
+                out.push(stamped, frame.id);
             }
         }
         if is_short {

@@ -19,23 +19,23 @@ struct BoardIdentity {
 }
 
 /// Takes the answers of board `address`, if it is of one of `types`; `Err` if it is of another one.
-fn told(
+fn identity(
     evidence: &mut Evidence<'_>,
     address: u8,
     types: &[u8],
 ) -> Result<Option<BoardIdentity>, ()> {
-    let mut told = discovered(evidence, address, types);
+    let mut identity = discovered(evidence, address, types);
     for (class, command) in [
         (class::POLLING_ANALOG, command::GET_FIRMWARE_VERSION),
         (class::POLLING_MOTOR, command::MOTOR_GET_FIRMWARE_VERSION),
     ] {
         evidence.belongs(to_board(class, address));
         let version = version(evidence, to_host(class, address), command, types);
-        told = told.or(version);
+        identity = identity.or(version);
     }
-    match told {
-        Some(told) if !types.contains(&told.board) => Err(()),
-        told => Ok(told),
+    match identity {
+        Some(identity) if !types.contains(&identity.board) => Err(()),
+        identity => Ok(identity),
     }
 }
 
@@ -48,7 +48,7 @@ fn discovered(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Option<
         first.is_some_and(|c| c == command::DISCOVER || c < 0x10)
     };
     let stream = evidence.sends_as(IdUse::Tells, id, rule)?;
-    let mut told = None;
+    let mut identity = None;
     let mut texts: [Option<[u8; 4]>; 8] = [None; 8];
     let (mut frames, mut answers) = (0, 0_usize);
     for frame in stream.kept() {
@@ -56,7 +56,7 @@ fn discovered(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Option<
         match *frame.data() {
             [command::DISCOVER, board, major, minor, ref build @ ..] if build.len() < 2 => {
                 answers += 1;
-                told = Some(BoardIdentity {
+                identity = Some(BoardIdentity {
                     board,
                     version: [major, minor],
                     build: build.first().copied(),
@@ -71,7 +71,7 @@ fn discovered(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Option<
             _ => {}
         }
     }
-    let mut told = told?;
+    let mut identity = identity?;
     // A type of 256; among many frames one is like it by chance.
     evidence.add(8.0 - log2(types.len()) - log2(frames / answers.max(1)));
     if texts.iter().all(Option::is_some) {
@@ -81,9 +81,9 @@ fn discovered(evidence: &mut Evidence<'_>, address: u8, types: &[u8]) -> Option<
         let text = bytes
             .take_while(|byte| **byte != 0)
             .map(|byte| char::from(*byte));
-        told.info = text.filter(|letter| !letter.is_control()).collect();
+        identity.info = text.filter(|letter| !letter.is_control()).collect();
     }
-    Some(told)
+    Some(identity)
 }
 
 /// What a board has answered with identifier `id` to who asked for its version with `command`.
@@ -135,23 +135,25 @@ pub(crate) fn recognise(
     let addresses = ADDRESSES.filter_map(|address| u8::try_from(address).ok());
     let find = |address: u8| {
         let mut evidence = Evidence::new(seen, ADDRESSES.count());
-        let told = told(&mut evidence, address, types).ok()?;
-        let board = told.as_ref().map(|told| told.board);
+        let identity = identity(&mut evidence, address, types).ok()?;
+        let board = identity.as_ref().map(|identity| identity.board);
         let (keys, joints) = streams(&mut evidence, address, board);
         if board.is_none_or(|board| maybe.contains(&board)) && !evidence.is_sending() {
             return None;
         }
-        let what = match &told {
+        let what = match &identity {
             None => "iCub board".into(),
-            Some(told) => {
-                let known = board::NAMES.iter().find(|(code, _)| *code == told.board);
+            Some(identity) => {
+                let known = board::NAMES
+                    .iter()
+                    .find(|(code, _)| *code == identity.board);
                 let name = known.map_or("board", |(_, name)| name);
-                let [major, minor] = told.version;
-                let text = match told.info.as_str() {
+                let [major, minor] = identity.version;
+                let text = match identity.info.as_str() {
                     "" => String::new(),
                     text => format!(", {text:?}"),
                 };
-                match told.build {
+                match identity.build {
                     Some(build) => format!("{name}, firmware {major}.{minor}.{build}{text}"),
                     None => format!("{name}, in its bootloader {major}.{minor}: restart it{text}"),
                 }

@@ -7,11 +7,12 @@ use super::frames::{
 use super::options::{IcubImuOptions, ImuKeys};
 use crate::bringup::{Bringup, Timing};
 use crate::configure::{Configure, Setting};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{self, HalfOrder, Limit, Paired, Pairing};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, NotSent, OutputInfo, Spec, SpecError, StampedReading,
+    bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -116,7 +117,7 @@ impl ImuDevice {
         &mut self,
         bit: u16,
         frame: &Frame,
-        link: &mut Supervision<Configure>,
+        session: &mut Session<Configure>,
         out: &mut Decoded,
     ) {
         self.acquisition.have |= bit;
@@ -134,35 +135,35 @@ impl ImuDevice {
         if self.not_calibrated {
             quality |= Quality::NOT_CALIBRATED;
         }
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
             device_counter: u32::from(self.sequence.unwrap_or(0)),
-            ..Output::new(0, frame, quality, Reading::Imu(imu))
+            ..StampedReading::new(0, frame, quality, Reading::Imu(imu))
         };
-        self.give(output, frame, link, out);
+        self.add(stamped, frame, session, out);
     }
 
     /// Adds a reading; the first one after something was lost is marked.
-    fn give(
+    fn add(
         &mut self,
-        mut output: Output,
+        mut stamped: StampedReading,
         frame: &Frame,
-        link: &mut Supervision<Configure>,
+        session: &mut Session<Configure>,
         out: &mut Decoded,
     ) {
         if core::mem::take(&mut self.gap) {
-            output.quality |= Quality::GAP_BEFORE;
+            stamped.quality |= Quality::GAP_BEFORE;
         }
         self.seen = true;
-        link.give(output, frame, out);
+        session.add(stamped, frame, out);
     }
 
     fn triple(
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<Configure>,
+        session: &mut Session<Configure>,
         out: &mut Decoded,
     ) {
         let &[sequence, sensor, ..] = data else {
@@ -186,14 +187,14 @@ impl ImuDevice {
             _ => (&mut imu.angular_velocity, RATE_LSB),
         };
         *field = vector(data, 2).map(|count| f64::from(count) * lsb);
-        self.hold(bit, frame, link, out);
+        self.hold(bit, frame, session, out);
     }
 
     fn quaternion(
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<Configure>,
+        session: &mut Session<Configure>,
         out: &mut Decoded,
     ) {
         let bit = ImuQuantity::Orientation.bit();
@@ -212,14 +213,14 @@ impl ImuDevice {
         let w = bytes::i16_le(data, 0);
         self.acquisition.imu.orientation =
             [w, x, y, z].map(|count| f64::from(count) * QUATERNION_LSB);
-        self.hold(bit, frame, link, out);
+        self.hold(bit, frame, session, out);
     }
 
     fn status(
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<Configure>,
+        session: &mut Session<Configure>,
         out: &mut Decoded,
     ) {
         let &[sequence, gyroscope, accelerometer, magnetometer, ..] = data else {
@@ -238,7 +239,7 @@ impl ImuDevice {
         self.not_calibrated = lacks(ImuQuantity::Acceleration, accelerometer)
             || lacks(ImuQuantity::AngularVelocity, gyroscope)
             || lacks(ImuQuantity::MagneticField, magnetometer);
-        self.hold(bit, frame, link, out);
+        self.hold(bit, frame, session, out);
     }
 
     fn legacy(
@@ -246,7 +247,7 @@ impl ImuDevice {
         is_gyroscope: bool,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<Configure>,
+        session: &mut Session<Configure>,
         out: &mut Decoded,
     ) {
         let quantity = if is_gyroscope {
@@ -284,12 +285,12 @@ impl ImuDevice {
             set(true, rate);
             (acquired, stamp) = (t, kind);
         }
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
-            ..Output::new(0, frame, Quality::GOOD, Reading::Imu(imu))
+            ..StampedReading::new(0, frame, Quality::GOOD, Reading::Imu(imu))
         };
-        self.give(output, frame, link, out);
+        self.add(stamped, frame, session, out);
     }
 }
 
@@ -375,7 +376,7 @@ impl Driver for IcubImuOptions {
 impl Family for ImuDevice {
     type Questions = Configure;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<Configure>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<Configure>, out: &mut Decoded) {
         let is_legacy = self.plan.legacy != Legacy::None;
         if let Some(stream) =
             icub::stream_type(frame.id, class::PERIODIC_INERTIAL, self.plan.address)
@@ -390,10 +391,10 @@ impl Family for ImuDevice {
             };
             match stream {
                 _ if data.len() != expected => out.fault(Counter::Length, 1, frame.id),
-                kind::TRIPLE => self.triple(data, frame, link, out),
-                kind::QUATERNION => self.quaternion(data, frame, link, out),
-                kind::STATUS => self.status(data, frame, link, out),
-                _ => self.legacy(stream == kind::LEGACY_GYROSCOPE, data, frame, link, out),
+                kind::TRIPLE => self.triple(data, frame, session, out),
+                kind::QUATERNION => self.quaternion(data, frame, session, out),
+                kind::STATUS => self.status(data, frame, session, out),
+                _ => self.legacy(stream == kind::LEGACY_GYROSCOPE, data, frame, session, out),
             }
         } else if !is_legacy
             && frame.id == icub::to_host(class::POLLING_ANALOG, self.plan.address)
@@ -401,7 +402,7 @@ impl Family for ImuDevice {
         {
             match data.first() {
                 Some(&command::IMU_CONFIG_GET) => {
-                    link.questions.answer(data, frame, out);
+                    session.questions.answer(data, frame, out);
                 }
                 // Answers to other questions are for other devices.
                 Some(_) => {}

@@ -103,9 +103,9 @@ impl Board for Mc4Board {
         joint.ticks = bytes::quantise(state.position, joint.scale.position, least, most) as i32;
         let velocity = Some(state.velocity).filter(|velocity| velocity.is_finite());
         joint.steps = velocity.map(|v| bytes::quantise_i16(v, joint.scale.velocity));
-        let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT | Quality::NOT_CALIBRATED;
+        let carried = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT | Quality::NOT_CALIBRATED;
         let known = status_quality(u32::from(joint.faults), u32::from(joint.mode));
-        if known.0 != quality.0 & told.0 {
+        if known.0 != quality.0 & carried.0 {
             let set = |flag, bit: u32| if quality.contains(flag) { bit as u8 } else { 0 };
             joint.faults = set(Quality::DEVICE_FAULT, fault::ABSOLUTE_ENCODER)
                 | set(Quality::DRIVE_FAULT, fault::EXTERNAL);

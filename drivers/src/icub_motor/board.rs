@@ -77,8 +77,9 @@ impl Board for MotorBoard {
             Reading::Joint(joint) => {
                 let velocity = if self.velocity { joint.velocity } else { 0.0 };
                 board::finite(&[joint.position, velocity])?;
-                let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT | Quality::NOT_CALIBRATED;
-                if self.status.0 & told.0 != quality.0 & told.0 {
+                let carried =
+                    Quality::DEVICE_FAULT | Quality::DRIVE_FAULT | Quality::NOT_CALIBRATED;
+                if self.status.0 & carried.0 != quality.0 & carried.0 {
                     let mut actuator = Actuator {
                         duty: 0.0,
                         mode: 6,

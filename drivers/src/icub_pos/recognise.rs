@@ -16,12 +16,12 @@ impl Recognise for IcubPosOptions {
                 [quantity, values, ref bytes @ ..] if frame.len() == 8 => {
                     let count = values & 0xF;
                     let (values, _) = bytes.as_chunks();
-                    let mut own = values.iter().take(count.into());
+                    let mut carried = values.iter().take(count.into());
                     // A length may be any.
                     let is_angle = |value| i16::from_le_bytes(value).unsigned_abs() <= 3600;
                     quantity < 2
                         && (1..=VALUES).contains(&count)
-                        && own.all(|value| quantity == 1 || is_angle(*value))
+                        && carried.all(|value| quantity == 1 || is_angle(*value))
                 }
                 _ => false,
             });

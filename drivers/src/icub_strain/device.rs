@@ -5,12 +5,12 @@ use super::exchange::{Exchange, Told};
 use super::frames::{CELSIUS_PER_LSB, STEPS, StrainHalf, ZERO, kind};
 use super::options::{IcubStrainOptions, StrainStream};
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry, Timing};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::{
     Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
-    Driver, Frame, Mode, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
+    Driver, Frame, Mode, NotSent, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -172,11 +172,11 @@ struct Whole {
 }
 
 impl Whole {
-    fn output(&self, quality: Quality, reading: Reading, frame: &Frame) -> Output {
-        Output {
+    fn output(&self, quality: Quality, reading: Reading, frame: &Frame) -> StampedReading {
+        StampedReading {
             acquired: self.acquired,
             stamp: self.stamp,
-            ..Output::new(0, frame, quality, reading)
+            ..StampedReading::new(0, frame, quality, reading)
         }
     }
 }
@@ -257,20 +257,20 @@ impl Strain {
         second: bool,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<StrainScales>,
+        session: &mut Session<StrainScales>,
         out: &mut Decoded,
     ) {
         let Some(whole) = self.calibrated.push(second, data, frame, out) else {
             return;
         };
-        let Some(per_step) = link.questions.per_step else {
-            if link.bringup.mode() == Mode::Listen
-                && !link.questions.settled
-                && link.questions.refusal.is_none()
+        let Some(per_step) = session.questions.per_step else {
+            if session.bringup.mode() == Mode::Listen
+                && !session.questions.settled
+                && session.questions.refusal.is_none()
             {
                 // The board streams already, its scale is unknown, and no other program will
                 // request it for this host.
-                link.questions.refusal = Some(Refusal::NoFullScale);
+                session.questions.refusal = Some(Refusal::NoFullScale);
             }
             return;
         };
@@ -292,7 +292,7 @@ impl Strain {
             Quality::GOOD
         };
         let quality = whole.quality | frozen | step | self.calibrated.take_gap();
-        link.give(whole.output(quality, reading, frame), frame, out);
+        session.add(whole.output(quality, reading, frame), frame, out);
     }
 
     fn gauges(
@@ -300,7 +300,7 @@ impl Strain {
         second: bool,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<StrainScales>,
+        session: &mut Session<StrainScales>,
         out: &mut Decoded,
     ) {
         let Some(whole) = self.raw.push(second, data, frame, out) else {
@@ -311,7 +311,7 @@ impl Strain {
             counts: [a, b, c, d, e, f].map(i32::from),
         });
         let quality = whole.quality | self.raw.take_gap();
-        link.give(whole.output(quality, reading, frame), frame, out);
+        session.add(whole.output(quality, reading, frame), frame, out);
     }
 }
 
@@ -388,17 +388,17 @@ impl Driver for IcubStrainOptions {
 impl Family for Strain {
     type Questions = StrainScales;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<StrainScales>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<StrainScales>, out: &mut Decoded) {
         if let Some(stream) = icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) {
             let known = matches!(stream, kind::RAW_FORCE..=kind::TORQUE | kind::THERMOMETER..);
             let Some(data) = known.then(|| bytes::payload(frame, out)).flatten() else {
                 return;
             };
             match stream {
-                kind::FORCE => self.wrench(false, data, frame, link, out),
-                kind::TORQUE => self.wrench(true, data, frame, link, out),
-                kind::RAW_FORCE => self.gauges(false, data, frame, link, out),
-                kind::RAW_TORQUE => self.gauges(true, data, frame, link, out),
+                kind::FORCE => self.wrench(false, data, frame, session, out),
+                kind::TORQUE => self.wrench(true, data, frame, session, out),
+                kind::RAW_FORCE => self.gauges(false, data, frame, session, out),
+                kind::RAW_TORQUE => self.gauges(true, data, frame, session, out),
                 _ => temperature(data, frame, out),
             }
         } else if frame.id == icub::to_host(class::POLLING_ANALOG, self.address)
@@ -406,14 +406,17 @@ impl Family for Strain {
         {
             match data.first() {
                 Some(&command::GET_FULL_SCALES) if !self.exchange.expects(data) => {
-                    link.questions.answer(data, link.bringup.mode(), frame, out);
+                    session
+                        .questions
+                        .answer(data, session.bringup.mode(), frame, out);
                 }
                 // As with full scales: live and in a log the same answers are malformed.
                 Some(&command::GET_MATRIX_RC) => {
-                    self.exchange.answer(data, link.bringup.mode(), frame, out);
+                    self.exchange
+                        .answer(data, session.bringup.mode(), frame, out);
                 }
                 Some(&(command::GET_FULL_SCALES | command::GET_CURR_TARE))
-                    if link.bringup.mode() == Mode::Supervise =>
+                    if session.bringup.mode() == Mode::Supervise =>
                 {
                     self.exchange.answer(data, Mode::Supervise, frame, out);
                 }
@@ -432,7 +435,7 @@ impl Family for Strain {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Supervision<StrainScales>,
+        _session: &mut Session<StrainScales>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         self.exchange.poll(now)
@@ -454,16 +457,18 @@ impl Family for Strain {
         &mut self,
         command: Command,
         now: Nanos,
-        link: &Supervision<StrainScales>,
+        session: &Session<StrainScales>,
     ) -> Result<(), CommandRefused> {
         let tares = command == Command::Tare;
-        if tares && self.stream == StrainStream::Uncalibrated && link.bringup.mode() != Mode::Listen
+        if tares
+            && self.stream == StrainStream::Uncalibrated
+            && session.bringup.mode() != Mode::Listen
         {
             return Err(CommandRefused::Useless(
                 "this device streams raw gauges alone, which a tare does not change",
             ));
         }
-        link.takes_command()?;
+        session.takes_command()?;
         if self.exchange.is_open() {
             return Err(CommandRefused::Busy);
         }
@@ -473,11 +478,11 @@ impl Family for Strain {
 
     fn outcome(
         &mut self,
-        link: &Supervision<StrainScales>,
+        session: &Session<StrainScales>,
     ) -> Option<Result<CommandOutcome, CommandFailed>> {
         Some(match self.exchange.outcome()? {
             Ok((Command::Tare, told)) => {
-                let per_step = link.questions.per_step.unwrap_or([f64::NAN; 6]);
+                let per_step = session.questions.per_step.unwrap_or([f64::NAN; 6]);
                 Ok(CommandOutcome::Tared(Some(added(told, per_step))))
             }
             Ok((Command::Calibration, told)) => Ok(CommandOutcome::Calibration(calibration(told))),
@@ -515,8 +520,8 @@ fn temperature(data: &[u8], frame: &Frame, out: &mut Decoded) {
         [mask, _, _, _, _] if mask & 1 == 1 => {
             let celsius = f64::from(bytes::i16_le(data, 1)) * CELSIUS_PER_LSB;
             let reading = Reading::Temperature(Temperature { celsius });
-            let output = Output::new(0, frame, Quality::GOOD, reading);
-            out.push(output, frame.id);
+            let stamped = StampedReading::new(0, frame, Quality::GOOD, reading);
+            out.push(stamped, frame.id);
         }
         [_, _, _, _, _] => out.fault(Counter::Value, 1, frame.id),
         _ => out.fault(Counter::Length, 1, frame.id),

@@ -5,11 +5,11 @@ use super::options::Jr3CanOptions;
 use super::protocol::{READY, SAMPLE, STEPS, id, node, op, op_of};
 use super::scales::{Jr3Scales, Question};
 use crate::bringup::{Bringup, Timing};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::wrench::{NewZero, TareCommand, at_end};
 use crate::{
     Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
-    Driver, Frame, Mode, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
+    Driver, Frame, Mode, NotSent, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -64,7 +64,7 @@ impl Jr3 {
         &mut self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<Jr3Scales>,
+        session: &mut Session<Jr3Scales>,
         out: &mut Decoded,
     ) {
         match *data {
@@ -78,8 +78,8 @@ impl Jr3 {
             }
             [state, ref scales @ ..] if scales.len() == 6 => {
                 let scales = [0, 2, 4].map(|at| bytes::u16_le(scales, at));
-                let mode = link.bringup.mode();
-                link.questions.answer(state, scales, mode, frame, out);
+                let mode = session.bringup.mode();
+                session.questions.answer(state, scales, mode, frame, out);
             }
             _ => out.fault(Counter::Length, 1, frame.id),
         }
@@ -89,12 +89,12 @@ impl Jr3 {
         &mut self,
         half: Jr3Half,
         frame: &Frame,
-        link: &mut Supervision<Jr3Scales>,
+        session: &mut Session<Jr3Scales>,
         out: &mut Decoded,
     ) {
         self.joined = true;
         if self.waiting.replace((frame.t, frame.stamp, half)).is_some() {
-            link.lost(Counter::Unpaired, 1, frame, out);
+            session.lost(Counter::Unpaired, 1, frame, out);
         }
     }
 
@@ -102,13 +102,13 @@ impl Jr3 {
         &mut self,
         half: Jr3Half,
         frame: &Frame,
-        link: &mut Supervision<Jr3Scales>,
+        session: &mut Session<Jr3Scales>,
         out: &mut Decoded,
     ) {
         let force = (self.waiting).take_if(|(_, _, force)| force.counter == half.counter);
         let Some((acquired, stamp, force)) = force else {
             if self.joined {
-                link.lost(Counter::Unpaired, 1, frame, out);
+                session.lost(Counter::Unpaired, 1, frame, out);
             }
             return;
         };
@@ -118,14 +118,14 @@ impl Jr3 {
                 0 => quality |= Quality::FROZEN,
                 samples => {
                     let lost = self.periods(samples).saturating_sub(1);
-                    link.lost(Counter::Lost, lost, frame, out);
+                    session.lost(Counter::Lost, lost, frame, out);
                 }
             }
         }
-        let Some(per_step) = link.questions.per_step else {
-            if link.bringup.mode() == Mode::Listen && link.questions.refusal.is_none() {
+        let Some(per_step) = session.questions.per_step else {
+            if session.bringup.mode() == Mode::Listen && session.questions.refusal.is_none() {
                 // The board streams already, and no other program asks for this host.
-                link.questions.refusal = Some(Refusal::NoFullScale);
+                session.questions.refusal = Some(Refusal::NoFullScale);
             }
             return;
         };
@@ -138,13 +138,13 @@ impl Jr3 {
         quality |= self.zero.mark(frame.t);
         let [fx, fy, fz, tx, ty, tz] = values;
         let (force, torque) = ([fx, fy, fz], [tx, ty, tz]);
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
             device_counter: u32::from(half.counter),
-            ..Output::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
+            ..StampedReading::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        link.give(output, frame, out);
+        session.add(stamped, frame, out);
     }
 
     /// The number of periods in which the sensor takes `samples`, to the nearest.
@@ -172,7 +172,7 @@ impl Driver for Jr3CanOptions {
         let [p0, p1, p2, p3] = ((period.0 / 1000) as u32).to_le_bytes();
         bringup.start_with(id(op::START, node), &[c0, c1, p0, p1, p2, p3]);
         bringup.stop_with(id(op::STOP, node), &[]);
-        let own = [op::FORCE, op::MOMENT, op::ACKNOWLEDGE, op::BOOT_UP];
+        let codes = [op::FORCE, op::MOMENT, op::ACKNOWLEDGE, op::BOOT_UP];
         let heard = [
             op::START_SYNC,
             op::START,
@@ -180,7 +180,7 @@ impl Driver for Jr3CanOptions {
             op::GET_FORCE_SCALES,
             op::GET_MOMENT_SCALES,
         ];
-        let own = own.map(|op| Claim::exclusive(id(op, node)));
+        let exclusive = codes.map(|op| Claim::exclusive(id(op, node)));
         let heard = heard.map(|op| Claim::shared(id(op, node)));
         let this = Jr3 {
             node,
@@ -192,7 +192,7 @@ impl Driver for Jr3CanOptions {
             tare: TareCommand::default(),
             outcome: None,
         };
-        let claims = own.into_iter().chain(heard);
+        let claims = exclusive.into_iter().chain(heard);
         Ok(Supervised::boxed(claims, bringup, scales, this))
     }
 }
@@ -200,17 +200,17 @@ impl Driver for Jr3CanOptions {
 impl Family for Jr3 {
     type Questions = Jr3Scales;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<Jr3Scales>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<Jr3Scales>, out: &mut Decoded) {
         let Some(op) = op_of(frame.id, self.node) else {
             return;
         };
         match op {
             op::START | op::START_SYNC | op::ZERO => return self.expect_zero(frame.t),
-            op::GET_FORCE_SCALES if link.bringup.mode() == Mode::Listen => {
-                return link.questions.overhear(Question::Forces);
+            op::GET_FORCE_SCALES if session.bringup.mode() == Mode::Listen => {
+                return session.questions.overhear(Question::Forces);
             }
-            op::GET_MOMENT_SCALES if link.bringup.mode() == Mode::Listen => {
-                return link.questions.overhear(Question::Moments);
+            op::GET_MOMENT_SCALES if session.bringup.mode() == Mode::Listen => {
+                return session.questions.overhear(Question::Moments);
             }
             op::FORCE | op::MOMENT | op::ACKNOWLEDGE | op::BOOT_UP => {}
             _ => return,
@@ -219,11 +219,11 @@ impl Family for Jr3 {
             return;
         };
         match (op, Jr3Half::parse(data)) {
-            (op::ACKNOWLEDGE, _) => self.acknowledge(data, frame, link, out),
-            (op::FORCE, Some(half)) => self.force(half, frame, link, out),
-            (op::MOMENT, Some(half)) => self.moment(half, frame, link, out),
+            (op::ACKNOWLEDGE, _) => self.acknowledge(data, frame, session, out),
+            (op::FORCE, Some(half)) => self.force(half, frame, session, out),
+            (op::MOMENT, Some(half)) => self.moment(half, frame, session, out),
             (op::BOOT_UP, _) if data.is_empty() => {
-                link.bringup.restart();
+                session.bringup.restart();
                 self.reset();
                 self.zero.expect(frame.t);
             }
@@ -231,8 +231,8 @@ impl Family for Jr3 {
         }
     }
 
-    fn full_scale(&self, link: &Supervision<Jr3Scales>) -> Option<[f64; 6]> {
-        Some(link.questions.per_step?.map(|step| step * STEPS))
+    fn full_scale(&self, session: &Session<Jr3Scales>) -> Option<[f64; 6]> {
+        Some(session.questions.per_step?.map(|step| step * STEPS))
     }
 
     fn reset(&mut self) {
@@ -244,7 +244,7 @@ impl Family for Jr3 {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Supervision<Jr3Scales>,
+        _session: &mut Session<Jr3Scales>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         let due = self.tare.poll(now);
@@ -275,19 +275,19 @@ impl Family for Jr3 {
         &mut self,
         command: Command,
         now: Nanos,
-        link: &Supervision<Jr3Scales>,
+        session: &Session<Jr3Scales>,
     ) -> Result<(), CommandRefused> {
         if self.tare.is_open() {
             return Err(CommandRefused::Busy);
         }
         match command {
             Command::Tare => {
-                link.takes_command()?;
+                session.takes_command()?;
                 self.tare.begin(now);
             }
             // They were read at the start.
             Command::Calibration => {
-                let known = self.full_scale(link);
+                let known = self.full_scale(session);
                 let scales = known.ok_or(CommandRefused::Unknown("its full scale"))?;
                 let scales = Calibration::FullScale(scales);
                 self.outcome = Some(CommandOutcome::Calibration(scales));
@@ -298,7 +298,7 @@ impl Family for Jr3 {
 
     fn outcome(
         &mut self,
-        _link: &Supervision<Jr3Scales>,
+        _session: &Session<Jr3Scales>,
     ) -> Option<Result<CommandOutcome, CommandFailed>> {
         self.outcome.take().map(Ok).or_else(|| self.tare.outcome())
     }

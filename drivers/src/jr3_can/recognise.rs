@@ -41,8 +41,8 @@ fn board(seen: &Traffic, driver: &'static str, node: u16) -> Option<Finding> {
                     .into_iter()
                     .all(|at| (1..10_000).contains(&scale(at)))
         };
-        let mut told = stream.kept().filter(|frame| frame.len() == 7).peekable();
-        told.peek().is_some() && told.all(plausible)
+        let mut frames = stream.kept().filter(|frame| frame.len() == 7).peekable();
+        frames.peek().is_some() && frames.all(plausible)
     });
     if scales {
         // Each a number of 16 bits, one of seven.

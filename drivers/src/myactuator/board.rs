@@ -105,8 +105,8 @@ impl MyactuatorBoard {
                 board::finite(&[joint.position, joint.velocity])?;
                 board::finite_or_absent(&[joint.torque, joint.current])?;
                 self.joint = *joint;
-                let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
-                if self.keys.quality(errors).0 != quality.0 & told.0 {
+                let carried = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
+                if self.keys.quality(errors).0 != quality.0 & carried.0 {
                     let set = |flag, error| if quality.contains(flag) { error } else { 0 };
                     // V2 has no error of the encoder.
                     let sensor = match self.keys.protocol {

@@ -3,10 +3,11 @@
 use super::frames::{Answer, JOINT, LENGTH, MOTOR, MotorStatus, MyactuatorProtocol, command};
 use super::options::{MyactuatorKeys, MyactuatorOptions, MyactuatorPosition};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Rounds, Supervised, Supervision, temperature};
+use crate::family::{Family, Rounds, Session, Supervised, temperature};
 use crate::held::{HeldValue, OnChange};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes, mit,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading,
+    bytes, mit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -36,7 +37,7 @@ impl MyactuatorMotor {
         position: f64,
         saturated: bool,
         frame: &Frame,
-        link: &mut Supervision<NoInquiry>,
+        session: &mut Session<NoInquiry>,
         out: &mut Decoded,
     ) {
         let mut quality = self.keys.quality(self.errors);
@@ -51,14 +52,14 @@ impl MyactuatorMotor {
             current,
             ..JointState::ABSENT
         };
-        link.joint(JOINT, frame, quality, state, out);
+        session.joint(JOINT, frame, quality, state, out);
     }
 
     fn state(
         &mut self,
         state: MotorStatus,
         frame: &Frame,
-        link: &mut Supervision<NoInquiry>,
+        session: &mut Session<NoInquiry>,
         out: &mut Decoded,
     ) {
         let MyactuatorKeys {
@@ -83,7 +84,7 @@ impl MyactuatorMotor {
         };
         let saturated = place || is_end(state.speed) || is_end(state.current);
         let position = f64::from(state.place) * place_step;
-        self.joint(position, saturated, frame, link, out);
+        self.joint(position, saturated, frame, session, out);
     }
 
     fn errors(&mut self, errors: u16, frame: &Frame, out: &mut Decoded) {
@@ -96,7 +97,8 @@ impl MyactuatorMotor {
                 faults: u32::from(errors),
             });
             let quality = self.keys.quality(errors);
-            out.push(Output::new(JOINT, frame, quality, reading), frame.id);
+            let stamped = StampedReading::new(JOINT, frame, quality, reading);
+            out.push(stamped, frame.id);
         }
     }
 
@@ -104,7 +106,7 @@ impl MyactuatorMotor {
         &self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<NoInquiry>,
+        session: &mut Session<NoInquiry>,
         out: &mut Decoded,
     ) {
         let measured = (data.split_first()).filter(|(id, _)| u16::from(**id) == self.keys.address);
@@ -113,7 +115,7 @@ impl MyactuatorMotor {
         };
         let (state, saturated) = mit::measured(self.keys.scales, raw);
         let quality = self.keys.quality(self.errors) | saturated;
-        link.joint(JOINT, frame, quality, state, out);
+        session.joint(JOINT, frame, quality, state, out);
     }
 }
 
@@ -155,7 +157,7 @@ impl Family for MyactuatorMotor {
     type Questions = NoInquiry;
 
     #[allow(clippy::cast_precision_loss)] // an angle of 2^53 steps is none
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         let is_motion =
             self.keys.position == MyactuatorPosition::Motion && frame.id == self.keys.motion();
         if !is_motion && frame.id != self.keys.answers() {
@@ -165,13 +167,19 @@ impl Family for MyactuatorMotor {
             return;
         };
         if is_motion {
-            return self.motion(data, frame, link, out);
+            return self.motion(data, frame, session, out);
         }
-        let asks = link.bringup.mode() == Mode::Supervise;
+        let asks = session.bringup.mode() == Mode::Supervise;
         match Answer::parse(self.keys.protocol, asks, data) {
-            Some(Answer::State(state)) => self.state(state, frame, link, out),
+            Some(Answer::State(state)) => self.state(state, frame, session, out),
             Some(Answer::Angle(angle)) if self.keys.position == MyactuatorPosition::Angle => {
-                self.joint(angle as f64 * self.keys.angle_step, false, frame, link, out);
+                self.joint(
+                    angle as f64 * self.keys.angle_step,
+                    false,
+                    frame,
+                    session,
+                    out,
+                );
             }
             Some(Answer::Errors(errors)) => self.errors(errors, frame, out),
             // Answers to other programs.
@@ -189,7 +197,7 @@ impl Family for MyactuatorMotor {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Supervision<NoInquiry>,
+        _session: &mut Session<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         let round: &[u8] = match self.keys.position {

@@ -65,7 +65,7 @@ fn has(stream: &Stream, command: u8) -> bool {
 
 /// Whether the newest answers about errors and state tell one temperature.
 fn agrees(stream: &Stream) -> bool {
-    let told = |command: u8| {
+    let temperature = |command: u8| {
         let is_one = |frame: &&Frame| {
             let rest = frame.data().split_first();
             rest.is_some_and(|(first, rest)| *first == command && rest.iter().any(|b| *b != 0))
@@ -73,8 +73,8 @@ fn agrees(stream: &Stream) -> bool {
         let newest = stream.recent().rev().find(is_one)?;
         newest.data().get(1).map(|byte| byte.cast_signed())
     };
-    let told = (told(command::ERRORS), told(command::STATE));
-    matches!(told, (Some(a), Some(b)) if a.abs_diff(b) <= 1)
+    let temperatures = (temperature(command::ERRORS), temperature(command::STATE));
+    matches!(temperatures, (Some(a), Some(b)) if a.abs_diff(b) <= 1)
 }
 
 /// What that counts \[bits\]: a byte of two frames is the same, within 1, once in 85 times; but

@@ -69,8 +69,8 @@ impl OdriveBoard {
         match (output, reading) {
             (JOINT, Reading::Joint(joint)) => {
                 board::finite(&[joint.position])?;
-                let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
-                if firmware.quality(self.errors).0 != quality.0 & told.0 {
+                let carried = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
+                if firmware.quality(self.errors).0 != quality.0 & carried.0 {
                     let (encoder, drive) = match firmware {
                         Firmware::V0_6 => (error::MISSING_ESTIMATE, error::ESTOP_0_6),
                         Firmware::V0_5 => (error::ENCODER_FAILED, error::ESTOP_0_5),

@@ -4,10 +4,10 @@ use super::firmware::{Firmware, error};
 use super::frames::{FET, JOINT, LENGTH, MOTOR, command, is_request};
 use super::options::{OdriveKeys, OdriveOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Rounds, Supervised, Supervision, temperature};
+use crate::family::{Family, Rounds, Session, Supervised, temperature};
 use crate::held::HeldValue;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -35,12 +35,12 @@ impl OdriveAxis {
         &self,
         data: &[u8],
         frame: &Frame,
-        link: &mut Supervision<NoInquiry>,
+        session: &mut Session<NoInquiry>,
         out: &mut Decoded,
     ) {
         let (position, velocity) = (float(data, 0) * TAU, float(data, 1) * TAU);
         if !position.is_finite() {
-            return link.lost(Counter::Value, 1, frame, out);
+            return session.lost(Counter::Value, 1, frame, out);
         }
         let current = self.current.at(frame, self.keys.hold);
         let torque = match self.keys.torque_constant {
@@ -58,7 +58,7 @@ impl OdriveAxis {
             current,
             ..JointState::ABSENT
         };
-        link.joint(JOINT, frame, self.status, state, out);
+        session.joint(JOINT, frame, self.status, state, out);
     }
 
     fn heartbeat(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
@@ -78,7 +78,8 @@ impl OdriveAxis {
             encoder: faults & self.keys.firmware.encoder_errors(),
             faults,
         });
-        out.push(Output::new(JOINT, frame, self.status, reading), frame.id);
+        let stamped = StampedReading::new(JOINT, frame, self.status, reading);
+        out.push(stamped, frame.id);
     }
 }
 
@@ -119,7 +120,7 @@ impl Driver for OdriveOptions {
 impl Family for OdriveAxis {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         let Some(command) = self.keys.command(frame.id) else {
             return;
         };
@@ -130,7 +131,7 @@ impl Family for OdriveAxis {
             return;
         };
         match command {
-            command::ESTIMATES => self.estimates(data, frame, link, out),
+            command::ESTIMATES => self.estimates(data, frame, session, out),
             command::IQ => self.current = HeldValue::new(frame, float(data, 1)),
             command::TORQUES => self.torque = HeldValue::new(frame, float(data, 1)),
             command::TEMPERATURE => {
@@ -149,7 +150,7 @@ impl Family for OdriveAxis {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Supervision<NoInquiry>,
+        _session: &mut Session<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         let command = self.requests.ask(self.keys.firmware.requests(), now)?;

@@ -7,10 +7,12 @@ use super::frames::{
 };
 use super::options::{OpenImuKeys, OpenImuOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::group::FrameGroup;
 use crate::pairing::Limit;
-use crate::{Claim, Decoded, Device, Driver, Frame, Output, OutputInfo, Spec, SpecError, bytes};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError, StampedReading, bytes,
+};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Saturation};
@@ -44,17 +46,17 @@ impl OpenImuSample {
         let merits = data[6];
         let is_wrong = |bit: &u8| merits >> bit & 3 == merit::ERROR;
         let counts = [0, 2, 4].map(|at| u32::from(bytes::u16_le(data, at)));
-        let mut wrong = false;
+        let mut any_wrong = false;
         match quantity {
             OpenImuQuantity::Orientation => {
                 let angle = |at| ANGLE.value(bytes::u32_le(data, at) & 0xFF_FFFF);
                 this.imu.orientation = quaternion(angle(0)?, angle(3)?);
-                wrong = merit::OF_ANGLES.iter().any(is_wrong);
+                any_wrong = merit::OF_ANGLES.iter().any(is_wrong);
             }
             OpenImuQuantity::Acceleration => {
                 let values = all(counts.map(|count| ACCELERATION.value(count)))?;
                 this.imu.proper_acceleration = plan.upright.turn(plan.axes.exchange(values));
-                wrong = merit::OF_AXES.iter().any(is_wrong);
+                any_wrong = merit::OF_AXES.iter().any(is_wrong);
             }
             OpenImuQuantity::AngularVelocity => {
                 let values = all(counts.map(|count| RATE.value(count)))?;
@@ -68,11 +70,11 @@ impl OpenImuSample {
                         _ => Saturation::None,
                     };
                     this.quality = this.quality.with_saturation(axis, end);
-                    wrong |= end == Saturation::None && is_wrong(bit);
+                    any_wrong |= end == Saturation::None && is_wrong(bit);
                 }
             }
         }
-        if wrong {
+        if any_wrong {
             this.quality |= Quality::DEVICE_FAULT;
         }
         Some(this)
@@ -141,7 +143,7 @@ impl Driver for OpenImuOptions {
 impl Family for OpenImuSensor {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         let Some((pgn, source)) = group_and_source(frame.id) else {
             return;
         };
@@ -160,15 +162,15 @@ impl Family for OpenImuSensor {
         let mut dropped = 0;
         let add = |sample: &mut OpenImuSample| sample.add(quantity, part);
         let whole = (self.group).push(position, frame, OpenImuSample::EMPTY, add, &mut dropped);
-        link.lost(Counter::Unpaired, dropped, frame, out);
+        session.lost(Counter::Unpaired, dropped, frame, out);
         let Some(whole) = whole else { return };
         let OpenImuSample { imu, quality } = whole.content;
-        let output = Output {
+        let stamped = StampedReading {
             acquired: whole.acquired,
             stamp: whole.stamp,
-            ..Output::new(0, frame, quality, Reading::Imu(imu))
+            ..StampedReading::new(0, frame, quality, Reading::Imu(imu))
         };
-        link.give(output, frame, out);
+        session.add(stamped, frame, out);
     }
 
     fn reset(&mut self) {

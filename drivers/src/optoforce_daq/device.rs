@@ -6,11 +6,11 @@ use super::protocol::{
     ANSWER, CONFIGURATION, ERRORS, OVERLOAD_FX, OptoIds, OptoSettings, PACKET, ZERO_OWN, sum,
 };
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::wrench::{self, NewZero};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, Mode, NotSent, Output, OutputInfo, Spec, SpecError,
-    bytes,
+    Claim, Decoded, Device, Driver, Frame, Id, Mode, NotSent, OutputInfo, Spec, SpecError,
+    StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -76,7 +76,7 @@ impl Opto {
         halves: [[u8; 8]; 2],
         first: (Nanos, StampKind),
         frame: &Frame,
-        link: &mut Supervision<NoInquiry>,
+        session: &mut Session<NoInquiry>,
         out: &mut Decoded,
     ) {
         let [[_, _, _, _, c0, c1, s0, s1], [a, b, c, d, e, f, _, _]] = halves;
@@ -88,7 +88,7 @@ impl Opto {
                 0 => quality |= Quality::FROZEN,
                 1 => {}
                 step => {
-                    link.bringup.lost();
+                    session.bringup.lost();
                     // A large step is a unit that was started again.
                     if step <= u16::MAX / 2 {
                         out.fault(Counter::Lost, u32::from(step) - 1, frame.id);
@@ -113,13 +113,13 @@ impl Opto {
         quality |= self.zero.mark(frame.t);
         let torque = [f64::NAN; 3];
         let (acquired, stamp) = first;
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
             device_counter: u32::from(counter),
-            ..Output::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
+            ..StampedReading::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        link.give(output, frame, out);
+        session.add(stamped, frame, out);
     }
 }
 
@@ -168,7 +168,7 @@ impl Driver for OptoforceDaqOptions {
 impl Family for Opto {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         if frame.id != self.ids.data {
             return;
         }
@@ -182,7 +182,7 @@ impl Family for Opto {
         if let Some((t, stamp, first)) = waiting {
             let before = sum(&first).wrapping_add(sum(half.get(..6).unwrap_or(&half)));
             if before == bytes::u16_be(&half, 6) {
-                return self.packet([first, half], (t, stamp), frame, link, out);
+                return self.packet([first, half], (t, stamp), frame, session, out);
             }
         }
         let begins = half.starts_with(&PACKET);
@@ -201,7 +201,7 @@ impl Family for Opto {
                 return;
             }
         }
-        link.bringup.lost();
+        session.bringup.lost();
     }
 
     fn reset(&mut self) {

@@ -4,12 +4,12 @@
 use super::options::RobotousRftOptions;
 use super::protocol::{DEFAULT_RATE, OVERLOAD_FX, RftIds, SET, command, period, send};
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry, Timing};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::wrench::{self, NewZero, TareCommand};
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Driver, Frame,
-    Id, Mode, NotSent, Output, OutputInfo, Spec, SpecError, bytes,
+    Id, Mode, NotSent, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -129,24 +129,24 @@ impl Rft {
         (Wrench { force, torque }, quality)
     }
 
-    fn give(
+    fn add(
         &mut self,
         halves: [[u8; 8]; 2],
         first: (Nanos, StampKind),
         frame: &Frame,
-        link: &mut Supervision<Rate>,
+        session: &mut Session<Rate>,
         out: &mut Decoded,
     ) {
         let [a, b] = halves;
         let (wrench, mut quality) = self.wrench(a, b);
         quality |= self.zero.mark(frame.t);
         let (acquired, stamp) = first;
-        let output = Output {
+        let stamped = StampedReading {
             acquired,
             stamp,
-            ..Output::new(0, frame, quality, Reading::Wrench(wrench))
+            ..StampedReading::new(0, frame, quality, Reading::Wrench(wrench))
         };
-        link.give(output, frame, out);
+        session.add(stamped, frame, out);
     }
 }
 
@@ -185,7 +185,7 @@ impl Driver for RobotousRftOptions {
 impl Family for Rft {
     type Questions = Rate;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<Rate>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<Rate>, out: &mut Decoded) {
         let second = frame.id == self.ids.second;
         if !second && frame.id != self.ids.first {
             return;
@@ -196,16 +196,16 @@ impl Family for Rft {
         };
         let mut unpaired = 0;
         let paired = self.pairing.push(second, frame, half, &mut unpaired);
-        link.lost(Counter::Unpaired, unpaired, frame, out);
+        session.lost(Counter::Unpaired, unpaired, frame, out);
         let Paired::With(acquired, stamp, halves) = paired else {
             return;
         };
         match halves[0] {
             [command::START, ..] => {
-                self.give(halves, (acquired, stamp), frame, link, out);
+                self.add(halves, (acquired, stamp), frame, session, out);
             }
-            [command::GET_RATE, code, ..] if link.bringup.mode() == Mode::Supervise => {
-                link.questions.answer(code, frame, out);
+            [command::GET_RATE, code, ..] if session.bringup.mode() == Mode::Supervise => {
+                session.questions.answer(code, frame, out);
             }
             // Answers to other questions are for other programs.
             _ => {}
@@ -219,7 +219,7 @@ impl Family for Rft {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Supervision<Rate>,
+        _session: &mut Session<Rate>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         let due = self.tare.poll(now);
@@ -247,12 +247,12 @@ impl Family for Rft {
         &mut self,
         command: Command,
         now: Nanos,
-        link: &Supervision<Rate>,
+        session: &Session<Rate>,
     ) -> Result<(), CommandRefused> {
         if command != Command::Tare {
             return Err(CommandRefused::Unsupported);
         }
-        link.takes_command()?;
+        session.takes_command()?;
         if self.tare.is_open() {
             return Err(CommandRefused::Busy);
         }
@@ -262,7 +262,7 @@ impl Family for Rft {
 
     fn outcome(
         &mut self,
-        _link: &Supervision<Rate>,
+        _session: &Session<Rate>,
     ) -> Option<Result<CommandOutcome, CommandFailed>> {
         self.tare.outcome()
     }

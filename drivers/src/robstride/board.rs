@@ -78,9 +78,9 @@ impl RobstrideBoard {
                 board::finite(&[joint.position, joint.velocity])?;
                 board::finite_or_absent(&[joint.torque])?;
                 self.joint = *joint;
-                let told = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
+                let carried = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
                 let all = u32::from(self.of_state) << OF_STATE | self.faults;
-                if quality_of(all, self.keys.encoder).0 != quality.0 & told.0 {
+                if quality_of(all, self.keys.encoder).0 != quality.0 & carried.0 {
                     let set = |flag, bit: u32| {
                         if quality.contains(flag) {
                             bit >> OF_STATE

@@ -6,11 +6,11 @@ use super::frames::{
 };
 use super::options::{RobstrideKeys, RobstrideOptions, RobstrideProtocol};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Rounds, Supervised, Supervision, quality_of, temperature};
+use crate::family::{Family, Rounds, Session, Supervised, quality_of, temperature};
 use crate::held::{HeldValue, OnChange};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, Mode, Output, OutputInfo, Spec, SpecError, bytes,
-    mit,
+    Claim, Decoded, Device, Driver, Frame, Id, Mode, OutputInfo, Spec, SpecError, StampedReading,
+    bytes, mit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -42,7 +42,8 @@ impl RobstrideMotor {
                 encoder: faults & self.keys.encoder,
                 faults,
             });
-            out.push(Output::new(JOINT, frame, self.quality(), reading), frame.id);
+            let stamped = StampedReading::new(JOINT, frame, self.quality(), reading);
+            out.push(stamped, frame.id);
         }
         due
     }
@@ -55,7 +56,7 @@ impl RobstrideMotor {
         &mut self,
         state: &RobstrideState,
         frame: &Frame,
-        link: &mut Supervision<NoInquiry>,
+        session: &mut Session<NoInquiry>,
         out: &mut Decoded,
     ) {
         if let Some((mode, faults)) = state.told {
@@ -72,14 +73,14 @@ impl RobstrideMotor {
             return;
         }
         let (state, saturated) = mit::measured(self.keys.scales, state.raw);
-        link.joint(JOINT, frame, self.quality() | saturated, state, out);
+        session.joint(JOINT, frame, self.quality() | saturated, state, out);
     }
 
     fn parameter(
         &mut self,
         (parameter, value): (u16, f64),
         frame: &Frame,
-        link: &mut Supervision<NoInquiry>,
+        session: &mut Session<NoInquiry>,
         out: &mut Decoded,
     ) {
         // Answers to another program.
@@ -98,7 +99,7 @@ impl RobstrideMotor {
                     current,
                     ..JointState::ABSENT
                 };
-                link.joint(JOINT, frame, self.quality(), state, out);
+                session.joint(JOINT, frame, self.quality(), state, out);
             }
             parameter::POSITION => out.fault(Counter::Value, 1, frame.id),
             _ => {}
@@ -169,15 +170,15 @@ impl Driver for RobstrideOptions {
 impl Family for RobstrideMotor {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         match self.message(frame, out) {
-            Some(RobstrideMessage::State(state)) => self.state(&state, frame, link, out),
+            Some(RobstrideMessage::State(state)) => self.state(&state, frame, session, out),
             Some(RobstrideMessage::Faults(faults)) => {
                 self.faults = faults & ((1 << OF_STATE) - 1);
                 self.tell(frame, out);
             }
             Some(RobstrideMessage::Parameter(parameter, Some(value))) => {
-                self.parameter((parameter, f64::from(value)), frame, link, out);
+                self.parameter((parameter, f64::from(value)), frame, session, out);
             }
             Some(RobstrideMessage::Parameter(parameter, None))
                 if self.keys.request_period.is_some() && parameter::ASKED.contains(&parameter) =>
@@ -197,7 +198,7 @@ impl Family for RobstrideMotor {
     fn request(
         &mut self,
         now: Nanos,
-        _link: &mut Supervision<NoInquiry>,
+        _session: &mut Session<NoInquiry>,
         _out: &mut Decoded,
     ) -> Option<Frame> {
         let [low, high] = (self.questions.ask(&parameter::ASKED, now)?).to_le_bytes();

@@ -77,7 +77,7 @@ fn finding(evidence: Evidence<'_>, address: u8) -> Option<Finding> {
 fn private(seen: &Traffic, address: u8, host: u8) -> Option<Finding> {
     let hosts = if HOSTS.contains(&host) { 2 } else { 256 };
     let mut evidence = Evidence::new(seen, usize::from(NUMBERS) * hosts);
-    let own = |stream: &&Stream, kinds: &[u8]| {
+    let is_own = |stream: &&Stream, kinds: &[u8]| {
         let [to, from, upper, kind] = stream.id.raw().to_le_bytes();
         let is_extended = matches!(stream.id, Id::Extended(_));
         is_extended && (to, from) == (host, address) && upper >> 6 < 3 && kinds.contains(&kind)
@@ -87,7 +87,7 @@ fn private(seen: &Traffic, address: u8, host: u8) -> Option<Finding> {
     // many messages of one form. So the stream with most frames speaks for the motor.
     let states = seen
         .streams()
-        .filter(|stream| own(stream, &[kind::STATE, kind::REPORT]));
+        .filter(|stream| is_own(stream, &[kind::STATE, kind::REPORT]));
     let mut states: Vec<&Stream> = states.collect();
     states.sort_by_key(|stream| core::cmp::Reverse(stream.frames));
     if let Some((most, others)) = states.split_first() {
@@ -102,11 +102,14 @@ fn private(seen: &Traffic, address: u8, host: u8) -> Option<Finding> {
     }
     for stream in seen
         .streams()
-        .filter(|stream| own(stream, &[kind::PARAMETER]))
+        .filter(|stream| is_own(stream, &[kind::PARAMETER]))
     {
         evidence.sends(stream.id, is_parameter);
     }
-    for stream in seen.streams().filter(|stream| own(stream, &[kind::FAULT])) {
+    for stream in seen
+        .streams()
+        .filter(|stream| is_own(stream, &[kind::FAULT]))
+    {
         evidence.sends_length(stream.id, LENGTH);
     }
     let number = id(kind::DEVICE, 0, address, 0xFE);

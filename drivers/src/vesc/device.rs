@@ -6,9 +6,11 @@ use super::frames::{
 use super::options::{VescKeys, VescOptions, VescPosition};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::bytes::{self, i16_be, u32_be};
-use crate::family::{Family, Supervised, Supervision, temperature};
+use crate::family::{Family, Session, Supervised, temperature};
 use crate::held::HeldValue;
-use crate::{Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError};
+use crate::{
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading,
+};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Actuator, JointState, Kind, Quality, Reading};
@@ -39,15 +41,15 @@ impl VescController {
             encoder: 0,
             faults: 0,
         });
-        let output = Output::new(JOINT, frame, Quality::GOOD, actuator);
-        out.push(output, frame.id);
+        let stamped = StampedReading::new(JOINT, frame, Quality::GOOD, actuator);
+        out.push(stamped, frame.id);
     }
 
     fn position(
         &self,
         raw: i32,
         frame: &Frame,
-        link: &mut Supervision<NoInquiry>,
+        session: &mut Session<NoInquiry>,
         out: &mut Decoded,
     ) {
         let hold = self.keys.hold;
@@ -60,7 +62,7 @@ impl VescController {
             current,
             ..JointState::ABSENT
         };
-        link.joint(JOINT, frame, Quality::GOOD, state, out);
+        session.joint(JOINT, frame, Quality::GOOD, state, out);
     }
 }
 
@@ -91,7 +93,7 @@ impl Driver for VescOptions {
 impl Family for VescController {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         let commands = [command::STATUS, command::STATUS_4, command::STATUS_5];
         let is_its = |command: &u8| self.keys.id(*command) == frame.id;
         let Some(command) = commands.into_iter().find(is_its) else {
@@ -110,11 +112,11 @@ impl Family for VescController {
                     }
                 }
                 if position == VescPosition::Pid {
-                    self.position(i32::from(i16_be(data, 6)), frame, link, out);
+                    self.position(i32::from(i16_be(data, 6)), frame, session, out);
                 }
             }
             (_, VescPosition::Tachometer) => {
-                self.position(u32_be(data, 0).cast_signed(), frame, link, out);
+                self.position(u32_be(data, 0).cast_signed(), frame, session, out);
             }
             _ => {}
         }

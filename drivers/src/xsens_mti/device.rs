@@ -3,11 +3,11 @@
 use super::frames::{ACCELERATION_LSB, BUFFER_OVERFLOW, MtiMessage, RATE_LSB, status};
 use super::options::{MtiKeys, XsensMtiOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Supervised, Supervision};
+use crate::family::{Family, Session, Supervised};
 use crate::group::{FrameGroup, PartialReading};
 use crate::pairing::Limit;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, Output, OutputInfo, Spec, SpecError, bytes,
+    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -109,11 +109,11 @@ impl Mti {
     }
 
     /// Outputs a complete sample.
-    fn give(
+    fn add(
         &mut self,
         whole: &PartialReading<MtiSample>,
         frame: &Frame,
-        link: &mut Supervision<NoInquiry>,
+        session: &mut Session<NoInquiry>,
         out: &mut Decoded,
     ) {
         let sample = &whole.content;
@@ -123,7 +123,7 @@ impl Mti {
             let last = self.counter.replace(sample.counter);
             match last.map(|last| sample.counter.wrapping_sub(last)) {
                 Some(0) => return out.fault(Counter::Unexpected, 1, frame.id),
-                Some(ahead) => link.lost(Counter::Lost, u32::from(ahead) - 1, frame, out),
+                Some(ahead) => session.lost(Counter::Lost, u32::from(ahead) - 1, frame, out),
                 None => {}
             }
         }
@@ -132,14 +132,14 @@ impl Mti {
         } else {
             Nanos::MIN
         };
-        let output = Output {
+        let stamped = StampedReading {
             acquired: whole.acquired,
             stamp: whole.stamp,
             device_time,
             device_counter: u32::from(sample.counter),
-            ..Output::new(0, frame, quality, Reading::Imu(sample.imu))
+            ..StampedReading::new(0, frame, quality, Reading::Imu(sample.imu))
         };
-        link.give(output, frame, out);
+        session.add(stamped, frame, out);
     }
 }
 
@@ -172,7 +172,7 @@ impl Driver for XsensMtiOptions {
 impl Family for Mti {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, link: &mut Supervision<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
         let mut numbered = (0..).zip(&self.plan.messages);
         let found = numbered.find(|(_, (id, _))| *id == frame.id);
         let (position, message) = match found {
@@ -187,14 +187,14 @@ impl Family for Mti {
             if data.first() != Some(&BUFFER_OVERFLOW) {
                 return out.fault(Counter::Value, 1, frame.id);
             }
-            return link.lost(Counter::DeviceFault, 1, frame, out);
+            return session.lost(Counter::DeviceFault, 1, frame, out);
         }
         let mut dropped = 0;
         let add = |sample: &mut MtiSample| sample.add(&self.plan, message, data);
         let whole = (self.group).push(position, frame, MtiSample::EMPTY, add, &mut dropped);
-        link.lost(Counter::Unpaired, dropped, frame, out);
+        session.lost(Counter::Unpaired, dropped, frame, out);
         if let Some(whole) = whole {
-            self.give(&whole, frame, link, out);
+            self.add(&whole, frame, session, out);
         }
     }
 

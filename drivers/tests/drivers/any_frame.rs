@@ -227,11 +227,13 @@ fn to_frame(event: &Event, claims: &[Claim], command_id: Option<Id>, now: Nanos)
     if let (Some(command), Some(first)) = (command, data.first_mut()) {
         *first = *command;
     }
-    let of = |claim: &Claim| match claim.id {
+    let some_id = |claim: &Claim| match claim.id {
         Id::Standard(raw) => Id::standard(raw | (*pick & !claim.mask) as u16),
         Id::Extended(raw) => Id::extended(raw | *pick & !claim.mask),
     };
-    let claimed = claims.get(*pick as usize / 8 % claims.len().max(1)).map(of);
+    let claimed = claims
+        .get(*pick as usize / 8 % claims.len().max(1))
+        .map(some_id);
     let id = match (any, pick % 8) {
         (Some(any), _) => Id::extended(*any),
         (None, 0) => command_id.unwrap_or(Id::standard(*id)),
@@ -319,14 +321,14 @@ fn drive(device: &mut dyn Device, board: &mut dyn Board, events: &[Event], liste
             Event::Stop => device.stop(now),
         }
         let _ = (device.state(), device.next_wake(), board.period());
-        for output in &out.readings {
-            assert!(is_finite(&output.reading), "{output:?}");
+        for stamped in &out.readings {
+            assert!(is_finite(&stamped.reading), "{stamped:?}");
             // Decoded readings can be encoded again (a wrench only if the board knows its scale).
             let mut frames = Frames::new();
             let _ = board.encode(
-                output.output,
-                &output.reading,
-                output.quality | Quality::GOOD,
+                stamped.output,
+                &stamped.reading,
+                stamped.quality | Quality::GOOD,
                 &mut frames,
             );
         }

@@ -5,7 +5,7 @@ use crate::rig::{
     Rig, board, count, decode, encode, frame, listener, options, poll, spec, supervisor,
 };
 use proprio_drivers::{
-    Decoded, Device, Fault, Frame, Mode, NotSent, Options, Output, SpecError, State,
+    Decoded, Device, Fault, Frame, Mode, NotSent, Options, SpecError, StampedReading, State,
 };
 use proprio_topics::{Counter, Nanos, Quality, Reading, Refusal, Wrench};
 use proptest::prelude::*;
@@ -72,7 +72,7 @@ fn session_listener(keys: &str) -> Box<dyn Device> {
     options("ati_netcanoem", keys).device(&listen).unwrap()
 }
 
-fn assert_read(readings: &[Output], wrenches: &[[f64; 6]]) {
+fn assert_read(readings: &[StampedReading], wrenches: &[[f64; 6]]) {
     assert_eq!(readings.len(), wrenches.len());
     for (reading, right) in readings.iter().zip(wrenches) {
         for (a, b) in values(&reading.reading).iter().zip(right) {
@@ -145,13 +145,13 @@ fn halves(n: i16, status: u16, ms: f64) -> [Frame; 2] {
     ]
 }
 
-fn decode_keys(frames: &[Frame]) -> (Vec<Output>, Vec<Fault>) {
+fn decode_keys(frames: &[Frame]) -> (Vec<StampedReading>, Vec<Fault>) {
     decode(&mut *listener("ati_netcanoem", KEYS, &[]), frames)
 }
 
 /// The number of each reading, if its halves belong together, and whether it follows a gap.
-fn numbers(readings: &[Output]) -> Vec<(i32, bool)> {
-    let number = |reading: &Output| {
+fn numbers(readings: &[StampedReading]) -> Vec<(i32, bool)> {
+    let number = |reading: &StampedReading| {
         let [a, b, ..] = values(&reading.reading);
         assert_eq!(a, b, "halves of different readings");
         let gap = reading.quality.contains(Quality::GAP_BEFORE);
@@ -225,9 +225,9 @@ fn halves_that_are_far_apart_are_not_paired() {
 fn faults_and_saturation_are_told() {
     let fault = |status| {
         let (readings, faults) = decode_keys(&halves(7, status, 0.0));
-        let told = readings[0].quality.contains(Quality::DEVICE_FAULT);
-        assert_eq!(count(&faults, Counter::DeviceFault), u32::from(told));
-        told
+        let is_faulty = readings[0].quality.contains(Quality::DEVICE_FAULT);
+        assert_eq!(count(&faults, Counter::DeviceFault), u32::from(is_faulty));
+        is_faulty
     };
     for bit in 0..16 {
         let concerns = matches!(bit, 0..=8 | 11 | 12 | 15);
@@ -427,7 +427,7 @@ fn a_sensor_that_does_not_tell_its_calibration_is_refused_by_name() {
     assert_eq!(silent.device.state(), State::Streaming);
 
     // Zero counts, a row of zeros, a row that is not a number; the state names the channel.
-    let told = |frames: &[&str]| {
+    let state = |frames: &[&str]| {
         let mut device = session_listener("");
         let frames: Vec<Frame> = frames.iter().map(|text| frame(text, 0.0)).collect();
         let (_, faults) = decode(&mut *device, &frames);
@@ -435,24 +435,24 @@ fn a_sensor_that_does_not_tell_its_calibration_is_refused_by_name() {
         device.state()
     };
     let bad = |channel| State::Refused(Refusal::BadCalibration { channel });
-    assert_eq!(told(&["3F7#00000000000007D0"]), bad(0));
-    assert_eq!(told(&["3F7#000007D000000000"]), bad(3));
-    assert_eq!(told(&["3F8#0007"]), bad(0));
-    assert_eq!(told(&["3F8#0200"]), bad(3));
+    assert_eq!(state(&["3F7#00000000000007D0"]), bad(0));
+    assert_eq!(state(&["3F7#000007D000000000"]), bad(3));
+    assert_eq!(state(&["3F8#0007"]), bad(0));
+    assert_eq!(state(&["3F8#0200"]), bad(3));
     let zeros = [
         "3F2#04",
         "3F2#0000000000000000",
         "3F3#0000000000000000",
         "3F4#0000000000000000",
     ];
-    assert_eq!(told(&zeros), bad(4));
+    assert_eq!(state(&zeros), bad(4));
     let nan = [
         "3F2#05",
         "3F2#FFFFFFFFFFFFFFFF",
         "3F3#3F80000000000000",
         "3F4#0000000000000000",
     ];
-    assert_eq!(told(&nan), bad(5));
+    assert_eq!(state(&nan), bad(5));
 }
 
 #[test]
@@ -797,8 +797,8 @@ fn a_stray_row_does_not_void_a_configured_matrix() {
     let mut device = session_listener(parts()[2]);
     let stray = faults_of(&mut *device, "3F2#3F8000003F800000", 0.0);
     assert_eq!(stray, [Counter::Unexpected]);
-    let told = ["3F7#", "3F7#00000064000003E8", "3F8#", "3F8#0203"];
-    let (_, faults) = decode(&mut *device, &told.map(|text| frame(text, 1.0)));
+    let answers = ["3F7#", "3F7#00000064000003E8", "3F8#", "3F8#0203"];
+    let (_, faults) = decode(&mut *device, &answers.map(|text| frame(text, 1.0)));
     assert!(faults.is_empty(), "{faults:?}");
     let (readings, _) = decode(&mut *device, &halves_at_3f(2.0));
     assert_eq!(numbers(&readings), [(5, false)]);

@@ -4,7 +4,9 @@
 mod drive;
 
 use crate::rig::{Rig, board, count, decode, encode, frame, joint, listener, options, spec};
-use proprio_drivers::{Board, Decoded, Device, Frame, Frames, Mode, Output, SpecError, State};
+use proprio_drivers::{
+    Board, Decoded, Device, Frame, Frames, Mode, SpecError, StampedReading, State,
+};
 use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Refusal, StampKind};
 use proptest::prelude::*;
 use std::f64::consts::TAU;
@@ -19,8 +21,8 @@ fn actuator(reading: &Reading) -> Actuator {
     }
 }
 
-fn joints(readings: &[Output]) -> Vec<Output> {
-    let is_joint = |output: &&Output| matches!(output.reading, Reading::Joint(_));
+fn joints(readings: &[StampedReading]) -> Vec<StampedReading> {
+    let is_joint = |stamped: &&StampedReading| matches!(stamped.reading, Reading::Joint(_));
     readings.iter().filter(is_joint).copied().collect()
 }
 
@@ -70,25 +72,25 @@ fn a_session_of_another_master_tells_mapping_and_scales() {
     // The status is sent after the joint's values: one fault is told by the emergency message.
     assert_eq!(count(&faults, Counter::DriveFault), 2, "{faults:?}");
     assert_eq!((joints.len(), faults.len()), (truth.len(), 2));
-    for (output, raw) in joints.iter().zip(&truth) {
-        let read = joint(&output.reading);
+    for (stamped, raw) in joints.iter().zip(&truth) {
+        let read = joint(&stamped.reading);
         assert!(near(read.position, raw[0] * TAU / 10_000.0), "{read:?}");
         assert!(near(read.velocity, raw[1] * 0.1 * TAU / 60.0), "{read:?}");
         assert!(near(read.torque, raw[2] * 0.88e-3), "{read:?}");
         assert!(near(read.current, raw[3] * 4.3e-3), "{read:?}");
         let sync = frames
             .iter()
-            .rfind(|f| f.id.raw() == 0x80 && f.t <= output.acquired);
-        assert_eq!(output.acquired, sync.unwrap().t, "measured at its SYNC");
+            .rfind(|f| f.id.raw() == 0x80 && f.t <= stamped.acquired);
+        assert_eq!(stamped.acquired, sync.unwrap().t, "measured at its SYNC");
     }
-    let fault = |output: &Output| output.quality.contains(Quality::DRIVE_FAULT);
+    let fault = |stamped: &StampedReading| stamped.quality.contains(Quality::DRIVE_FAULT);
     assert_eq!(
         joints.iter().map(fault).collect::<Vec<_>>(),
         [false, false, false, true, true, false]
     );
     let states: Vec<Actuator> = (readings.iter())
-        .filter(|output| matches!(output.reading, Reading::Actuator(_)))
-        .map(|output| actuator(&output.reading))
+        .filter(|stamped| matches!(stamped.reading, Reading::Actuator(_)))
+        .map(|stamped| actuator(&stamped.reading))
         .collect();
     assert_eq!(states.len(), 12, "the mode's and the status' process data");
     assert_eq!(
@@ -106,17 +108,17 @@ fn an_encoder_that_another_master_has_configured_is_read() {
     let mine = claimed(&*device, &frames);
     let (readings, faults) = decode(&mut *device, &mine);
     assert_eq!(readings.len(), truth.len());
-    for (output, raw) in readings.iter().zip(&truth) {
+    for (stamped, raw) in readings.iter().zip(&truth) {
         // It is scaled: object 6001, not 6501.
-        let position = joint(&output.reading).position;
+        let position = joint(&stamped.reading).position;
         assert!(near(position, raw[0] * TAU / 3600.0), "{position}");
         assert!(
             frames
                 .iter()
-                .any(|f| f.id.raw() == 0x80 && f.t == output.acquired)
+                .any(|f| f.id.raw() == 0x80 && f.t == stamped.acquired)
         );
     }
-    let fault = |output: &Output| output.quality.contains(Quality::DEVICE_FAULT);
+    let fault = |stamped: &StampedReading| stamped.quality.contains(Quality::DEVICE_FAULT);
     assert_eq!(readings.iter().filter(|r| fault(r)).count(), 1);
     assert!(fault(&readings[4]) && count(&faults, Counter::DeviceFault) == 1);
     let mut by_key = at("canopen_encoder", "counts_per_turn = 100", 9, Mode::Listen);
@@ -138,7 +140,7 @@ struct Synced {
     reading: Reading,
     period: i64,
     now: i64,
-    readings: Vec<Output>,
+    readings: Vec<StampedReading>,
     sent: Vec<String>,
     /// Whether the n-th process data frame is lost.
     loses: fn(usize) -> bool,
@@ -235,9 +237,9 @@ fn an_encoder_is_configured_and_started() {
     );
     assert_eq!(rig.device.state(), State::Streaming);
     assert_eq!(rig.readings.len(), 6);
-    for output in &rig.readings {
-        assert!((joint(&output.reading).position - 1.5).abs() < TAU / 16384.0);
-        assert_eq!(output.quality, Quality::GOOD);
+    for stamped in &rig.readings {
+        assert!((joint(&stamped.reading).position - 1.5).abs() < TAU / 16384.0);
+        assert_eq!(stamped.quality, Quality::GOOD);
     }
     rig.device.stop(rig.now);
     rig.run(30);
@@ -285,8 +287,8 @@ fn an_encoder_can_measure_by_sync() {
         "{}",
         synced.readings.len()
     );
-    for output in &synced.readings {
-        assert_eq!(output.acquired.0 % 5_000_000, 0, "the time of a SYNC");
+    for stamped in &synced.readings {
+        assert_eq!(stamped.acquired.0 % 5_000_000, 0, "the time of a SYNC");
     }
 }
 
@@ -388,9 +390,9 @@ fn a_late_answer_does_not_get_the_stamp_of_a_later_sync() {
         };
         let frames: Vec<Frame> = frames.iter().map(to_frame).collect();
         let (readings, faults) = decode(&mut *device, &frames);
-        let read = |output: &Output| {
-            let number = joint(&output.reading).position * 4.0 / TAU;
-            (number.round() as u32, output.acquired.0 as f64 / 1e6)
+        let read = |stamped: &StampedReading| {
+            let number = joint(&stamped.reading).position * 4.0 / TAU;
+            (number.round() as u32, stamped.acquired.0 as f64 / 1e6)
         };
         let read: Vec<(u32, f64)> = readings.iter().map(read).collect();
         assert_eq!(read, *right);
@@ -746,19 +748,19 @@ fn a_simulated_node_refuses_as_the_standard_says() {
         node.on_frame(&frame(text, 0.0), &mut out);
         out.first().map(ToString::to_string)
     };
-    let told = |text: &str| Some(text.to_owned());
-    assert_eq!(ask("601#4000100000000000"), told("581#4300100096010200"));
-    assert_eq!(ask("601#4019100000000000"), told("581#8019100000000206"));
-    assert_eq!(ask("601#2319100000000000"), told("581#8019100000000206"));
+    let some = |text: &str| Some(text.to_owned());
+    assert_eq!(ask("601#4000100000000000"), some("581#4300100096010200"));
+    assert_eq!(ask("601#4019100000000000"), some("581#8019100000000206"));
+    assert_eq!(ask("601#2319100000000000"), some("581#8019100000000206"));
     // Its identity: how many entries, and the serial number.
-    assert_eq!(ask("601#4018100000000000"), told("581#4F18100004000000"));
-    assert_eq!(ask("601#4018100400000000"), told("581#4318100401000000"));
-    assert_eq!(ask("601#2F00180500000000"), told("581#8000180510000706"));
-    assert_eq!(ask("601#E000100000000000"), told("581#8000100001000405"));
-    assert_eq!(ask("601#2B001805E8030000"), told("581#6000180500000000"));
-    assert_eq!(ask("601#4000180500000000"), told("581#4B001805E8030000"));
-    assert_eq!(ask("000#8101"), told("701#00"));
-    assert_eq!(ask("601#4000180500000000"), told("581#4B0018050A000000"));
+    assert_eq!(ask("601#4018100000000000"), some("581#4F18100004000000"));
+    assert_eq!(ask("601#4018100400000000"), some("581#4318100401000000"));
+    assert_eq!(ask("601#2F00180500000000"), some("581#8000180510000706"));
+    assert_eq!(ask("601#E000100000000000"), some("581#8000100001000405"));
+    assert_eq!(ask("601#2B001805E8030000"), some("581#6000180500000000"));
+    assert_eq!(ask("601#4000180500000000"), some("581#4B001805E8030000"));
+    assert_eq!(ask("000#8101"), some("701#00"));
+    assert_eq!(ask("601#4000180500000000"), some("581#4B0018050A000000"));
     assert_eq!((ask("602#4000100000000000"), ask("000#8102")), (None, None));
 }
 

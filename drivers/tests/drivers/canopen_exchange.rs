@@ -2,7 +2,9 @@
 //! which process data make a reading.
 
 use crate::rig::{Rig, board, count, decode, encode, frame, listener, options, spec, supervisor};
-use proprio_drivers::{Decoded, Device, EncodeError, Frame, Frames, Mode, NotSent, Output, State};
+use proprio_drivers::{
+    Decoded, Device, EncodeError, Frame, Frames, Mode, NotSent, StampedReading, State,
+};
 use proprio_topics::{
     Actuator, Counter, JointState, Nanos, Quality, Reading, Refusal, StampKind, Temperature,
 };
@@ -19,8 +21,8 @@ fn turned(turns: f64) -> Reading {
 }
 
 /// The positions \[turns\] of joints in `readings`.
-fn positions(readings: &[Output]) -> Vec<f64> {
-    let joint = |output: &Output| match output.reading {
+fn positions(readings: &[StampedReading]) -> Vec<f64> {
+    let joint = |stamped: &StampedReading| match stamped.reading {
         Reading::Joint(joint) => Some(joint.position / TAU),
         _ => None,
     };
@@ -156,13 +158,13 @@ fn what_another_program_is_answered_is_not_taken() {
                 // Also of the same object, as the other one writes it.
                 return vec!["581#6001650000000000".into(), usual(question).unwrap()];
             }
-            let own = usual(question);
-            [foreign.to_owned()].into_iter().chain(own).collect()
+            let answers = usual(question);
+            [foreign.to_owned()].into_iter().chain(answers).collect()
         });
         assert_eq!(sent, usual_frames, "{foreign}");
         let faults = out.faults.iter();
-        let told: Vec<Counter> = faults.map(|fault| fault.counter).collect();
-        assert_eq!(told, [Counter::Starts], "{foreign}");
+        let counters: Vec<Counter> = faults.map(|fault| fault.counter).collect();
+        assert_eq!(counters, [Counter::Starts], "{foreign}");
         device.on_frame(&frame("181#00040000", 60.0), &mut out);
         assert_eq!(positions(&out.readings), [0.25], "{foreign}");
     }
@@ -259,8 +261,8 @@ fn counts_per_turn_may_not_change() {
         let mut device = encoder
             .device(&spec(9, Mode::Listen, &[0]))
             .expect("legal keys");
-        let told = frame("589#4301650000100000", 1.0);
-        let frames = [told, frame("189#00040000", 2.0), frame(second, 3.0)];
+        let answer = frame("589#4301650000100000", 1.0);
+        let frames = [answer, frame("189#00040000", 2.0), frame(second, 3.0)];
         let (readings, _) = decode(&mut *device, &frames);
         assert_eq!(positions(&readings), [0.25]);
         assert_eq!(device.state(), state, "{second}");
@@ -274,7 +276,7 @@ fn scales_of_keys_count_before_those_of_the_drive() {
     let keys = "counts_per_turn = 4\nrated_current = 2.0\nrated_torque = 3.0\n\
                 pdos = [{ number = 1, objects = [0x6064, 0x6077, 0x6078] }]";
     let mut drive = listener("canopen_drive", keys, &[0]);
-    let told = [
+    let answers = [
         "581#438F600110000000",
         "581#438F600111000000",
         "581#438F600201000000",
@@ -285,7 +287,7 @@ fn scales_of_keys_count_before_those_of_the_drive() {
         "581#4376600002000000",
         "181#01000000F4010A00",
     ];
-    let (readings, faults) = decode(&mut *drive, &told.map(|text| frame(text, 1.0)));
+    let (readings, faults) = decode(&mut *drive, &answers.map(|text| frame(text, 1.0)));
     assert_eq!(faults, []);
     let Reading::Joint(joint) = readings[0].reading else {
         panic!("{readings:?}")
@@ -314,10 +316,10 @@ fn a_scale_that_is_not_known_is_missed() {
             State::Refused(Refusal::Untold { object: scale }),
             "{keys}"
         );
-        let told = Refusal::Untold { object: scale }.to_string();
+        let text = Refusal::Untold { object: scale }.to_string();
         assert!(
-            told.contains(&format!("{scale:04X}")) && told.contains(keys),
-            "{told}"
+            text.contains(&format!("{scale:04X}")) && text.contains(keys),
+            "{text}"
         );
         let known = format!("{keys} = 1.0\n{mapped}");
         let mut known = listener("canopen_drive", &known, &[0]);
@@ -384,7 +386,7 @@ fn an_identifier_matters_only_for_values_of_use() {
         let object = u16::from_str_radix(mapped, 16).expect("a number");
         let [low, high] = object.to_le_bytes();
         let mut drive = listener("canopen_drive", "counts_per_turn = 4", &[0]);
-        let told = [
+        let answers = [
             "581#4300180181010000".to_owned(),
             "581#4F001802FE000000".to_owned(),
             "581#4F001A0001000000".to_owned(),
@@ -395,7 +397,7 @@ fn an_identifier_matters_only_for_values_of_use() {
             format!("581#43011A012000{low:02X}{high:02X}"),
             "181#01000000".to_owned(),
         ];
-        let frames: Vec<Frame> = told.iter().map(|text| frame(text, 1.0)).collect();
+        let frames: Vec<Frame> = answers.iter().map(|text| frame(text, 1.0)).collect();
         decode(&mut *drive, &frames);
         assert_eq!(drive.state(), state, "{mapped}");
     }

@@ -2,7 +2,7 @@
 
 use crate::rig::{decode, frame, options, spec};
 use proprio_drivers::objects::{ObjectEntry, Objects};
-use proprio_drivers::{Device, Mode, Options, Output, SpecError, State};
+use proprio_drivers::{Device, Mode, Options, SpecError, StampedReading, State};
 use proprio_topics::{Reading, Refusal};
 use std::f64::consts::TAU;
 
@@ -37,8 +37,8 @@ fn listener(driver: &str, keys: &str, file: Objects) -> Box<dyn Device> {
 }
 
 /// Position \[turns\] and velocity \[turns/s\] of each joint's reading.
-fn turns(readings: &[Output]) -> Vec<(f64, f64)> {
-    let joint = |output: &Output| match output.reading {
+fn turns(readings: &[StampedReading]) -> Vec<(f64, f64)> {
+    let joint = |stamped: &StampedReading| match stamped.reading {
         Reading::Joint(joint) => Some((joint.position / TAU, joint.velocity / TAU)),
         _ => None,
     };
@@ -56,7 +56,7 @@ fn the_key_names_the_file() {
 #[test]
 fn the_file_of_another_node_is_refused() {
     for driver in ["canopen_encoder", "canopen_drive"] {
-        let of = |node| {
+        let build = |node| {
             let file = Objects {
                 node: Some(node),
                 ..file(&[(0x6501, 0, 4096)])
@@ -64,8 +64,8 @@ fn the_file_of_another_node_is_refused() {
             let spec = spec(5, Mode::Listen, &[0]);
             described(driver, "", file).device(&spec).map(|_| ())
         };
-        assert_eq!(of(5), Ok(()));
-        assert!(matches!(of(6), Err(SpecError::Description(_))));
+        assert_eq!(build(5), Ok(()));
+        assert!(matches!(build(6), Err(SpecError::Description(_))));
     }
 }
 
@@ -152,7 +152,7 @@ fn an_encoder_may_have_its_position_in_two_tpdos() {
         let frames: Vec<_> = frames.iter().map(|(text, ms)| frame(text, *ms)).collect();
         let (readings, faults) = decode(&mut *device, &frames);
         assert!(faults.is_empty(), "{faults:?}");
-        let at = |output: &Output| output.acquired.0 / 100_000;
+        let at = |stamped: &StampedReading| stamped.acquired.0 / 100_000;
         readings.iter().map(at).collect::<Vec<_>>()
     };
     let (sync, first, second) = ("080#", "185#01000000", "285#01000000");
@@ -196,7 +196,7 @@ fn an_encoder_has_its_position_at_each_sync() {
     }
     let (readings, faults) = decode(&mut *device, &frames);
     assert!(faults.is_empty(), "{faults:?}");
-    let found: Vec<i64> = readings.iter().map(|output| output.acquired.0).collect();
+    let found: Vec<i64> = readings.iter().map(|stamped| stamped.acquired.0).collect();
     let syncs: Vec<i64> = (0..40).map(|cycle| 10_000_000 * cycle).collect();
     assert_eq!(found, syncs);
 }
@@ -477,10 +477,12 @@ fn two_tpdos_with_the_position_are_one_series_of_readings() {
         let frames: Vec<_> = frames.iter().map(|(text, ms)| frame(text, *ms)).collect();
         let (readings, faults) = decode(&mut *device, &frames);
         assert!(faults.is_empty(), "{faults:?}");
-        let at = |output: &Output| (output.acquired.0 / 1_000_000, output.reading.values()[0]);
+        let at = |stamped: &StampedReading| {
+            (stamped.acquired.0 / 1_000_000, stamped.reading.values()[0])
+        };
         let joints = readings
             .iter()
-            .filter(|output| matches!(output.reading, Reading::Joint(_)));
+            .filter(|stamped| matches!(stamped.reading, Reading::Joint(_)));
         joints.map(at).collect::<Vec<_>>()
     };
     let quarter = |n: i64| (10 * n, n as f64 * TAU / 4.0);
@@ -525,8 +527,8 @@ fn two_tpdos_with_the_position_are_one_series_of_readings() {
     let (readings, _) = decode(&mut *device, &frames);
     let joints = readings
         .iter()
-        .filter(|output| matches!(output.reading, Reading::Joint(_)));
-    let times: Vec<i64> = joints.map(|output| output.acquired.0 / 100_000).collect();
+        .filter(|stamped| matches!(stamped.reading, Reading::Joint(_)));
+    let times: Vec<i64> = joints.map(|stamped| stamped.acquired.0 / 100_000).collect();
     assert_eq!(times, [101, 100, 200]);
 }
 
@@ -541,7 +543,7 @@ fn rated(keys: &str, vendor: Option<u32>, entries: &[(u16, u8, u32)]) -> Result<
     );
     let mut device = listener("canopen_drive", &keys, objects);
     let (readings, _) = decode(&mut *device, &[frame("185#00000000E803", 1.0)]);
-    match readings.first().map(|output| output.reading) {
+    match readings.first().map(|stamped| stamped.reading) {
         Some(Reading::Joint(joint)) => Ok(joint.torque),
         _ => Err(device.state()),
     }
@@ -596,10 +598,10 @@ fn a_rated_torque_that_can_not_be_is_refused() {
         assert!(rated("rated_torque = 1.0", None, &entries).is_ok());
         assert!(rated("rated_torque_unit = \"mNm\"", None, &entries).is_ok());
     }
-    let told = Refusal::Implausible { object: 0x6076 }.to_string();
+    let text = Refusal::Implausible { object: 0x6076 }.to_string();
     assert!(
-        told.contains("object 6076") && told.contains("rated_torque_unit"),
-        "{told}"
+        text.contains("object 6076") && text.contains("rated_torque_unit"),
+        "{text}"
     );
 }
 
@@ -669,7 +671,7 @@ fn positions_and_velocities_are_in_the_units_that_the_drive_states() {
 /// A value that is no number is told to a driver that needs it.
 #[test]
 fn what_is_wrong_in_a_file_harms_only_where_it_is_needed() {
-    let told = |driver: &str, keys: &str, at: (u16, u8), mode| {
+    let build = |driver: &str, keys: &str, at: (u16, u8), mode| {
         let mut objects = file(&[
             (0x608F, 1, 1000),
             (0x6501, 0, 1000),
@@ -719,7 +721,7 @@ fn what_is_wrong_in_a_file_harms_only_where_it_is_needed() {
             false,
         ),
     ] {
-        let problem = told(driver, keys, at, mode);
+        let problem = build(driver, keys, at, mode);
         assert_eq!(
             problem.is_err(),
             is_needed,

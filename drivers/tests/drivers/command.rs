@@ -54,7 +54,7 @@ fn outcome(rig: &mut Rig) -> (Result<CommandOutcome, CommandFailed>, u32) {
 }
 
 fn values(rig: &Rig) -> Vec<([f64; 6], bool)> {
-    let of = |reading: &Reading| match reading {
+    let values = |reading: &Reading| match reading {
         Reading::Wrench(w) => {
             let ([a, b, c], [d, e, f]) = (w.force, w.torque);
             [a, b, c, d, e, f]
@@ -63,7 +63,12 @@ fn values(rig: &Rig) -> Vec<([f64; 6], bool)> {
     };
     let readings = rig.readings.iter();
     readings
-        .map(|r| (of(&r.reading), r.quality.contains(Quality::ZERO_CHANGED)))
+        .map(|r| {
+            (
+                values(&r.reading),
+                r.quality.contains(Quality::ZERO_CHANGED),
+            )
+        })
         .collect()
 }
 
@@ -415,9 +420,9 @@ fn a_calibration_is_read_while_the_board_streams() {
         overwrite(&mut rig, 2, 5, 0xFD2E);
         overwrite(&mut rig, 5, 0, 0x0123);
         rig.run(20);
-        let told = calibration(&mut rig);
-        let Calibration::Fractions { full_scale, matrix } = told else {
-            panic!("{told:?}")
+        let matrices = calibration(&mut rig);
+        let Calibration::Fractions { full_scale, matrix } = matrices else {
+            panic!("{matrices:?}")
         };
         assert_eq!(full_scale, [1804, 1804, 1804, 31, 31, 31]);
         let mut expected = [[0; 6]; 6];
@@ -427,9 +432,9 @@ fn a_calibration_is_read_while_the_board_streams() {
         let scales = (0..6).map(|axis| format!("201#180{axis}"));
         let entries = (0..36).map(|k| format!("201#0A0{}0{}", k / 6, k % 6));
         assert_eq!(rig.sent, scales.chain(entries).collect::<Vec<_>>());
-        assert_eq!(told.defects().as_slice(), []);
+        assert_eq!(matrices.defects().as_slice(), []);
         // 1804 N at 32768 counts.
-        let per_count = told.per_count().unwrap();
+        let per_count = matrices.per_count().unwrap();
         assert!((per_count[2][5] * 32768.0 + 722.0 / 32768.0 * 1804.0).abs() < 1e-9);
         // The stream did not notice.
         rig.run(100);
@@ -441,7 +446,7 @@ fn a_calibration_is_read_while_the_board_streams() {
         );
         assert!(rig.readings.len() >= 11);
         assert!(rig.readings.iter().all(|r| r.quality == Quality::GOOD));
-        assert_eq!(calibration(&mut rig), told, "again");
+        assert_eq!(calibration(&mut rig), matrices, "again");
         if keys == SCALES {
             assert_eq!(tare(&mut rig), Ok(()));
             assert!(matches!(
@@ -461,8 +466,8 @@ fn a_calibration_that_cannot_be_read_says_why() {
         count += u32::from(frame.id == proprio_drivers::Id::standard(0x210));
         frame.id == proprio_drivers::Id::standard(0x210) && count % 3 == 0
     });
-    let told = calibration(&mut rig);
-    assert_eq!(told.defects().as_slice(), []);
+    let learnt = calibration(&mut rig);
+    assert_eq!(learnt.defects().as_slice(), []);
     assert_eq!(rig.count(Counter::Unexpected), 0);
     // An old firmware that does not know the question.
     let mut rig = streaming(SCALES);
@@ -526,8 +531,8 @@ fn what_is_wrong_with_a_calibration_is_named() {
         overwrite(&mut rig, 1, column, 0xFFFF);
     }
     overwrite(&mut rig, 4, 4, 0);
-    let told = calibration(&mut rig);
-    let words: Vec<String> = told.defects().iter().map(ToString::to_string).collect();
+    let learnt = calibration(&mut rig);
+    let words: Vec<String> = learnt.defects().iter().map(ToString::to_string).collect();
     let expected = [
         "the entry of fy, gauge 0 is FFFF, as in erased memory",
         "the row of ty is zero: it always reads zero",
@@ -544,8 +549,8 @@ fn what_is_wrong_with_a_calibration_is_named() {
     let mut matrix = [[0; 6]; 6];
     (0..6).for_each(|axis| matrix[axis][axis] = 20_000);
     let defects = |full_scale, matrix| -> Vec<Defect> {
-        let told = Calibration::Fractions { full_scale, matrix };
-        told.defects().into_iter().collect()
+        let fractions = Calibration::Fractions { full_scale, matrix };
+        fractions.defects().into_iter().collect()
     };
     assert_eq!(defects(full_scale, matrix), []);
     full_scale[3] = 0;
@@ -584,12 +589,12 @@ fn what_a_gauge_count_means_follows_from_counts_and_units() {
     for (entry, n) in matrix.iter_mut().flatten().zip(1_u8..) {
         *entry = f32::from(n);
     }
-    let told = Calibration::Counts {
+    let counts = Calibration::Counts {
         matrix,
         counts: [1000.0, 500.0],
         units: [4.0, 0.25],
     };
-    let per_count = told.per_count().expect("it is told");
+    let per_count = counts.per_count().expect("it is told");
     for (axis, row) in per_count.iter().enumerate() {
         let unit = if axis < 3 { 0.004 } else { 0.0005 };
         for (value, entry) in row.iter().zip(matrix[axis]) {
@@ -606,8 +611,8 @@ fn axes_that_can_not_be_told_from_each_other_have_a_high_condition_number() {
     let mut matrix = [[0; 6]; 6];
     (0..6).for_each(|axis| matrix[axis][axis] = 30_000);
     let words = |matrix| {
-        let told = Calibration::Fractions { full_scale, matrix };
-        let defects = told.defects();
+        let fractions = Calibration::Fractions { full_scale, matrix };
+        let defects = fractions.defects();
         (
             defects.first().copied(),
             defects.iter().map(ToString::to_string).collect::<Vec<_>>(),
@@ -651,30 +656,30 @@ fn an_ati_sensor_tells_what_was_read_at_its_start() {
     );
     rig.run(300);
     assert_eq!(rig.device.state(), State::Streaming);
-    let told = calibration(&mut rig);
+    let learnt = calibration(&mut rig);
     let Calibration::Counts {
         matrix,
         counts,
         units,
-    } = told
+    } = learnt
     else {
-        panic!("{told:?}")
+        panic!("{learnt:?}")
     };
     assert_eq!((counts, units), ([1e6, 1e6], [1.0, 1.0]));
     assert_eq!((matrix[0][3], matrix[5][5]), (-13_200.0, 740.0));
-    assert_eq!(told.defects().as_slice(), []);
-    assert!((told.per_count().unwrap()[0][3] + 0.0132).abs() < 1e-9);
-    assert_eq!(told.full_scale(), None);
+    assert_eq!(learnt.defects().as_slice(), []);
+    assert!((learnt.per_count().unwrap()[0][3] + 0.0132).abs() < 1e-9);
+    assert_eq!(learnt.full_scale(), None);
     assert_eq!(tare(&mut rig), Err(CommandRefused::Unsupported));
     let mut broken = matrix;
     broken[2][1] = f32::NAN;
-    let told = Calibration::Counts {
+    let altered = Calibration::Counts {
         matrix: broken,
         counts,
         units,
     };
     assert_eq!(
-        told.defects().as_slice(),
+        altered.defects().as_slice(),
         [Defect::NotFinite { axis: 2, gauge: 1 }]
     );
 }
@@ -736,9 +741,9 @@ fn sensors_that_do_not_tell_their_zero_are_tared() {
     assert_eq!(failed, Err(CommandFailed::NoAnswer));
     assert!((100..=103).contains(&ms), "{ms}");
     // Its full scales are known since its start.
-    let told = calibration(&mut rig);
-    assert_eq!(told.full_scale().map(|all| all[0].round()), Some(115.0));
-    assert_eq!((told.per_count(), told.defects().len()), (None, 0));
+    let learnt = calibration(&mut rig);
+    assert_eq!(learnt.full_scale().map(|all| all[0].round()), Some(115.0));
+    assert_eq!((learnt.per_count(), learnt.defects().len()), (None, 0));
     let refused = rig.device.full_scale().map(|all| all[5]);
     assert!(
         refused.is_some_and(|most| (most - 6.1).abs() < 1e-9),

@@ -540,9 +540,9 @@ fn the_commands_of_motors_are_no_sensor() {
             });
         }
         let found = recognise(&bus.heard());
-        let mut told: Vec<(&str, u32)> = found.iter().map(|f| (f.driver, f.address)).collect();
-        told.sort_unstable();
-        assert_eq!(told, [("cubemars", 1), ("cubemars", 2)], "{found:?}");
+        let mut named: Vec<(&str, u32)> = found.iter().map(|f| (f.driver, f.address)).collect();
+        named.sort_unstable();
+        assert_eq!(named, [("cubemars", 1), ("cubemars", 2)], "{found:?}");
         let sure = |found: &Finding| found.certainty() >= Some(Certainty::Likely);
         assert!(found.iter().all(sure), "{found:?}");
     }
@@ -564,8 +564,8 @@ fn a_motor_is_found_among_its_commands() {
         vec![7, a, b, c, d, 0xFF, 0x46, 0]
     });
     let found = likely(&bus.heard());
-    let told: Vec<(&str, u32)> = found.iter().map(|f| (f.driver, f.address)).collect();
-    assert_eq!(told, [("cubemars", 7)], "{found:?}");
+    let named: Vec<(&str, u32)> = found.iter().map(|f| (f.driver, f.address)).collect();
+    assert_eq!(named, [("cubemars", 7)], "{found:?}");
 }
 
 /// A node of a profile that no driver reads is named as such, and taken for nothing else.
@@ -584,11 +584,11 @@ fn an_unknown_node_is_a_node() {
         vec![0x43, 0, 0x10, 0, 0x91, 1, 0x0F, 0]
     });
     let found = likely(&bus.heard());
-    let told: Vec<(u32, bool)> = found
+    let named: Vec<(u32, bool)> = found
         .iter()
         .map(|found| (found.address, found.unusable.is_empty()))
         .collect();
-    assert_eq!(told, [(0x15, false)], "{found:?}");
+    assert_eq!(named, [(0x15, false)], "{found:?}");
 }
 
 /// The identifiers of frames, and those that the device of `row` reads.

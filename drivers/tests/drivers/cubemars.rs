@@ -6,7 +6,7 @@ use crate::rig::{
     options, refused, shown_keys, spec, texts,
 };
 use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode};
-use proprio_drivers::{Output, State};
+use proprio_drivers::{StampedReading, State};
 use proprio_topics::{Counter, JointState, Kind, Nanos, Quality, Reading, StampKind, Temperature};
 use proptest::prelude::*;
 use std::f64::consts::TAU;
@@ -24,8 +24,8 @@ fn motor(keys: &str, number: u32) -> Box<dyn Device> {
 }
 
 /// Errors and temperatures told.
-fn told(readings: &[Output]) -> Vec<(u32, f64)> {
-    let mut told = Vec::new();
+fn actuators(readings: &[StampedReading]) -> Vec<(u32, f64)> {
+    let mut all = Vec::new();
     for pair in readings.windows(2) {
         if let (Reading::Actuator(actuator), Reading::Temperature(temperature)) =
             (pair[0].reading, pair[1].reading)
@@ -33,10 +33,10 @@ fn told(readings: &[Output]) -> Vec<(u32, f64)> {
             assert_eq!((pair[0].output, pair[1].output), (0, 1));
             assert!(actuator.duty.is_nan() && actuator.mode == 0);
             assert_eq!(actuator.encoder, u32::from(actuator.faults == 5));
-            told.push((actuator.faults, temperature.celsius));
+            all.push((actuator.faults, temperature.celsius));
         }
     }
-    told
+    all
 }
 
 #[test]
@@ -74,7 +74,7 @@ fn frames_are_read_as_other_programs_read_them() {
             assert_eq!(readings.len(), 1);
         } else {
             let (celsius, error) = (number(celsius), error.parse().unwrap());
-            assert_eq!(told(&readings), [(error, celsius)], "{line}");
+            assert_eq!(actuators(&readings), [(error, celsius)], "{line}");
             let quality = match error {
                 0 => Quality::GOOD,
                 5 => Quality::DEVICE_FAULT,
@@ -132,7 +132,7 @@ fn keys_replace_the_models_ranges() {
         let read = joints(&readings)[0].0;
         assert!(near(read.position, 95.5) && near(read.velocity, 45.0));
         assert!(near(read.current, 40.0) && near(read.torque, 20.0));
-        assert_eq!(told(&readings), [(0, 42.0)]);
+        assert_eq!(actuators(&readings), [(0, 42.0)]);
     }
     let keys = "mode = \"servo\"\nmodel = \"AK10-9\"\npole_pairs = 14\ngear_ratio = 6.0";
     let mut device = motor(keys, 2);
@@ -193,17 +193,17 @@ fn motors_share_an_identifier() {
     assert_eq!(first.claims(), [Claim::shared(Id::standard(0))]);
     assert_eq!(first.claims(), second.claims());
     // A motor whose replies have its own number as identifier: commands have it too.
-    let mut own = motor(&format!("{MIT}\nhost_id = 7"), 7);
-    assert_eq!(own.claims(), [Claim::shared(Id::standard(7))]);
+    let mut named = motor(&format!("{MIT}\nhost_id = 7"), 7);
+    assert_eq!(named.claims(), [Claim::shared(Id::standard(7))]);
     let frames = [
         frame("007#80007FF000000800", 0.0),
         frame("007#FFFFFFFFFFFFFFFC", 0.5),
         frame("007#0780007FF8004100", 1.0),
     ];
-    let (readings, faults) = decode(&mut *own, &frames);
+    let (readings, faults) = decode(&mut *named, &frames);
     assert!(faults.is_empty());
     assert_eq!(joints(&readings).len(), 1);
-    assert_eq!(told(&readings), [(0, 25.0)]);
+    assert_eq!(actuators(&readings), [(0, 25.0)]);
     // Servo mode: each motor has its own.
     let servo = motor(SERVO, 254);
     assert_eq!(servo.claims(), [Claim::exclusive(Id::extended(0x29FE))]);
@@ -265,11 +265,11 @@ fn temperature_and_error_are_told_now_and_then() {
     ];
     let (readings, _) = decode(&mut *device, &frames);
     let expected = [(0, 20.0), (0, 23.0), (1, 25.0), (5, 27.0), (0, -10.0)];
-    assert_eq!(told(&readings), expected);
+    assert_eq!(actuators(&readings), expected);
     assert_eq!(joints(&readings).len(), frames.len());
     device.restart(Nanos::from_millis(1100));
     let (readings, _) = decode(&mut *device, &[at(30, 0, 1100.0)]);
-    assert_eq!(told(&readings), [(0, 30.0)]);
+    assert_eq!(actuators(&readings), [(0, 30.0)]);
     let qualities: Vec<Quality> = readings.iter().map(|r| r.quality).collect();
     assert_eq!(
         qualities,
@@ -332,7 +332,7 @@ fn the_keys_of_the_page_are_legal_and_nothing_is_sent() {
     rig.board_loses = Box::new(|_, _| false);
     rig.run(20);
     assert_eq!(joints(&rig.readings)[50].1, Quality::GAP_BEFORE);
-    assert_eq!(told(&rig.readings).len(), 2);
+    assert_eq!(actuators(&rig.readings).len(), 2);
     rig.device.stop(rig.now);
     rig.run(20);
     assert_eq!(rig.device.state(), State::Stopped);
@@ -492,21 +492,21 @@ proptest! {
             encode(&mut *board, 1, &warm, Quality::GOOD);
             let frames = encode(&mut *board, 0, &Reading::Joint(state), quality);
             let (readings, _) = decode(&mut *listener("cubemars", keys, &[0]), &frames);
-            let (back, told) = joints(&readings)[0];
+            let (back, found) = joints(&readings)[0];
             let effort = if keys == MIT { back.torque } else { back.current };
             let read = [back.position, back.velocity, effort];
             for ((a, b), step) in read.iter().zip(sent).zip(steps) {
                 prop_assert!((a - b).abs() <= step * (0.5 + 1e-9), "{} {} {}", a, b, step);
             }
-            prop_assert_eq!(told.0 & !Quality::SATURATED.0, quality.0);
+            prop_assert_eq!(found.0 & !Quality::SATURATED.0, quality.0);
             let (_, read) = told_once(&readings);
             prop_assert!((read - celsius).abs() <= 0.5 + 1e-9);
         }
     }
 }
 
-fn told_once(readings: &[Output]) -> (u32, f64) {
-    let told = told(readings);
-    assert_eq!(told.len(), 1);
-    told[0]
+fn told_once(readings: &[StampedReading]) -> (u32, f64) {
+    let actuators = actuators(readings);
+    assert_eq!(actuators.len(), 1);
+    actuators[0]
 }

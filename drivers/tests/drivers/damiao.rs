@@ -6,7 +6,9 @@ use crate::rig::{
     near, options, poll, refused, sends_nothing, shown_keys, spec, texts,
 };
 use proprio_drivers::State;
-use proprio_drivers::{Claim, Decoded, Device, EncodeError, Frame, Frames, Id, Mode, Output};
+use proprio_drivers::{
+    Claim, Decoded, Device, EncodeError, Frame, Frames, Id, Mode, StampedReading,
+};
 use proprio_topics::{
     Counter, JointState, Nanos, Quality, Reading, Refusal, StampKind, Temperature,
 };
@@ -25,8 +27,8 @@ fn motor(keys: &str, address: u32, mode: Mode) -> Box<dyn Device> {
 }
 
 /// Mode and faults, temperatures of FET and motor.
-fn told(readings: &[Output]) -> Vec<(u32, u32, f64, f64)> {
-    let told = readings.windows(3).filter_map(|three| {
+fn actuators(readings: &[StampedReading]) -> Vec<(u32, u32, f64, f64)> {
+    let states = readings.windows(3).filter_map(|three| {
         let [a, b, c] = [0, 1, 2].map(|place| (three[place].output, three[place].reading));
         match (a, b, c) {
             (
@@ -41,7 +43,7 @@ fn told(readings: &[Output]) -> Vec<(u32, u32, f64, f64)> {
             _ => None,
         }
     });
-    told.collect()
+    states.collect()
 }
 
 #[test]
@@ -64,7 +66,7 @@ fn frames_are_read_as_other_programs_read_them() {
                 assert!(joint.current.is_nan() && joint.acceleration.is_nan());
                 let state: u32 = state.parse().unwrap();
                 let expected = (u32::from(state == 1), if state > 1 { state } else { 0 });
-                let (mode, code, hot, hotter) = told(&readings)[0];
+                let (mode, code, hot, hotter) = actuators(&readings)[0];
                 assert_eq!((mode, code), expected, "{line}");
                 assert_eq!((hot, hotter), (number(fet), number(rotor)), "{line}");
                 assert_eq!(quality.contains(Quality::DRIVE_FAULT), state > 1, "{line}");
@@ -236,7 +238,7 @@ fn states_are_told_now_and_then() {
         (0, 2, 27.0, 40.0),
         (1, 0, 28.0, 40.0),
     ];
-    assert_eq!(told(&readings), expected);
+    assert_eq!(actuators(&readings), expected);
     let (good, sensor) = (Quality::GOOD, Quality::DEVICE_FAULT);
     let drive = Quality::DRIVE_FAULT;
     let qualities: Vec<Quality> = joints(&readings)
@@ -249,7 +251,7 @@ fn states_are_told_now_and_then() {
     assert_eq!(faulty, [2, 2]);
     device.restart(Nanos::from_millis(1012));
     let (readings, _) = decode(&mut *device, &[at(1, 30, 1012)]);
-    assert_eq!(told(&readings), [(1, 0, 30.0, 40.0)]);
+    assert_eq!(actuators(&readings), [(1, 0, 30.0, 40.0)]);
     assert_eq!(joints(&readings)[0].1, Quality::GAP_BEFORE);
 }
 

@@ -5,7 +5,9 @@ mod messages;
 
 use crate::rig::{board, count, decode, encode, listener, options, spec};
 use proprio_drivers::signal::{Bits, Message, Raw, Signal, Switch};
-use proprio_drivers::{Decoded, EncodeError, Format, Frame, Frames, Id, Mode, Output, State};
+use proprio_drivers::{
+    Decoded, EncodeError, Format, Frame, Frames, Id, Mode, StampedReading, State,
+};
 use proprio_topics::{
     Counter, JointState, Nanos, Quality, Reading, StampKind, Temperature, Wrench,
 };
@@ -124,13 +126,13 @@ fn half(second: bool, n: u8, ms: f64) -> Frame {
 }
 
 /// The numbers of force and torque in each reading.
-fn numbers(readings: &[Output]) -> Vec<(u32, u32)> {
+fn numbers(readings: &[StampedReading]) -> Vec<(u32, u32)> {
     let number = |value: f64| (value * 100.0).round() as u32;
-    let of = |output: &Output| match output.reading {
+    let counts = |stamped: &StampedReading| match stamped.reading {
         Reading::Wrench(w) => (number(w.force[0]), number(w.torque[2])),
-        _ => panic!("{output:?}"),
+        _ => panic!("{stamped:?}"),
     };
-    readings.iter().map(of).collect()
+    readings.iter().map(counts).collect()
 }
 
 #[test]
@@ -321,7 +323,7 @@ fn a_held_value_joins_the_others_until_it_is_too_old() {
     let (readings, faults) = decode(&mut *device, &frames);
     assert!(faults.is_empty(), "{faults:?}");
     let joints: Vec<JointState> = (readings.iter())
-        .filter_map(|output| match output.reading {
+        .filter_map(|stamped| match stamped.reading {
             Reading::Joint(state) => Some(state),
             _ => None,
         })
@@ -354,9 +356,9 @@ fn pages_of_one_message_are_one_reading() {
     let (readings, faults) = decode(&mut *device, &frames);
     assert!(faults.is_empty(), "{faults:?}");
     let values: Vec<[f64; 3]> = (readings.iter())
-        .map(|output| match output.reading {
+        .map(|stamped| match stamped.reading {
             Reading::Imu(imu) => imu.proper_acceleration,
-            _ => panic!("{output:?}"),
+            _ => panic!("{stamped:?}"),
         })
         .collect();
     assert_eq!(values, [[1.0, 2.0, 2.0], [3.0, 4.0, 4.0]]);
@@ -403,7 +405,7 @@ fn signals_of_one_frame_are_one_reading() {
         let (mut device, mut board) = device(keys, x, y, Mode::Listen);
         let (readings, faults) = decode(&mut *device, &frames);
         assert!(faults.is_empty(), "{faults:?}");
-        let values = readings.iter().map(|output| output.reading.values());
+        let values = readings.iter().map(|stamped| stamped.reading.values());
         let values: Vec<[f64; 2]> = values.map(|values| [values[0], values[1]]).collect();
         assert_eq!(values[..2], expected, "{x:?} {y:?}");
         device.restart(Nanos::ZERO);
@@ -421,7 +423,7 @@ fn values_that_are_not_available_are_none() {
                 fields = { position = \"G.Byte\", velocity = \"G.Word\", current = \"G.Bits\", \
                 torque = \"G.Two\" }\n\
                 hold_ms = { current = 1000.0, torque = 1000.0 }\nfault = \"G.Flag\"\n";
-    let told = |j1939: bool, raw: Raw, flag: u64, data: [u8; 6]| {
+    let decoded = |j1939: bool, raw: Raw, flag: u64, data: [u8; 6]| {
         let message = Message {
             name: "G".to_owned(),
             id: Ok(Id::extended(0x18FF_1023)),
@@ -443,9 +445,9 @@ fn values_that_are_not_available_are_none() {
         assert!(readings.is_empty() && faults.is_empty(), "{faults:?}");
         let (readings, faults) = decode(&mut *device, &[Frame::new(id, &data)]);
         let is_faulty = count(&faults, Counter::DeviceFault) != 0;
-        let values = |output: &Output| match output.reading {
+        let values = |stamped: &StampedReading| match stamped.reading {
             Reading::Joint(joint) => [joint.position, joint.velocity, joint.current, joint.torque],
-            _ => panic!("{output:?}"),
+            _ => panic!("{stamped:?}"),
         };
         (readings.first().map(values), is_faulty)
     };
@@ -468,7 +470,7 @@ fn values_that_are_not_available_are_none() {
         ([0x01, 0x00, 0xFE, 0x01, 0, 0], [1.0, NONE, 1.0, 0.0], false),
         ([0x01, 0x34, 0xFF, 0x01, 2, 2], [1.0, NONE, 1.0, NONE], true),
     ] {
-        let (found, is_faulty) = told(true, Raw::Unsigned, 2, data);
+        let (found, is_faulty) = decoded(true, Raw::Unsigned, 2, data);
         assert!(same(found, right), "{data:?} {found:?}");
         assert_eq!(is_faulty, fault, "{data:?}");
     }
@@ -479,14 +481,14 @@ fn values_that_are_not_available_are_none() {
         (8, 0xFF, false),
         (1, 1, true),
     ] {
-        let (_, is_faulty) = told(true, Raw::Unsigned, flag, [1, 1, 1, 1, raw, 1]);
+        let (_, is_faulty) = decoded(true, Raw::Unsigned, flag, [1, 1, 1, 1, raw, 1]);
         assert_eq!(is_faulty, fault, "{flag} {raw:x}");
     }
     let all = [0xFF; 6];
-    assert_eq!(told(true, Raw::Unsigned, 2, all), (None, false));
-    let found = told(false, Raw::Unsigned, 2, all);
+    assert_eq!(decoded(true, Raw::Unsigned, 2, all), (None, false));
+    let found = decoded(false, Raw::Unsigned, 2, all);
     assert_eq!(found, (Some([255.0, 65535.0, 15.0, 3.0]), true));
-    assert_eq!(told(true, Raw::Signed, 2, all), (Some([-1.0; 4]), true));
+    assert_eq!(decoded(true, Raw::Signed, 2, all), (Some([-1.0; 4]), true));
 }
 
 #[test]
@@ -678,7 +680,7 @@ fn a_frame_has_as_many_readings_as_bytes() {
     let (readings, faults) = decode(&mut *hand, &[frame(&bytes)]);
     assert!(faults.is_empty(), "{faults:?}");
     let values: Vec<(u8, u8)> = (readings.iter())
-        .map(|output| (output.output, output.reading.values()[1] as u8))
+        .map(|stamped| (stamped.output, stamped.reading.values()[1] as u8))
         .collect();
     assert_eq!(values, (0..).zip(bytes.clone()).collect::<Vec<_>>());
     // All that are too far back in a short frame are one fault.

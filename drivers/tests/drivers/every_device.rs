@@ -4,7 +4,7 @@
 
 use crate::recognise::{BOARDS, Bus, Row, readings, recorded};
 use crate::rig::{Rig, board, count, decode, encode, listener, options, spec};
-use proprio_drivers::{Decoded, Device, Frame, Id, Mode, NotSent, Options, Output, State};
+use proprio_drivers::{Decoded, Device, Frame, Id, Mode, NotSent, Options, StampedReading, State};
 use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Skin, StampKind, Wrench};
 
 fn device(row: &Row, mode: Mode) -> Box<dyn Device> {
@@ -387,12 +387,12 @@ fn stamps_and_their_kinds_belong_together() {
         let frames: Vec<Frame> = (recorded(row, 1000).iter().zip(kinds.into_iter().cycle()))
             .map(|(frame, kind)| frame.at(frame.t, kind))
             .collect();
-        for output in read(&mut *device(row, Mode::Listen), &frames) {
-            let of = frames.iter().filter(|frame| frame.t == output.acquired);
-            let kinds: Vec<StampKind> = of.map(|frame| frame.stamp).collect();
+        for stamped in read(&mut *device(row, Mode::Listen), &frames) {
+            let measured = frames.iter().filter(|frame| frame.t == stamped.acquired);
+            let kinds: Vec<StampKind> = measured.map(|frame| frame.stamp).collect();
             assert!(
-                kinds.contains(&output.stamp),
-                "{row:?}: {output:?}, {kinds:?}"
+                kinds.contains(&stamped.stamp),
+                "{row:?}: {stamped:?}, {kinds:?}"
             );
         }
     }
@@ -402,7 +402,7 @@ fn stamps_and_their_kinds_belong_together() {
 /// where the silence was in the midst of a reading.
 #[test]
 fn a_gap_is_told_once() {
-    let gaps = |readings: &[Output]| {
+    let gaps = |readings: &[StampedReading]| {
         let gaps = readings
             .iter()
             .filter(|r| r.quality.contains(Quality::GAP_BEFORE));
@@ -424,8 +424,8 @@ fn a_gap_is_told_once() {
             outputs.sort_unstable();
             outputs.dedup();
             assert!(!outputs.is_empty());
-            let told = (gaps(&steady), gaps(&resumed));
-            assert_eq!(told, (0, outputs.len()), "{row:?} {cut}");
+            let counted = (gaps(&steady), gaps(&resumed));
+            assert_eq!(counted, (0, outputs.len()), "{row:?} {cut}");
             assert!(
                 resumed[0].quality.contains(Quality::GAP_BEFORE),
                 "{row:?} {cut}"
@@ -435,10 +435,10 @@ fn a_gap_is_told_once() {
 }
 
 /// What a reading is of: the output, and the triangle of a skin.
-fn key(output: &Output) -> (u8, u32) {
-    match output.reading {
-        Reading::Skin(skin) => (output.output, skin.triangle),
-        _ => (output.output, 0),
+fn key(stamped: &StampedReading) -> (u8, u32) {
+    match stamped.reading {
+        Reading::Skin(skin) => (stamped.output, skin.triangle),
+        _ => (stamped.output, 0),
     }
 }
 
@@ -466,7 +466,7 @@ fn numbers(reading: &Reading) -> Vec<f64> {
 }
 
 /// The measurements from `frames`, with the time advanced to each.
-fn read(device: &mut dyn Device, frames: &[Frame]) -> Vec<Output> {
+fn read(device: &mut dyn Device, frames: &[Frame]) -> Vec<StampedReading> {
     let mut readings = Vec::new();
     for frame in frames {
         let mut out = Decoded::new();
@@ -475,9 +475,9 @@ fn read(device: &mut dyn Device, frames: &[Frame]) -> Vec<Output> {
             device.on_frame(frame, &mut out);
         }
         // States are told again after a start.
-        let is_measured = |output: &&Output| {
+        let is_measured = |stamped: &&StampedReading| {
             !matches!(
-                output.reading,
+                stamped.reading,
                 Reading::Actuator(_) | Reading::Temperature(_)
             )
         };
@@ -488,14 +488,14 @@ fn read(device: &mut dyn Device, frames: &[Frame]) -> Vec<Output> {
 
 /// Whether `part` is one of `whole`, but for values that it lacks. (Without the SYNC that caused it
 /// a reading has the time of its frame.)
-fn is_among(part: &Output, whole: &[Output], later: Nanos) -> bool {
-    whole.iter().any(|output| {
+fn is_among(part: &StampedReading, whole: &[StampedReading], later: Nanos) -> bool {
+    whole.iter().any(|stamped| {
         let mut pairs = numbers(&part.reading)
             .into_iter()
-            .zip(numbers(&output.reading));
-        output.output == part.output
-            && output.reading.kind() == part.reading.kind()
-            && (output.acquired + later - part.acquired).0.abs() <= 500_000
+            .zip(numbers(&stamped.reading));
+        stamped.output == part.output
+            && stamped.reading.kind() == part.reading.kind()
+            && (stamped.acquired + later - part.acquired).0.abs() <= 500_000
             && pairs.all(|(a, b)| a.is_nan() || a.to_bits() == b.to_bits())
     })
 }
@@ -519,10 +519,10 @@ fn an_interruption_mixes_nothing() {
                 let end = whole.iter().filter(|o| o.acquired > frames[cut + lost].t);
                 let end = end.count();
                 assert!(again.len() + 4 >= end, "{row:?} {cut}+{lost}");
-                for output in &again {
+                for stamped in &again {
                     assert!(
-                        is_among(output, &whole, Nanos::ZERO),
-                        "{row:?} {cut}+{lost}: {output:?}"
+                        is_among(stamped, &whole, Nanos::ZERO),
+                        "{row:?} {cut}+{lost}: {stamped:?}"
                     );
                 }
                 // It is silent for a while.
@@ -533,10 +533,10 @@ fn an_interruption_mixes_nothing() {
                 let mut silent = device(row, Mode::Listen);
                 read(&mut *silent, before);
                 let after = read(&mut *silent, &shifted);
-                for output in &after {
+                for stamped in &after {
                     assert!(
-                        is_among(output, &whole, later),
-                        "{row:?} {cut}+{lost}: {output:?}"
+                        is_among(stamped, &whole, later),
+                        "{row:?} {cut}+{lost}: {stamped:?}"
                     );
                 }
                 assert!(after.len() + 4 >= end, "{row:?} {cut}+{lost}");

@@ -60,7 +60,7 @@ fn certainty_follows_from_the_bits() {
         (20.0, Some(Certainty::Certain)),
         (500.0, Some(Certainty::Certain)),
     ] {
-        let of = |guess| {
+        let certainty_if = |guess| {
             Finding {
                 bits,
                 guess,
@@ -68,8 +68,12 @@ fn certainty_follows_from_the_bits() {
             }
             .certainty()
         };
-        assert_eq!(of(false), certainty, "{bits}");
-        assert_eq!(of(true), certainty.map(|_| Certainty::Possible), "{bits}");
+        assert_eq!(certainty_if(false), certainty, "{bits}");
+        assert_eq!(
+            certainty_if(true),
+            certainty.map(|_| Certainty::Possible),
+            "{bits}"
+        );
     }
     // The words are probabilities, and are printed as such.
     for (bits, percent) in [
@@ -167,16 +171,16 @@ fn a_counter_is_evidence() {
 /// A board that may have a skin, or encoders, or not, is found as such only if it sends them.
 #[test]
 fn an_mtb4_is_what_it_sends() {
-    let told = "730#FF0B010203";
+    let answer = "730#FF0B010203";
     let drivers = |frames: &[&str]| {
         let findings = recognise(&traffic(&unstamped(frames)));
         let mut drivers: Vec<&str> = findings.iter().map(|found| found.driver).collect();
         drivers.sort_unstable();
         drivers
     };
-    assert_eq!(drivers(&[told]), ["icub_imu"]);
+    assert_eq!(drivers(&[answer]), ["icub_imu"]);
     assert_eq!(
-        drivers(&[told, "432#4000000000000000"]),
+        drivers(&[answer, "432#4000000000000000"]),
         ["icub_imu", "icub_skin"]
     );
 }
@@ -219,10 +223,10 @@ fn a_moteus_is_a_controller_that_replies_to_a_host() {
         (Id::extended(0x1_0100), None),
     ] {
         let found = found("moteus", &[reply(id)]);
-        let told = found
+        let named = found
             .as_ref()
             .map(|found| (found.address, key(found, "host")));
-        assert_eq!(told, controller, "{id}");
+        assert_eq!(named, controller, "{id}");
     }
     // Its host asks, and tells no errors.
     let seen = |query: &[u8]| {
@@ -271,8 +275,8 @@ fn an_ati_board_is_known_by_its_answers() {
     ] {
         let found = found(&["208#0203", "205#", serial]);
         let what = found.map(|found| found.what);
-        let told = letters.map(|l| format!("ATI sensor at a NETCANOEM board, serial {l}"));
-        assert_eq!(what, told, "{serial}");
+        let expected = letters.map(|l| format!("ATI sensor at a NETCANOEM board, serial {l}"));
+        assert_eq!(what, expected, "{serial}");
     }
 }
 
@@ -306,8 +310,8 @@ fn a_cubemars_motor_is_known_by_its_replies() {
         ("00002968#00010203040506", None),
     ] {
         let found = found("cubemars", &periodic(&[text], 10.0, 8));
-        let told = found.as_ref().map(|found| key(found, "mode").unwrap());
-        assert_eq!(told, mode, "{text}");
+        let found_mode = found.as_ref().map(|found| key(found, "mode").unwrap());
+        assert_eq!(found_mode, mode, "{text}");
         let host = found.as_ref().and_then(|found| key(found, "host_id"));
         assert_eq!(
             host,
@@ -369,7 +373,7 @@ fn a_jr3_board_is_known_by_its_counter_or_its_scales() {
         );
     }
     // 20 readings: the moments of `others` have a counter that no forces have.
-    let of = |others: u16| {
+    let bits = |others: u16| {
         let reading = |n: u16| {
             let other = n + if n < others { 100 } else { 0 };
             let text = |id, counter: u16| format!("{id}#000000000000{counter:02X}00");
@@ -378,7 +382,7 @@ fn a_jr3_board_is_known_by_its_counter_or_its_scales() {
         bits("jr3_can", &(0..20).flat_map(reading).collect::<Vec<_>>())
     };
     for (others, more) in [(0, 10.0), (2, 10.0), (3, 0.0), (15, 0.0)] {
-        assert!((of(others) - of(20) - more).abs() < 1e-9, "{others}");
+        assert!((bits(others) - bits(20) - more).abs() < 1e-9, "{others}");
     }
 }
 
@@ -412,10 +416,10 @@ fn an_odrive_is_known_by_its_heartbeat_or_its_estimates() {
     }
     // A byte that is 0, one of two others, and an identifier next to one that it has.
     let least = bits("odrive", &unstamped(&[BEAT]));
-    let told = bits("odrive", &unstamped(&[BEAT, "0A0#0204043A00060800"]));
+    let with_beat = bits("odrive", &unstamped(&[BEAT, "0A0#0204043A00060800"]));
     assert!(
-        (told - least - 8.0 - 7.0 - 1.0).abs() < 1e-9,
-        "{told} {least}"
+        (with_beat - least - 8.0 - 7.0 - 1.0).abs() < 1e-9,
+        "{with_beat} {least}"
     );
     assert_eq!(found("odrive", &unstamped(&["0B4#0000803F00000000"])), None);
     // Who has a heartbeat is asked for its version: not who is asked for one, or sends another.
@@ -529,8 +533,8 @@ fn an_xsens_sensor_is_known_by_two_quantities() {
         ),
     ] {
         let found = found("xsens_mti", &unstamped(texts));
-        let told = found.as_ref().and_then(|found| key(found, "quantities"));
-        assert_eq!(told, quantities, "{texts:?}");
+        let named = found.as_ref().and_then(|found| key(found, "quantities"));
+        assert_eq!(named, quantities, "{texts:?}");
     }
 }
 
@@ -566,8 +570,8 @@ fn damiao_motors_share_an_identifier() {
 
 #[test]
 fn a_motor_in_motion_mode_sends_its_own_number() {
-    let own = found("myactuator", &mit("501", "01", 10, 0.0));
-    assert_eq!(own.map(|found| found.address), Some(1));
+    let motor = found("myactuator", &mit("501", "01", 10, 0.0));
+    assert_eq!(motor.map(|found| found.address), Some(1));
     assert!(found("myactuator", &mit("501", "02", 10, 0.0)).is_none());
 }
 

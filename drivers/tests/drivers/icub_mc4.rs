@@ -4,7 +4,7 @@
 use crate::rig::{
     FD, Rig, board, count, decode, encode, frame, listener, options, shown_keys, spec,
 };
-use proprio_drivers::{Claim, EncodeError, Frame, Frames, Id, Mode, Output, SpecError};
+use proprio_drivers::{Claim, EncodeError, Frame, Frames, Id, Mode, SpecError, StampedReading};
 use proprio_drivers::{State, icub_mc4::fault};
 use proprio_topics::{Actuator, Counter, JointState, Quality, Reading};
 use proptest::prelude::*;
@@ -14,10 +14,10 @@ use std::f64::consts::TAU;
 const POSITIONS: &str = "111#0000010000FCFFFF";
 const KEYS: &str = "ticks_per_turn = [65536.0, 4096.0]\nvelocity_shift = [5, 3]";
 
-fn joint(output: &Output) -> JointState {
-    match output.reading {
+fn joint(stamped: &StampedReading) -> JointState {
+    match stamped.reading {
         Reading::Joint(joint) => joint,
-        _ => panic!("{output:?}"),
+        _ => panic!("{stamped:?}"),
     }
 }
 
@@ -38,10 +38,10 @@ fn positions_and_velocities_are_those_of_the_host() {
         (-TAU / 4.0, -2000.0 * TAU / 4096.0),
     ];
     assert_eq!(readings.len(), 2);
-    for ((output, right), number) in readings.iter().zip(expected).zip(0..) {
-        let joint = joint(output);
+    for ((stamped, right), number) in readings.iter().zip(expected).zip(0..) {
+        let joint = joint(stamped);
         assert_eq!(
-            (output.output, output.quality, output.acquired),
+            (stamped.output, stamped.quality, stamped.acquired),
             (number, Quality::GOOD, frames[1].t)
         );
         assert!(
@@ -146,13 +146,13 @@ fn faults_belong_to_their_joint() {
             let faulty = qualities.iter().filter(|q| q.contains(flag)).count();
             assert_eq!(count(&counted, counter), faulty as u32, "{status}");
         }
-        for (number, output) in readings[..2].iter().enumerate() {
-            let Reading::Actuator(actuator) = output.reading else {
-                panic!("{output:?}");
+        for (number, stamped) in readings[..2].iter().enumerate() {
+            let Reading::Actuator(actuator) = stamped.reading else {
+                panic!("{stamped:?}");
             };
             let mode = u32::from_str_radix(&status[4 * number + 2..4 * number + 4], 16);
             assert_eq!(
-                (usize::from(output.output), Ok(actuator.mode)),
+                (usize::from(stamped.output), Ok(actuator.mode)),
                 (number, mode)
             );
             assert_eq!(actuator.faults, faults[number]);
@@ -325,13 +325,13 @@ fn a_simulated_board_sends_what_it_is_given() {
     assert_eq!(send(0, &first, doubt | Quality::SATURATED), [""; 0]);
     assert_eq!(send(0, &first, drive | zero), ["113#0460000100000000"]);
     assert_eq!(send(0, &first, good), ["113#0001000100000000"]);
-    let told = Reading::Actuator(Actuator {
+    let actuator = Reading::Actuator(Actuator {
         duty: 0.0,
         mode: 0x50,
         encoder: 0,
         faults: 0x48,
     });
-    assert_eq!(send(1, &told, good), ["113#0001485000000000"]);
+    assert_eq!(send(1, &actuator, good), ["113#0001485000000000"]);
     let positions = send(1, &second, doubt | drive);
     assert_eq!(positions, both);
     // One joint in use does not wait for the other.
@@ -378,9 +378,9 @@ proptest! {
         }
         let (readings, _) = decode(&mut *listener("icub_mc4", &keys, &[0, 1]), &frames);
         let last = &readings[readings.len() - 2..];
-        for (number, output) in last.iter().enumerate() {
-            prop_assert_eq!(output.quality, quality);
-            let (back, step) = (joint(output), TAU / ticks[number]);
+        for (number, stamped) in last.iter().enumerate() {
+            prop_assert_eq!(stamped.quality, quality);
+            let (back, step) = (joint(stamped), TAU / ticks[number]);
             let step = [step, step * 1000.0 / f64::from(1 << shift)];
             let right = [positions[number], velocities[number]];
             for ((a, b), step) in [back.position, back.velocity].iter().zip(right).zip(step) {

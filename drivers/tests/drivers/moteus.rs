@@ -3,7 +3,7 @@
 
 use crate::rig::{FD, Rig, board, count, decode, encode, listener, options, spec, supervisor};
 use proprio_drivers::{
-    Board, Decoded, Device, Frame, Frames, Id, Mode, NotSent, Output, SpecError, State,
+    Board, Decoded, Device, Frame, Frames, Id, Mode, NotSent, SpecError, StampedReading, State,
 };
 use proprio_topics::{
     Actuator, Counter, JointState, Nanos, Quality, Reading, StampKind, Temperature,
@@ -25,12 +25,12 @@ fn reply(hex: &str) -> Frame {
     frame.at(Nanos::from_millis(5), StampKind::Software)
 }
 
-fn read(hex: &str) -> (Vec<Output>, Vec<proprio_drivers::Fault>) {
+fn read(hex: &str) -> (Vec<StampedReading>, Vec<proprio_drivers::Fault>) {
     decode(&mut *listener("moteus", "", &[0]), &[reply(hex)])
 }
 
-fn joint(output: &Output) -> JointState {
-    match output.reading {
+fn joint(stamped: &StampedReading) -> JointState {
+    match stamped.reading {
         Reading::Joint(joint) => joint,
         other => panic!("{other:?}"),
     }
@@ -158,7 +158,7 @@ fn a_controller_is_asked_as_by_the_makers_package() {
 fn states_are_told_on_change_and_once_a_second() {
     let mut device = listener("moteus", "", &[0]);
     // Mode 10 for 2.5 s; then mode 1 with fault 35, and again mode 10.
-    let mut told = Vec::new();
+    let mut states = Vec::new();
     for ms in 0..2520 {
         let (mode, fault) = if (2510..2515).contains(&ms) {
             (1, 35)
@@ -168,10 +168,10 @@ fn states_are_told_on_change_and_once_a_second() {
         let reply = reply(&format!("2100{mode:02X}210E1F210F{fault:02X}505050"));
         let t = Nanos::from_millis(ms);
         let (readings, _) = decode(&mut *device, &[reply.at(t, StampKind::Software)]);
-        for output in readings {
-            match output.reading {
-                Reading::Actuator(state) => told.push((ms, state.mode, state.faults)),
-                Reading::Temperature(warmth) => told.push((ms, 0, warmth.celsius as u32)),
+        for stamped in readings {
+            match stamped.reading {
+                Reading::Actuator(state) => states.push((ms, state.mode, state.faults)),
+                Reading::Temperature(warmth) => states.push((ms, 0, warmth.celsius as u32)),
                 _ => {}
             }
         }
@@ -186,7 +186,7 @@ fn states_are_told_on_change_and_once_a_second() {
         (2510, 1, 35),
         (2515, 10, 0),
     ];
-    assert_eq!(told, expected);
+    assert_eq!(states, expected);
     // A fault alone, in the answer to another program's question.
     let (readings, _) = decode(&mut *device, &[reply("210F2A50")]);
     let Reading::Actuator(state) = readings[0].reading else {
@@ -254,14 +254,14 @@ fn a_simulated_controller_answers_any_query() {
         Quality::GOOD,
     );
     let mut ask = |query: &str| one_reply(&mut *board, query);
-    let told = |text: &str| Some(format!("100##1{text}"));
-    assert_eq!(ask("1301"), told("2301191480"));
-    assert_eq!(ask("1701"), told("2701C409401F0080"));
-    assert_eq!(ask("1B01"), told("2B01A8610000400D0300000000805050"));
-    assert_eq!(ask("110E5050"), told("210E1F"));
-    assert_eq!(ask("10040D"), told("20040D301F0000"));
+    let some = |text: &str| Some(format!("100##1{text}"));
+    assert_eq!(ask("1301"), some("2301191480"));
+    assert_eq!(ask("1701"), some("2701C409401F0080"));
+    assert_eq!(ask("1B01"), some("2B01A8610000400D0300000000805050"));
+    assert_eq!(ask("110E5050"), some("210E1F"));
+    assert_eq!(ask("10040D"), some("20040D301F0000"));
     // A register that it does not have is 0; it answers nothing about those above 127.
-    assert_eq!(ask("117F"), told("217F00"));
+    assert_eq!(ask("117F"), some("217F00"));
     // No query, cut off, too long, a write, register 128.
     for wrong in [
         "", "50", "11", "1F", "01000A", "14FF01", "2004000A", "118001",
@@ -276,7 +276,7 @@ fn replies_without_the_position_are_no_reading_of_the_joint() {
     let (readings, faults) = read("21000A50");
     assert!(matches!(
         readings[..],
-        [Output {
+        [StampedReading {
             reading: Reading::Actuator(_),
             ..
         }]
@@ -311,7 +311,7 @@ fn temperatures_are_read_in_each_type() {
         let (readings, faults) = read(hex);
         assert!(faults.is_empty());
         let [
-            Output {
+            StampedReading {
                 reading: Reading::Temperature(Temperature { celsius }),
                 ..
             },
@@ -377,8 +377,8 @@ fn a_restart_forgets_the_fault() {
     let mut device = listener("moteus", "", &[0]);
     let fault = reply("210001210F2321010A");
     let (readings, _) = decode(&mut *device, &[fault]);
-    let told = Quality::DRIVE_FAULT | Quality::DEVICE_FAULT;
-    assert_eq!(readings[1].quality, told);
+    let faults = Quality::DRIVE_FAULT | Quality::DEVICE_FAULT;
+    assert_eq!(readings[1].quality, faults);
     device.restart(Nanos::ZERO);
     let (readings, _) = decode(&mut *device, &[reply("21010A")]);
     assert_eq!(readings[0].quality, Quality::GAP_BEFORE);

@@ -6,7 +6,7 @@ use crate::rig::{
     options, refused, sends_nothing, shown_keys, spec, takes_eight_bytes, temperatures, texts,
 };
 use proprio_drivers::State;
-use proprio_drivers::{Claim, Device, EncodeError, Frames, Id, Mode, Output};
+use proprio_drivers::{Claim, Device, EncodeError, Frames, Id, Mode, StampedReading};
 use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Temperature};
 use proptest::prelude::*;
 use std::f64::consts::TAU;
@@ -31,9 +31,9 @@ fn motor(keys: &str, address: u32, mode: Mode) -> Box<dyn Device> {
         .expect("a legal configuration")
 }
 
-fn faults(readings: &[Output]) -> Vec<u32> {
+fn faults(readings: &[StampedReading]) -> Vec<u32> {
     (readings.iter())
-        .filter_map(|output| match output.reading {
+        .filter_map(|stamped| match stamped.reading {
             Reading::Actuator(actuator) => Some(actuator.faults),
             _ => None,
         })

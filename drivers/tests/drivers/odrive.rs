@@ -89,8 +89,8 @@ fn frames_of_the_makers_description_are_read() {
             ("temperature", &[fet, motor]) => {
                 let read: Vec<(u8, Reading)> =
                     readings.iter().map(|r| (r.output, r.reading)).collect();
-                let of = |celsius| Reading::Temperature(Temperature { celsius });
-                assert_eq!(read, [(2, of(fet)), (1, of(motor))]);
+                let temp = |celsius| Reading::Temperature(Temperature { celsius });
+                assert_eq!(read, [(2, temp(fet)), (1, temp(motor))]);
                 seen[3] += 1;
             }
             ("heartbeat", &[errors, state, motor, encoder, controller, doubtful, drive]) => {
@@ -140,8 +140,8 @@ fn what_comes_in_other_frames_is_held_and_then_absent() {
     );
     assert!(faults.is_empty(), "{faults:?}");
     let (absent, mut read) = (f64::NAN, Vec::new());
-    for output in &readings {
-        let joint = joint(&output.reading);
+    for stamped in &readings {
+        let joint = joint(&stamped.reading);
         assert_eq!(joint.velocity, TAU * 0.5);
         read.push([joint.current, joint.torque]);
     }
@@ -496,11 +496,11 @@ fn a_simulated_axis_sends_what_it_is_given() {
     let good = Quality::GOOD;
     assert_eq!(send(0, &joint, good), [alone]);
     // Both temperatures once both are new, the inverter's first.
-    let of = |celsius| Reading::Temperature(Temperature { celsius });
-    assert_eq!(send(1, &of(1.0), good), [""; 0]);
-    assert_eq!(send(1, &of(2.0), good), [""; 0]);
-    assert_eq!(send(2, &of(1.0), good), ["035#0000803F00000040"]);
-    assert_eq!(send(2, &of(2.0), good), [""; 0]);
+    let temp = |celsius| Reading::Temperature(Temperature { celsius });
+    assert_eq!(send(1, &temp(1.0), good), [""; 0]);
+    assert_eq!(send(1, &temp(2.0), good), [""; 0]);
+    assert_eq!(send(2, &temp(1.0), good), ["035#0000803F00000040"]);
+    assert_eq!(send(2, &temp(2.0), good), [""; 0]);
     // A heartbeat when the faults change.
     let fault = send(0, &joint, Quality::DEVICE_FAULT | Quality::SATURATED);
     assert_eq!(fault, ["021#0800000008000000", alone]);
@@ -551,8 +551,8 @@ fn a_simulated_axis_sends_what_it_is_given() {
     let absent = Reading::Joint(JointState::ABSENT);
     for (output, reading, error) in [
         (0, absent, EncodeError::NotFinite),
-        (1, of(1.0), EncodeError::Kind),
-        (0, of(1.0), EncodeError::Kind),
+        (1, temp(1.0), EncodeError::Kind),
+        (0, temp(1.0), EncodeError::Kind),
         (3, torque, EncodeError::Output(3)),
     ] {
         let refused = old.encode(output, &reading, quality, &mut out);
@@ -587,19 +587,19 @@ proptest! {
         prop_assert!(near(back.position, position) && near(back.velocity, velocity));
         prop_assert!(near(back.current, current));
         prop_assert!(back.torque.is_nan() == old && (old || near(back.torque, torque)));
-        let told = Reading::Actuator(Actuator {
+        let reading = Reading::Actuator(Actuator {
             duty: 0.0, mode: u32::from(state), encoder: 0, faults: errors,
         });
-        let (readings, _) = decode(&mut *host, &encode(&mut *axis, 0, &told, Quality::GOOD));
+        let (readings, _) = decode(&mut *host, &encode(&mut *axis, 0, &reading, Quality::GOOD));
         let back = actuator(&readings[0].reading);
         prop_assert_eq!((back.mode, back.faults), (u32::from(state), errors));
         if !old {
-            let told = Reading::Temperature(Temperature { celsius });
-            encode(&mut *axis, 1, &told, Quality::GOOD);
-            let frames = encode(&mut *axis, 2, &told, Quality::GOOD);
+            let reading = Reading::Temperature(Temperature { celsius });
+            encode(&mut *axis, 1, &reading, Quality::GOOD);
+            let frames = encode(&mut *axis, 2, &reading, Quality::GOOD);
             let (readings, _) = decode(&mut *host, &frames);
-            for output in &readings {
-                let Reading::Temperature(back) = output.reading else { panic!("{output:?}") };
+            for stamped in &readings {
+                let Reading::Temperature(back) = stamped.reading else { panic!("{stamped:?}") };
                 prop_assert!(near(back.celsius, celsius));
             }
             prop_assert_eq!(readings.len(), 2);

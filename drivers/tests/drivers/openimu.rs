@@ -151,7 +151,7 @@ fn quality(slope: &str, acceleration: &str, rate: &str) -> (Quality, [u32; 2]) {
 
 #[test]
 fn a_merit_of_two_is_a_fault() {
-    let of = |slope: u8, acceleration: u8, rate: u8| {
+    let flags = |slope: u8, acceleration: u8, rate: u8| {
         quality(
             &format!("00007D00007D{slope:02X}00"),
             &format!("007D007D007D{acceleration:02X}00"),
@@ -160,18 +160,26 @@ fn a_merit_of_two_is_a_fault() {
     };
     let good = (Quality::GOOD, [0, 0]);
     let fault = (Quality::DEVICE_FAULT, [1, 0]);
-    assert_eq!(of(0, 0, 0), good);
+    assert_eq!(flags(0, 0, 0), good);
     // Less accuracy, and not known.
-    assert_eq!(of(0x55, 0x55, 0x55), good);
-    assert_eq!(of(0xFF, 0xFF, 0xFF), good);
+    assert_eq!(flags(0x55, 0x55, 0x55), good);
+    assert_eq!(flags(0xFF, 0xFF, 0xFF), good);
     for bit in [0, 2, 4, 6] {
         let error = 2 << bit;
-        assert_eq!(of(0, error, 0), if bit < 6 { fault } else { good }, "{bit}");
-        assert_eq!(of(0, 0, error), if bit < 6 { fault } else { good }, "{bit}");
+        assert_eq!(
+            flags(0, error, 0),
+            if bit < 6 { fault } else { good },
+            "{bit}"
+        );
+        assert_eq!(
+            flags(0, 0, error),
+            if bit < 6 { fault } else { good },
+            "{bit}"
+        );
         // Pitch and roll; the others say how they are compensated.
         let of_angle = matches!(bit, 2 | 6);
         assert_eq!(
-            of(error, 0, 0),
+            flags(error, 0, 0),
             if of_angle { fault } else { good },
             "{bit}"
         );
@@ -180,7 +188,7 @@ fn a_merit_of_two_is_a_fault() {
 
 #[test]
 fn a_rate_at_its_limit_is_saturated() {
-    let of = |[a, b, c]: [&str; 3], merits: u8| {
+    let flags = |[a, b, c]: [&str; 3], merits: u8| {
         quality(
             "00007D00007DCC00",
             "007D007D007DBF00",
@@ -190,15 +198,18 @@ fn a_rate_at_its_limit_is_saturated() {
     let at = |axis, end| Quality::GOOD.with_saturation(axis, end);
     let (high, low) = (Saturation::High, Saturation::Low);
     // 64000 is 250 deg/s; the order is y, x, z.
-    assert_eq!(of(["0000", "007D", "007D"], 0x3F), (at(4, low), [0, 1]));
-    assert_eq!(of(["007D", "00FA", "007D"], 0x3F), (at(3, high), [0, 1]));
-    assert_eq!(of(["007D", "007D", "FFFA"], 0x3F), (at(5, high), [0, 1]));
-    assert_eq!(of(["FFF9", "0100", "FFF9"], 0x3F), (Quality::GOOD, [0, 0]));
+    assert_eq!(flags(["0000", "007D", "007D"], 0x3F), (at(4, low), [0, 1]));
+    assert_eq!(flags(["007D", "00FA", "007D"], 0x3F), (at(3, high), [0, 1]));
+    assert_eq!(flags(["007D", "007D", "FFFA"], 0x3F), (at(5, high), [0, 1]));
+    assert_eq!(
+        flags(["FFF9", "0100", "FFF9"], 0x3F),
+        (Quality::GOOD, [0, 0])
+    );
     // OpenIMU335RI calls a limited axis an error: it is saturated. Another is a fault.
-    assert_eq!(of(["0000", "007D", "007D"], 0x02), (at(4, low), [0, 1]));
-    assert_eq!(of(["007D", "00FA", "007D"], 0x08), (at(3, high), [0, 1]));
+    assert_eq!(flags(["0000", "007D", "007D"], 0x02), (at(4, low), [0, 1]));
+    assert_eq!(flags(["007D", "00FA", "007D"], 0x08), (at(3, high), [0, 1]));
     let both = at(3, high) | Quality::DEVICE_FAULT;
-    assert_eq!(of(["007D", "00FA", "007D"], 0x02), (both, [1, 1]));
+    assert_eq!(flags(["007D", "00FA", "007D"], 0x02), (both, [1, 1]));
 }
 
 #[test]
@@ -326,13 +337,13 @@ fn disturbed(without: &[&str], late: Option<(&str, f64)>) -> Vec<Frame> {
 fn numbers(frames: &[Frame]) -> (Vec<i64>, Vec<bool>, u32) {
     let (readings, faults) = decode(&mut *listener("openimu", ALL, &[]), frames);
     let (mut read, mut gaps) = (Vec::new(), Vec::new());
-    for output in &readings {
+    for stamped in &readings {
         let Imu {
             proper_acceleration,
             angular_velocity,
             orientation,
             ..
-        } = imu(output);
+        } = imu(stamped);
         // The nose's height is the sine of the pitch.
         let pitch = turned(orientation, [1.0, 0.0, 0.0])[2].asin() / DEGREE;
         let all = [
@@ -347,7 +358,7 @@ fn numbers(frames: &[Frame]) -> (Vec<i64>, Vec<bool>, u32) {
             "a reading of two periods: {all:?}"
         );
         read.push(all[0]);
-        gaps.push(output.quality.contains(Quality::GAP_BEFORE));
+        gaps.push(stamped.quality.contains(Quality::GAP_BEFORE));
     }
     (read, gaps, count(&faults, Counter::Unpaired))
 }

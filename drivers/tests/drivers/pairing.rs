@@ -44,9 +44,9 @@ fn numbers_at(period_us: i64, frames: &[Frame]) -> (Vec<u16>, Vec<bool>, u32) {
     let (readings, faults) = decode(&mut *listener("icub_strain", &keys, &[]), frames);
     let numbers = readings
         .iter()
-        .map(|output| {
-            let Reading::Wrench(wrench) = output.reading else {
-                panic!("{output:?}")
+        .map(|stamped| {
+            let Reading::Wrench(wrench) = stamped.reading else {
+                panic!("{stamped:?}")
             };
             assert_eq!(wrench.force, wrench.torque, "halves of two readings");
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
@@ -56,7 +56,7 @@ fn numbers_at(period_us: i64, frames: &[Frame]) -> (Vec<u16>, Vec<bool>, u32) {
         .collect();
     let gaps = readings
         .iter()
-        .map(|output| output.quality.contains(Quality::GAP_BEFORE))
+        .map(|stamped| stamped.quality.contains(Quality::GAP_BEFORE))
         .collect();
     (numbers, gaps, count(&faults, Counter::Unpaired))
 }

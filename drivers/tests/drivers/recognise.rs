@@ -337,28 +337,31 @@ fn own(heard: &Traffic, row: &Row) -> Option<Finding> {
             assert!(heard.stream(explained.id).is_some(), "{finding:?}");
         }
     }
-    let own = findings
+    let found = findings
         .iter()
         .find(|f| (f.driver, f.address) == (driver, address));
-    let own = own.cloned();
+    let found = found.cloned();
     for other in findings {
-        let sure = own.as_ref().and_then(Finding::certainty);
+        let sure = found.as_ref().and_then(Finding::certainty);
         let is_other = (other.driver, other.address) != (driver, address);
         assert!(
             !is_other || other.certainty() <= sure,
-            "{row:?} is rather {other:?}\nthan {own:?}"
+            "{row:?} is rather {other:?}\nthan {found:?}"
         );
     }
-    own
+    found
 }
 
 #[test]
 fn every_board_is_recognised_by_listening_to_it() {
     for row in BOARDS {
         let heard = overheard(row);
-        let own = own(&heard, row).unwrap_or_else(|| panic!("{row:?} is not found"));
-        assert!(own.certainty() >= Some(Certainty::Likely), "{own:?}");
-        assert_eq!(own.unusable, "");
+        let finding = own(&heard, row).unwrap_or_else(|| panic!("{row:?} is not found"));
+        assert!(
+            finding.certainty() >= Some(Certainty::Likely),
+            "{finding:?}"
+        );
+        assert_eq!(finding.unusable, "");
         // Nothing of what is heard of a board, and of its host, remains unknown, but for the SYNC
         // and for the settings that a J1939 host sends to a group.
         let by_host = |id: Id| match id {
@@ -370,12 +373,12 @@ fn every_board_is_recognised_by_listening_to_it() {
             .device(&spec(address, Mode::Listen, outputs))
             .expect("legal keys");
         for stream in heard.streams().filter(|stream| !by_host(stream.id)) {
-            let known = own.has(stream.id)
+            let known = finding.has(stream.id)
                 || claimed
                     .claims()
                     .iter()
                     .any(|claim| claim.matches(stream.id))
-                || own.commands.iter().any(|ids| ids.contains(&stream.id));
+                || finding.commands.iter().any(|ids| ids.contains(&stream.id));
             assert!(known, "{row:?}: {}", stream.id);
         }
     }
@@ -468,13 +471,16 @@ const MUTE: [&str; 1] = ["aidin_aft200"];
 #[test]
 fn every_board_is_recognised_by_asking_it() {
     for row in BOARDS {
-        let own = own(&asked(row), row);
+        let finding = own(&asked(row), row);
         if MUTE.contains(&row.0) {
-            assert_eq!(own, None);
+            assert_eq!(finding, None);
             continue;
         }
-        let own = own.unwrap_or_else(|| panic!("{row:?} is not found"));
-        assert!(own.certainty() >= Some(Certainty::Likely), "{own:?}");
+        let finding = finding.unwrap_or_else(|| panic!("{row:?} is not found"));
+        assert!(
+            finding.certainty() >= Some(Certainty::Likely),
+            "{finding:?}"
+        );
     }
 }
 

@@ -54,8 +54,8 @@ fn a_board_is_read_by_the_drivers_of_its_type() {
         ("18", "amcfoc2c", &["icub_motor"]),
         ("77", "of the future", &[]),
     ] {
-        let told = format!("7E0#FF{board}020008");
-        let findings = found(&[(&told, 0.0)]);
+        let answer = format!("7E0#FF{board}020008");
+        let findings = found(&[(&answer, 0.0)]);
         let mut names: Vec<&str> = findings.iter().map(|finding| finding.driver).collect();
         names.sort_unstable();
         assert_eq!(names, drivers, "{name}");

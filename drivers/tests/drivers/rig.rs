@@ -2,8 +2,8 @@
 //! frames.
 
 use proprio_drivers::{
-    Board, Decoded, Device, Fault, Format, Frame, Frames, Id, Mode, NotSent, Options, Output,
-    Outputs, Spec, SpecError, State,
+    Board, Decoded, Device, Fault, Format, Frame, Frames, Id, Mode, NotSent, Options, Outputs,
+    Spec, SpecError, StampedReading, State,
 };
 use proprio_topics::{
     Actuator, Counter, Imu, JointState, Nanos, Quality, Reading, StampKind, Wrench,
@@ -100,7 +100,10 @@ pub(crate) fn frame(text: &str, ms: f64) -> Frame {
 }
 
 /// The readings and faults decoded from `frames`, in order.
-pub(crate) fn decode(device: &mut dyn Device, frames: &[Frame]) -> (Vec<Output>, Vec<Fault>) {
+pub(crate) fn decode(
+    device: &mut dyn Device,
+    frames: &[Frame],
+) -> (Vec<StampedReading>, Vec<Fault>) {
     let (mut readings, mut faults) = (Vec::new(), Vec::new());
     let mut out = Decoded::new();
     for frame in frames {
@@ -159,7 +162,7 @@ pub(crate) struct Rig {
     /// All frames that the host's interface sent, lost or not.
     pub(crate) sent: Vec<String>,
     pub(crate) received: usize,
-    pub(crate) readings: Vec<Output>,
+    pub(crate) readings: Vec<StampedReading>,
     pub(crate) faults: Vec<Fault>,
     /// The sequence of states, without repetition.
     pub(crate) states: Vec<State>,
@@ -304,20 +307,20 @@ impl Rig {
 }
 
 /// The states of joints among `readings`.
-pub(crate) fn joints(readings: &[Output]) -> Vec<(JointState, Quality)> {
+pub(crate) fn joints(readings: &[StampedReading]) -> Vec<(JointState, Quality)> {
     (readings.iter())
-        .filter_map(|output| match output.reading {
-            Reading::Joint(joint) if output.output == 0 => Some((joint, output.quality)),
+        .filter_map(|stamped| match stamped.reading {
+            Reading::Joint(joint) if stamped.output == 0 => Some((joint, stamped.quality)),
             _ => None,
         })
         .collect()
 }
 
 /// The temperatures among `readings`, with the numbers of their outputs.
-pub(crate) fn temperatures(readings: &[Output]) -> Vec<(u8, f64)> {
+pub(crate) fn temperatures(readings: &[StampedReading]) -> Vec<(u8, f64)> {
     (readings.iter())
-        .filter_map(|output| match output.reading {
-            Reading::Temperature(temperature) => Some((output.output, temperature.celsius)),
+        .filter_map(|stamped| match stamped.reading {
+            Reading::Temperature(temperature) => Some((stamped.output, temperature.celsius)),
             _ => None,
         })
         .collect()
@@ -407,8 +410,8 @@ pub(crate) fn joint(reading: &Reading) -> JointState {
     }
 }
 
-pub(crate) fn imu(output: &Output) -> Imu {
-    match output.reading {
+pub(crate) fn imu(stamped: &StampedReading) -> Imu {
+    match stamped.reading {
         Reading::Imu(imu) => imu,
         other => panic!("{other:?}"),
     }

@@ -4,7 +4,9 @@ use crate::rig::{
     Rig, board, count, decode, encode, frame, listener, options, reading, refused_at, shown_keys,
     spec, supervisor, texts, wrench,
 };
-use proprio_drivers::{Device, Format, Frame, Frames, Id, Mode, NotSent, Output, SpecError, State};
+use proprio_drivers::{
+    Device, Format, Frame, Frames, Id, Mode, NotSent, SpecError, StampedReading, State,
+};
 use proprio_topics::{Counter, Nanos, Quality, Reading, Saturation, StampKind, Wrench};
 use proptest::array::{uniform3, uniform6};
 use proptest::prelude::*;
@@ -28,17 +30,17 @@ fn paired(driver: &str, keys: &str, halves: &[(&str, f64)]) -> (Vec<(u16, bool)>
         })
         .collect();
     let (readings, faults) = decode(&mut *listener(driver, keys, &[]), &frames);
-    let of = |output: &Output| {
-        let Wrench { force, torque } = wrench(&output.reading);
+    let counted = |stamped: &StampedReading| {
+        let Wrench { force, torque } = wrench(&stamped.reading);
         let number = (torque[2] * 100.0).round();
         for k in 0..3 {
-            assert!(near(force[k], number, 0.1), "halves of two: {output:?}");
-            assert!(near(torque[k] * 100.0, number, 0.3), "{output:?}");
+            assert!(near(force[k], number, 0.1), "halves of two: {stamped:?}");
+            assert!(near(torque[k] * 100.0, number, 0.3), "{stamped:?}");
         }
-        let gap = output.quality.contains(Quality::GAP_BEFORE);
+        let gap = stamped.quality.contains(Quality::GAP_BEFORE);
         (number as u16, gap)
     };
-    let numbers = readings.iter().map(of).collect();
+    let numbers = readings.iter().map(counted).collect();
     (numbers, count(&faults, Counter::Unpaired))
 }
 
@@ -385,8 +387,8 @@ fn an_rft_that_streams_takes_no_other_command() {
     let done = |first: &str| vec![first.to_owned(), zeros.clone()];
     let set = answer("064#0F08000000000000");
     assert_eq!(set, (done("001#0F01000000000000"), None));
-    let wrong = answer("064#0F09000000000000");
-    assert_eq!(wrong, (done("001#0F00020000000000"), None));
+    let answered = answer("064#0F09000000000000");
+    assert_eq!(answered, (done("001#0F00020000000000"), None));
     let get = answer("064#1000000000000000");
     assert_eq!(get, (done("001#1008000000000000"), None));
     let ms = Some(Nanos::from_millis(1));
@@ -425,12 +427,12 @@ fn wrong_keys_of_an_rft_are_refused() {
     }
     for address in [0, 256] {
         let (least, most) = (1, 255);
-        let wrong = SpecError::Address {
+        let refused = SpecError::Address {
             address,
             least,
             most,
         };
-        assert_eq!(refused_at("robotous_rft", "", address), wrong);
+        assert_eq!(refused_at("robotous_rft", "", address), refused);
     }
     assert_eq!(options("robotous_rft", "").default_address(), Some(0x64));
 }
@@ -447,8 +449,8 @@ fn two_rfts_do_not_disturb_each_other() {
     let frames = RFT.map(|text| frame(&text.replacen("00", "0F", 1), 0.0));
     assert_eq!(decode(&mut *one, &frames).0.len(), 1);
     let claims = |device: &dyn Device| {
-        let of = |claim: &proprio_drivers::Claim| (claim.id, claim.exclusive);
-        device.claims().iter().map(of).collect::<Vec<_>>()
+        let key = |claim: &proprio_drivers::Claim| (claim.id, claim.exclusive);
+        device.claims().iter().map(key).collect::<Vec<_>>()
     };
     let ids = [0xF1, 0xF2].map(|id| (Id::standard(id), true));
     assert_eq!(claims(&*one), ids);
@@ -647,23 +649,23 @@ fn wrong_keys_of_an_aft_are_refused() {
         ("id_force = 0x800", "id_force", 2048.0, "from 0 to 0x7FF"),
         ("id_torque = 0x800", "id_torque", 2048.0, "from 0 to 0x7FF"),
     ] {
-        let wrong = SpecError::Key {
+        let refused = SpecError::Key {
             key,
             value,
             expected,
         };
-        assert_eq!(refused_at("aidin_aft200", keys, 1), wrong);
+        assert_eq!(refused_at("aidin_aft200", keys, 1), refused);
     }
     let same = refused_at("aidin_aft200", "id_force = 2", 1);
     assert!(matches!(same, SpecError::Keys { .. }), "{same:?}");
     for address in [0, 255] {
         let (least, most) = (1, 254);
-        let wrong = SpecError::Address {
+        let refused = SpecError::Address {
             address,
             least,
             most,
         };
-        assert_eq!(refused_at("aidin_aft200", "", address), wrong);
+        assert_eq!(refused_at("aidin_aft200", "", address), refused);
     }
     let shown = shown_keys(include_str!(
         "../../../docs/book/src/devices/aidin_aft200.md"

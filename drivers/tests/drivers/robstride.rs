@@ -7,7 +7,7 @@ use crate::rig::{
     texts,
 };
 use proprio_drivers::State;
-use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, Output};
+use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, StampedReading};
 use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Temperature};
 use proptest::prelude::*;
 use std::f64::consts::{PI, TAU};
@@ -26,9 +26,9 @@ fn motor(keys: &str, address: u32, mode: Mode) -> Box<dyn Device> {
 }
 
 /// Modes and faults.
-fn told(readings: &[Output]) -> Vec<(u32, u32)> {
+fn actuators(readings: &[StampedReading]) -> Vec<(u32, u32)> {
     (readings.iter())
-        .filter_map(|output| match output.reading {
+        .filter_map(|stamped| match stamped.reading {
             Reading::Actuator(actuator) => Some((actuator.mode, actuator.faults)),
             _ => None,
         })
@@ -96,7 +96,7 @@ fn frames_are_read_as_other_programs_read_them() {
                 assert!(joint.current.is_nan() && joint.acceleration.is_nan());
                 let faults: u32 = faults.parse().unwrap();
                 assert_eq!(
-                    told(&readings),
+                    actuators(&readings),
                     [(mode.parse().unwrap(), faults << 24)],
                     "{line}"
                 );
@@ -165,7 +165,7 @@ fn faults_hold_until_they_are_over() {
     let mut read = |frame: Frame| {
         let (readings, _) = decode(&mut *device, &[frame]);
         (
-            told(&readings),
+            actuators(&readings),
             joints(&readings).first().map(|(_, quality)| *quality),
         )
     };
@@ -272,7 +272,7 @@ fn answers_and_states_are_not_mixed() {
     let mut device = motor(ASKED, 1, Mode::Listen);
     let (readings, _) = decode(&mut *device, &[state]);
     assert!(joints(&readings).is_empty());
-    assert_eq!(told(&readings), [(2, 0x1000_0000)]);
+    assert_eq!(actuators(&readings), [(2, 0x1000_0000)]);
     assert_eq!(temperatures(&readings), [(1, 32.0)]);
     let frames = [
         answer("1B70", 3.0, 1.0),
@@ -333,7 +333,7 @@ fn the_mit_protocol_has_its_own_frames() {
         qualities,
         [Quality::GOOD, Quality::DEVICE_FAULT, Quality::GOOD]
     );
-    assert_eq!(told(&readings), [(0, 0), (0, 0x80), (0, 0)]);
+    assert_eq!(actuators(&readings), [(0, 0), (0, 0x80), (0, 0)]);
     assert_eq!(temperatures(&readings), [(1, 32.0)]);
 }
 
@@ -424,8 +424,8 @@ fn a_simulated_motor_sends_what_it_is_given() {
     );
     assert_eq!(send(0, &low, both), ["028C01FD#00000000000000FA"]);
     // A fault of that kind stays as it was told.
-    let told = ["150001FD#0001000000000000"];
-    assert_eq!(send(0, &actuator(1, 0x0100_0100), good), told);
+    let report = ["150001FD#0001000000000000"];
+    assert_eq!(send(0, &actuator(1, 0x0100_0100), good), report);
     assert_eq!(
         send(0, &low, Quality::DRIVE_FAULT),
         ["024101FD#00000000000000FA"]

@@ -97,8 +97,8 @@ fn triangles_are_paired_apart() {
 fn a_gap_is_that_of_its_triangle() {
     let mut device = listener("icub_skin", "", &[]);
     let both = |triangle: u8, ms: f64| {
-        let of = |text: &str, ms| frame(&text.replace("415", &format!("41{triangle:X}")), ms);
-        [of(FIRST, ms), of(SECOND, ms + 0.2)]
+        let part = |text: &str, ms| frame(&text.replace("415", &format!("41{triangle:X}")), ms);
+        [part(FIRST, ms), part(SECOND, ms + 0.2)]
     };
     let mut frames: Vec<Frame> = Vec::new();
     for (ms, used) in [
@@ -114,10 +114,11 @@ fn a_gap_is_that_of_its_triangle() {
     }
     let (readings, _) = decode(&mut *device, &frames);
     let gaps = |wanted: u32| -> Vec<bool> {
-        let own = readings
+        let wanted_readings = readings
             .iter()
             .filter(|r| skin(&r.reading).triangle == wanted);
-        own.map(|r| r.quality.contains(Quality::GAP_BEFORE))
+        wanted_readings
+            .map(|r| r.quality.contains(Quality::GAP_BEFORE))
             .collect()
     };
     assert_eq!(gaps(5), [false; 5]);

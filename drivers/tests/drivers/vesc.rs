@@ -6,7 +6,7 @@ use crate::rig::{
     takes_eight_bytes, temperatures, texts,
 };
 use proprio_drivers::State;
-use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, Output};
+use proprio_drivers::{Claim, Device, EncodeError, Frame, Frames, Id, Mode, StampedReading};
 use proprio_topics::{Actuator, Counter, JointState, Nanos, Quality, Reading, Temperature};
 use proptest::prelude::*;
 use std::f64::consts::TAU;
@@ -68,11 +68,11 @@ fn frames_of_the_firmware_are_read() {
                 panic!("{line}: {readings:?}");
             };
             assert!(near(told.duty, duty, 1e-3) && told.faults == 0, "{line}");
-            let told = temperatures(&readings);
-            assert!(told[0].0 == 2 && near(told[0].1, fet, 0.1), "{line}");
+            let warmth = temperatures(&readings);
+            assert!(warmth[0].0 == 2 && near(warmth[0].1, fet, 0.1), "{line}");
             // Motor -87.1: a thermometer that is not there.
-            assert_eq!(told.len(), if motor < -40.0 { 1 } else { 2 }, "{line}");
-            if let Some(&(output, celsius)) = told.get(1) {
+            assert_eq!(warmth.len(), if motor < -40.0 { 1 } else { 2 }, "{line}");
+            if let Some(&(output, celsius)) = warmth.get(1) {
                 assert!(output == 1 && near(celsius, motor, 0.1), "{line}");
             }
         }
@@ -197,7 +197,7 @@ fn nothing_is_sent() {
     rig.board_loses = Box::new(|_, _| false);
     let before = rig.readings.len();
     rig.run(100);
-    let is_gap = |output: &&Output| output.quality.contains(Quality::GAP_BEFORE);
+    let is_gap = |stamped: &&StampedReading| stamped.quality.contains(Quality::GAP_BEFORE);
     assert_eq!(rig.readings[before..].iter().filter(is_gap).count(), 1);
     rig.device.stop(rig.now);
     rig.run(10);
@@ -293,8 +293,8 @@ proptest! {
                 position: p, velocity: v, current: i, ..JointState::ABSENT
             };
             let mut board = board("vesc", keys, &[0]);
-            let told = Actuator { duty, mode: 0, encoder: 0, faults: 0 };
-            encode(&mut *board, 0, &Reading::Actuator(told), Quality::GOOD);
+            let actuator = Actuator { duty, mode: 0, encoder: 0, faults: 0 };
+            encode(&mut *board, 0, &Reading::Actuator(actuator), Quality::GOOD);
             let frames = encode(&mut *board, 0, &Reading::Joint(state), Quality::GOOD);
             let (readings, faults) = decode(&mut *listener("vesc", keys, &[0]), &frames);
             prop_assert!(faults.is_empty());

@@ -54,12 +54,15 @@ fn the_messages_of_a_sample_are_one_reading() {
     let (readings, faults) = decode(&mut *listener("xsens_mti", EVERYTHING, &[]), &sent);
     assert!(faults.is_empty(), "{faults:?}");
     assert_eq!(readings.len(), 1);
-    let output = &readings[0];
-    assert_eq!((output.acquired, output.stamp), (sent[0].t, sent[0].stamp));
-    assert_eq!(output.quality, Quality::DEVICE_COUNTER);
-    assert_eq!(output.device_counter, 0x1234);
-    assert_eq!(output.device_time, Nanos::from_micros(123_456_789 * 100));
-    let imu = imu(output);
+    let stamped = &readings[0];
+    assert_eq!(
+        (stamped.acquired, stamped.stamp),
+        (sent[0].t, sent[0].stamp)
+    );
+    assert_eq!(stamped.quality, Quality::DEVICE_COUNTER);
+    assert_eq!(stamped.device_counter, 0x1234);
+    assert_eq!(stamped.device_time, Nanos::from_micros(123_456_789 * 100));
+    let imu = imu(stamped);
     assert_eq!(imu.angular_velocity, [1.5, -2.25, 34.5]);
     assert_eq!(imu.proper_acceleration, [9.8125, -0.25, -98.5]);
     for (value, units) in imu
@@ -216,7 +219,7 @@ fn a_full_output_buffer_is_a_gap() {
     ]);
     let (readings, faults) = decode(&mut *device, &sent);
     let gaps: Vec<bool> = (readings.iter())
-        .map(|output| output.quality.contains(Quality::GAP_BEFORE))
+        .map(|stamped| stamped.quality.contains(Quality::GAP_BEFORE))
         .collect();
     assert_eq!(gaps, [false, true, false]);
     assert_eq!(count(&faults, Counter::DeviceFault), 1);
@@ -281,17 +284,17 @@ fn sequence(items: &[(&str, f64)]) -> Vec<Frame> {
 fn numbers(keys: &str, frames: &[Frame]) -> (Vec<u32>, Vec<bool>, u32, u32) {
     let (readings, faults) = decode(&mut *listener("xsens_mti", keys, &[]), frames);
     let mut read = (Vec::new(), Vec::new());
-    for output in &readings {
-        let imu = imu(output);
+    for stamped in &readings {
+        let imu = imu(stamped);
         let [rate, ..] = imu.angular_velocity.map(|value| value * 512.0);
         let [acceleration, ..] = imu.proper_acceleration.map(|value| value * 256.0);
         assert_eq!(rate, acceleration, "a reading of two samples");
-        if output.quality.contains(Quality::DEVICE_COUNTER) {
-            assert_eq!(rate, f64::from(output.device_counter));
+        if stamped.quality.contains(Quality::DEVICE_COUNTER) {
+            assert_eq!(rate, f64::from(stamped.device_counter));
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         read.0.push(rate as u32);
-        read.1.push(output.quality.contains(Quality::GAP_BEFORE));
+        read.1.push(stamped.quality.contains(Quality::GAP_BEFORE));
     }
     let [dropped, lost] = [Counter::Unpaired, Counter::Lost].map(|c| count(&faults, c));
     (read.0, read.1, dropped, lost)
@@ -356,25 +359,25 @@ fn a_message_that_is_missing_costs_its_sample_and_the_next() {
 
 #[test]
 fn a_pair_without_a_counter_is_never_of_two_samples() {
-    let of = |without: &[&str], late| {
+    let read_without = |without: &[&str], late| {
         let mut frames = disturbed(without, late);
         frames.retain(|frame| frame.id != Id::standard(6));
         numbers(UNCOUNTED, &frames)
     };
-    let (read, _, dropped, lost) = of(&[], None);
+    let (read, _, dropped, lost) = read_without(&[], None);
     assert_eq!((read.len(), dropped, lost), (9, 0, 0));
-    let (read, _, dropped, _) = of(&["G4"], None);
+    let (read, _, dropped, _) = read_without(&["G4"], None);
     assert_eq!(
         (read.as_slice(), dropped),
         (&[1, 2, 3, 5, 6, 7, 8, 9][..], 1)
     );
-    let (read, gaps, dropped, _) = of(&["A4"], None);
+    let (read, gaps, dropped, _) = read_without(&["A4"], None);
     assert_eq!((read.as_slice(), dropped), (&[1, 2, 3, 6, 7, 8, 9][..], 2));
     assert_eq!(gaps, [false, false, false, true, false, false, false]);
     // Acceleration 4 after angular velocity 5, and after both of sample 5.
-    let (read, _, dropped, _) = of(&[], Some(("A4", 5.015)));
+    let (read, _, dropped, _) = read_without(&[], Some(("A4", 5.015)));
     assert_eq!((read.as_slice(), dropped), (&[1, 2, 3, 6, 7, 8, 9][..], 2));
-    let (read, _, _, _) = of(&["A5"], Some(("A4", 5.015)));
+    let (read, _, _, _) = read_without(&["A5"], Some(("A4", 5.015)));
     assert_eq!(read, [1, 2, 3, 6, 7, 8, 9]);
 }
 
@@ -441,7 +444,7 @@ fn the_counter_and_the_time_overflow() {
         ACCELERATION, // the clock has started again
     ]);
     let (readings, faults) = decode(&mut *device, &sent);
-    let times: Vec<Nanos> = readings.iter().map(|output| output.device_time).collect();
+    let times: Vec<Nanos> = readings.iter().map(|stamped| stamped.device_time).collect();
     let overflow = 1_i64 << 32;
     assert_eq!(
         times,
@@ -449,14 +452,14 @@ fn the_counter_and_the_time_overflow() {
     );
     let counters: Vec<u32> = readings
         .iter()
-        .map(|output| output.device_counter)
+        .map(|stamped| stamped.device_counter)
         .collect();
     assert_eq!(counters, [0xFFFF, 0, 3, 4]);
     assert_eq!(count(&faults, Counter::Lost), 2);
     assert_eq!(count(&faults, Counter::Unexpected), 1);
     assert_eq!(count(&faults, Counter::Unpaired), 0);
     let gaps: Vec<bool> = (readings.iter())
-        .map(|output| output.quality.contains(Quality::GAP_BEFORE))
+        .map(|stamped| stamped.quality.contains(Quality::GAP_BEFORE))
         .collect();
     assert_eq!(gaps, [false, false, true, false]);
 }
@@ -479,7 +482,7 @@ fn a_restart_begins_anew() {
     ];
     let (readings, _) = decode(&mut *device, &frames(&sent.concat()));
     let times: Vec<i64> = (readings.iter())
-        .map(|output| output.device_time.0 / 1000)
+        .map(|stamped| stamped.device_time.0 / 1000)
         .collect();
     assert_eq!(times, [0x6000_0000, 0, 0x6000_0000, 0xC000_0000]);
     decode(&mut *device, &frames(&["005#C0000001", "006#0009"]));

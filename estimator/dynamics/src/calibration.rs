@@ -141,10 +141,10 @@ impl Calibration {
     #[must_use]
     pub fn then(&self, e: &Matrix6<f64>, more: &Wrench, reference: Option<f64>) -> Self {
         let change = Matrix6::identity() + e;
-        let own = change * Vector6::from(self.per_kelvin.torque_first());
+        let drift = change * Vector6::from(self.per_kelvin.torque_first());
         Self::new(
             change * self.gain,
-            wrench(&own) + *more,
+            wrench(&drift) + *more,
             self.reference.or(reference),
         )
     }

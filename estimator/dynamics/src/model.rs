@@ -532,20 +532,20 @@ pub enum ModelError {
     #[error("the URDF has no link: nothing in its <robot> is a <link>")]
     NoLinks,
     /// Two links or two joints of one name.
-    #[error("{place}: the {kind} on line {first} has the same name; rename one of them")]
+    #[error("{location}: the {kind} on line {first} has the same name; rename one of them")]
     Duplicate {
         /// The second one.
-        place: Location,
+        location: Location,
         /// `link` or `joint`.
         kind: &'static str,
         /// The line of the first one.
         first: usize,
     },
     /// An element or an attribute that is needed and is not there.
-    #[error("{place}: {what} has no {missing}{}; {remedy}", instead(.there))]
+    #[error("{location}: {what} has no {missing}{}; {remedy}", instead(.there))]
     Missing {
         /// The link or joint.
-        place: Location,
+        location: Location,
         /// The element that lacks it, such as `<axis>`.
         what: String,
         /// What it lacks: `xyz`, or `<mass>`.
@@ -556,10 +556,10 @@ pub enum ModelError {
         remedy: &'static str,
     },
     /// An attribute that is needed and is empty.
-    #[error("{place}: {what} has an empty {attribute}; {remedy}")]
+    #[error("{location}: {what} has an empty {attribute}; {remedy}")]
     Empty {
         /// The link or joint.
-        place: Location,
+        location: Location,
         /// Its element, such as `its <axis>`.
         what: String,
         /// The attribute.
@@ -569,20 +569,22 @@ pub enum ModelError {
     },
     /// An element or a value that xacro would replace.
     #[error(
-        "{place}: {what} is not expanded: the file is a xacro; expand it first (xacro FILE > \
+        "{location}: {what} is not expanded: the file is a xacro; expand it first (xacro FILE > \
          model.urdf)"
     )]
     Unexpanded {
         /// The link, the joint or the robot, at the element's line.
-        place: Location,
+        location: Location,
         /// The element, with the attribute if it is one.
         what: String,
     },
     /// A joint refers to a link that does not exist.
-    #[error("{place}: its {role} link {link} is not in the URDF; correct the name or add the link")]
+    #[error(
+        "{location}: its {role} link {link} is not in the URDF; correct the name or add the link"
+    )]
     UnknownLink {
         /// The joint.
-        place: Location,
+        location: Location,
         /// `parent` or `child`.
         role: &'static str,
         /// The name that no link has.
@@ -590,12 +592,12 @@ pub enum ModelError {
     },
     /// A link is the child of two joints.
     #[error(
-        "{place}: its child {link} is already the child of joint {first} (line {line}); loops \
+        "{location}: its child {link} is already the child of joint {first} (line {line}); loops \
          cannot be described, only trees: remove one of the joints"
     )]
     TwoParents {
         /// The second joint.
-        place: Location,
+        location: Location,
         /// The link.
         link: String,
         /// The first joint.
@@ -614,10 +616,10 @@ pub enum ModelError {
     #[error("{0}: the joints above it form a loop; only trees can be described: remove a joint")]
     Loop(Location),
     /// A number that cannot be parsed.
-    #[error("{place}: {element} {attribute}=\"{value}\" is not {expected}")]
+    #[error("{location}: {element} {attribute}=\"{value}\" is not {expected}")]
     Number {
         /// The owner of the element, at the element's line.
-        place: Location,
+        location: Location,
         /// The element, such as `<origin>`.
         element: String,
         /// The attribute.
@@ -629,11 +631,11 @@ pub enum ModelError {
     },
     /// NaN or infinity.
     #[error(
-        "{place}: {element} {attribute}=\"{value}\" is not finite; write the number that it is"
+        "{location}: {element} {attribute}=\"{value}\" is not finite; write the number that it is"
     )]
     NotFinite {
         /// The owner of the element, at the element's line.
-        place: Location,
+        location: Location,
         /// The element, such as `<origin>`.
         element: String,
         /// The attribute.
@@ -645,18 +647,18 @@ pub enum ModelError {
     #[error("{0}: its <axis> xyz is zero; write a direction, such as xyz=\"0 0 1\"")]
     ZeroAxis(Location),
     /// A joint of a type that is not supported.
-    #[error("{place}: type=\"{kind}\" {}", unsupported(.kind))]
+    #[error("{location}: type=\"{kind}\" {}", unsupported(.kind))]
     UnsupportedJoint {
         /// The joint.
-        place: Location,
+        location: Location,
         /// Its type.
         kind: String,
     },
     /// A joint that cannot follow another one as its `<mimic>` says.
-    #[error("{place}: its <mimic> joint=\"{follows}\" {reason}")]
+    #[error("{location}: its <mimic> joint=\"{follows}\" {reason}")]
     Mimic {
         /// The joint.
-        place: Location,
+        location: Location,
         /// The joint that it should follow.
         follows: String,
         /// Why it cannot, and what to do.
@@ -664,12 +666,12 @@ pub enum ModelError {
     },
     /// A body whose mass is negative.
     #[error(
-        "{place}: the mass is {mass} kg{}; a mass cannot be negative: correct the <mass>",
+        "{location}: the mass is {mass} kg{}; a mass cannot be negative: correct the <mass>",
         together(.with)
     )]
     NegativeMass {
         /// The link with the least mass, at its `<inertial>`.
-        place: Location,
+        location: Location,
         /// The mass of the body.
         mass: f64,
         /// The links that are fixed to it.
@@ -677,14 +679,14 @@ pub enum ModelError {
     },
     /// A body whose tensor of inertia is not positive semidefinite.
     #[error(
-        "{place}: the inertia is not positive semidefinite (least principal moment about the \
+        "{location}: the inertia is not positive semidefinite (least principal moment about the \
          centre of mass {least:.3e} kg m^2){}; no body has this inertia: correct ixx to izz of the \
          <inertia> (about the centre of mass, in kg m^2)",
         together(.with)
     )]
     InertiaNotPositive {
         /// The link with the least moment of its own, at its `<inertial>`.
-        place: Location,
+        location: Location,
         /// The least eigenvalue of the body's tensor [kg m^2].
         least: f64,
         /// The links that are fixed to it.
@@ -694,7 +696,7 @@ pub enum ModelError {
     #[error(
         "{}: the mass is unknown, because no <inertial> is there or in a link fixed to it; add one \
          (with mass 0 and inertia 0 if it is meant to be massless)",
-        .0.iter().map(|(place, joint)| format!("{place}, beyond joint {joint}"))
+        .0.iter().map(|(location, joint)| format!("{location}, beyond joint {joint}"))
             .collect::<Vec<_>>().join("; ")
     )]
     MissingInertial(Vec<(Location, String)>),

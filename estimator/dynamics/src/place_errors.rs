@@ -121,11 +121,11 @@ impl PlaceErrors {
             let rows = solver.contact_rows(other);
             for (i, (sum, row)) in self.contacts[other].iter_mut().zip(rows).enumerate() {
                 let axis = x_bf.rotation.column(i % 3).into_owned();
-                let own = match i < 3 {
+                let shift = match i < 3 {
                     true => Motion::translation(&axis),
                     false => Motion::rotation(&axis, &x_bf.translation),
                 };
-                *sum += variance(&if other == contact { *row - own } else { *row });
+                *sum += variance(&if other == contact { *row - shift } else { *row });
             }
         }
     }
@@ -145,11 +145,11 @@ impl PlaceErrors {
             return 0.0;
         };
         let moved = structure.moved_by(dof).iter();
-        let own = moved.filter(|moved| structure.subtree_of(**moved) == number);
+        let moved_here = moved.filter(|moved| structure.subtree_of(**moved) == number);
         let of_link = |moved: &usize| {
             variance(&covariance, &torque_motion(structure, solver, *moved, link)).sqrt()
         };
-        let sum: f64 = own.map(of_link).sum();
+        let sum: f64 = moved_here.map(of_link).sum();
         sum * sum
     }
 

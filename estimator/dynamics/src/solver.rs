@@ -554,15 +554,15 @@ impl Solver {
                 continue;
             }
             let (s, h) = (self.axes[link], self.torque_rows[link]);
-            let own = if place.sensors_below.contains(sensor) {
+            let part = if place.sensors_below.contains(sensor) {
                 h - s
             } else {
                 h
             };
             // What the sensor transmits has opposite signs on its two sides.
             let is_beyond = structure.places[child].subtree == place.subtree;
-            let own = if is_beyond { -own } else { own };
-            motion = Some(motion.map_or(own, |sum| sum + own));
+            let part = if is_beyond { -part } else { part };
+            motion = Some(motion.map_or(part, |sum| sum + part));
         }
         motion.map_or(0.0, |motion| {
             variance(structure, sensor, &self.sensor_poses[sensor], &motion)

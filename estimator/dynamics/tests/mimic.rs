@@ -338,11 +338,11 @@ fn a_joint_that_cannot_follow_says_where_and_why() {
     };
     // Other programs read it: it is a joint of its own, and so is not held by a mistake.
     let misspelt = HAND.replacen("<mimic joint=\"lead\"", "<mimic joint=\"led\"", 1);
-    let own = Model::from_urdf(&misspelt, &[]).unwrap();
-    assert!(own.dof("close").is_some());
-    assert_eq!(own.follows("cable"), Some("close"));
+    let model = Model::from_urdf(&misspelt, &[]).unwrap();
+    assert!(model.dof("close").is_some());
+    assert_eq!(model.follows("cable"), Some("close"));
     assert_eq!(
-        own.warnings()[0],
+        model.warnings()[0],
         "line 19: joint close: its <mimic> joint=\"led\" is not a joint of the URDF: it is taken \
          as a joint of its own, which is measured or in [locked]"
     );

@@ -734,14 +734,14 @@ fn sub_tree_regressors_hold_for_the_readings() {
                 let links = subtree.links().iter();
                 let sensors = subtree.sensors();
                 let contacts = subtree.contacts().iter();
-                let own: Vec<f64> = links
+                let values: Vec<f64> = links
                     .flat_map(|&link| &parameters[10 * link..10 * link + 10])
                     .chain(sensors.flat_map(|sensor| &offsets[6 * sensor..6 * sensor + 6]))
                     .chain(contacts.flat_map(|present| &unknowns[present.contact]))
                     .copied()
                     .collect();
                 for (row, measured) in subtree.measured().iter().enumerate() {
-                    let made = dot(subtree.row(row), &own);
+                    let made = dot(subtree.row(row), &values);
                     assert!(
                         (made - measured).abs() < NEAR * touch.size(),
                         "{what}: {made}, not {measured}"

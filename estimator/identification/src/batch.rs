@@ -285,7 +285,7 @@ impl Exclusion<'_, '_> {
         estimate: &NoiseAndMap,
     ) -> Result<Option<NoiseAndMap>, IdentifyError> {
         let before = self.undeclared.loads.clone();
-        let channels = self.measurement.channels_of(&load.units);
+        let channels = self.measurement.channels_of(&load.subtrees);
         self.undeclared.add_load(load);
         self.undeclared.mark(training_logs_mut(self.logs));
         let without = self.fit(Some(estimate.noise.clone()))?;
@@ -447,7 +447,7 @@ fn cross_validated_fit(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::observation::{Annotated, Observation, UnitSet};
+    use crate::dataset::observation::{Annotated, Observation, SubtreeSet};
     use crate::measurement::noise_model::NoiseModel;
     use crate::measurement::reduction::tests::{between_two_sensors, readings};
     use crate::training::SAMPLE_INSTANTS;
@@ -511,14 +511,14 @@ mod tests {
         let of_link = |link: &str| {
             let link =
                 (0..robot.model.link_count()).find(|&number| robot.model.link_name(number) == link);
-            let mut units = UnitSet::default();
-            units.insert(
+            let mut subtrees = SubtreeSet::default();
+            subtrees.insert(
                 robot
                     .structure
                     .subtree_of(link.expect("a link"))
                     .expect("its sub-tree"),
             );
-            units
+            subtrees
         };
         let channels_of = |link: &str| measurement.channels_of(&of_link(link));
         let thigh = channels_of("thigh");

@@ -64,8 +64,8 @@ impl Retention {
         }
         let mut own_residuals: Vec<Residuals> =
             map_segments(measurement, segments, |measurement, number, segment| {
-                let own = self.blocks.iter().filter(|block| block.segment == number);
-                residuals_of_folds(residuals(measurement, segment, &noise, &self.sets), own)
+                let blocks = self.blocks.iter().filter(|block| block.segment == number);
+                residuals_of_folds(residuals(measurement, segment, &noise, &self.sets), blocks)
             });
         let unknowns = measurement.unknowns();
         let seconds = &noise.seconds;
@@ -136,10 +136,10 @@ pub(crate) fn held_out(
     let cad_is_one = unknowns.parameters_without_cad().is_empty() && unknowns.joints.is_empty();
     for (fold, reduced) in reduced.chunks(segments.len()).enumerate() {
         let others: Information = added(reduced, unknowns.parameters());
-        let own = posterior(prior, unknowns, &others)?.fit(tau)?;
+        let fitted = posterior(prior, unknowns, &others)?.fit(tau)?;
         // As the parameters are reported.
-        let own = without_negative_rotors(prior, unknowns, &others, &own)?;
-        let both = [parameters_without_cad(unknowns, &others), own];
+        let fitted = without_negative_rotors(prior, unknowns, &others, &fitted)?;
+        let both = [parameters_without_cad(unknowns, &others), fitted];
         let of_others = blocks.iter().filter(|block| block.fold != fold);
         let instants = of_others.flat_map(|block| block.instants(segments));
         let friction = prediction::friction(measurement, instants, &both);
@@ -149,8 +149,8 @@ pub(crate) fn held_out(
         candidates.extend(judged.skip(usize::from(cad_is_known)));
         let last = candidates.len() - 1;
         pairs.push([if cad_is_known { 0 } else { last - 1 }, last]);
-        let [_, own] = both;
-        sets.push(own);
+        let [_, fitted] = both;
+        sets.push(fitted);
     }
     let errors = |segment: &LogSegment<'_>| {
         let log = PredictionError::of_fit(measurement, segment.instants);
@@ -255,13 +255,13 @@ fn residuals_of_folds<'a>(
     for block in blocks {
         folds[block.range.clone()].fill(block.fold);
     }
-    let own = |channel: usize| {
+    let channel_noise = |channel: usize| {
         (0..count)
             .map(|i| residuals.noise[folds[i]][channel][i])
             .collect()
     };
-    let own: Vec<Vec<f64>> = (0..residuals.measured.len()).map(own).collect();
-    residuals.noise = vec![own];
+    let noise: Vec<Vec<f64>> = (0..residuals.measured.len()).map(channel_noise).collect();
+    residuals.noise = vec![noise];
     for (range, block) in residuals.ranges.iter().zip(&mut residuals.nuisance) {
         let set = folds.get(range.start).copied().unwrap_or(0);
         block.x = block.x.columns(set, 1).into_owned();
@@ -280,19 +280,20 @@ fn retained_fraction(
     let mut share = vec![0.0; links.len() + extra.len()];
     let mut findings = Vec::new();
     for group in links.iter().copied().collect::<BTreeSet<usize>>() {
-        let own = sums.iter().zip(&groups.channels);
-        let own = own.filter(|(_, g)| **g == group);
-        let (cross, square) = own.fold((0.0, 0.0), |sum, (own, _)| (sum.0 + own.0, sum.1 + own.1));
+        let group_sums = sums.iter().zip(&groups.channels);
+        let group_sums = group_sums.filter(|(_, g)| **g == group);
+        let (cross, square) =
+            group_sums.fold((0.0, 0.0), |sum, (own, _)| (sum.0 + own.0, sum.1 + own.1));
         let retained_fraction = if square > 0.0 {
             (cross / square).clamp(0.0, 1.0)
         } else {
             0.0
         };
         if retained_fraction < 1.0 {
-            let own = unknowns.links.iter().zip(links);
-            let own = own.filter(|(_, g)| **g == group);
+            let members = unknowns.links.iter().zip(links);
+            let members = members.filter(|(_, g)| **g == group);
             let model = &measurement.robot().model;
-            let names: Vec<&str> = own.map(|(link, _)| model.link_name(*link)).collect();
+            let names: Vec<&str> = members.map(|(link, _)| model.link_name(*link)).collect();
             findings.push(shrunk(retained_fraction, names.join(", ")));
         }
         let all = share.iter_mut().zip(links.iter().chain(extra));

@@ -95,7 +95,7 @@ impl Dataset {
         Ok(Self {
             name: name.to_owned(),
             role,
-            instants: recording.instants(robot),
+            instants: recording.observations(robot),
             apart: (recording.is_stamped() && spacing > robot.max_silence).then_some(spacing),
             findings: recording.findings,
         })

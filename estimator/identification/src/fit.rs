@@ -117,13 +117,13 @@ pub(crate) fn parameters_without_cad(
     let (r, z) = information.to_triangle();
     let (rows, precision) = (r.nrows(), &unknowns.precision);
     while !columns.is_empty() {
-        let mut own = r
+        let mut system = r
             .select_columns(&columns)
             .resize_vertically(rows + columns.len(), 0.0);
-        for (place, &column) in columns.iter().enumerate() {
-            own[(rows + place, place)] = precision[column - unknowns.inertial()].sqrt();
+        for (index, &column) in columns.iter().enumerate() {
+            system[(rows + index, index)] = precision[column - unknowns.inertial()].sqrt();
         }
-        let qr = own.qr();
+        let qr = system.qr();
         let right = qr
             .q()
             .tr_mul(&z.clone().resize_vertically(rows + columns.len(), 0.0));
@@ -147,8 +147,8 @@ pub(crate) fn parameters_without_cad(
 }
 
 fn is_rotor(unknowns: &Unknowns, column: usize) -> bool {
-    let place = column.checked_sub(unknowns.inertial());
-    let extra = place.and_then(|place| unknowns.extra.get(place));
+    let index = column.checked_sub(unknowns.inertial());
+    let extra = index.and_then(|index| unknowns.extra.get(index));
     matches!(extra, Some(ExtraParameter::RotorInertia(_)))
 }
 
@@ -172,7 +172,7 @@ pub(crate) fn without_negative_rotors(
         let precision: Vec<f64> = of_kept
             .map(|column| precision[column - unknowns.inertial()])
             .collect();
-        let own = Posterior::new(
+        let refit = Posterior::new(
             prior,
             &unknowns.links,
             &r.select_columns(&keep),
@@ -181,7 +181,7 @@ pub(crate) fn without_negative_rotors(
         )?
         .fit(fit.tau)?;
         x = DVector::zeros(unknowns.parameters());
-        for (&column, value) in keep.iter().zip(&own.x) {
+        for (&column, value) in keep.iter().zip(&refit.x) {
             x[column] = *value;
         }
     }
@@ -330,10 +330,10 @@ fn gain_precision(robot: &Robot, unknowns: &Unknowns, fit: &MapEstimate) -> Vec<
     let root = fit.covariance_root();
     let (mut square, mut gamma) = (1.0, 1.0);
     let extra = unknowns.extra.iter().enumerate();
-    for (place, extra) in extra.filter(|(_, own)| is_gain(own)) {
-        let column = unknowns.inertial() + place;
+    for (index, extra) in extra.filter(|(_, own)| is_gain(own)) {
+        let column = unknowns.inertial() + index;
         square += fit.x[column].powi(2) * extra.precision(robot);
-        gamma += (1.0 - root.row(column).norm_squared() * precision[place]).max(0.0);
+        gamma += (1.0 - root.row(column).norm_squared() * precision[index]).max(0.0);
     }
     let scale = (square / gamma).sqrt().clamp(SCALE.0, SCALE.1);
     for (precision, extra) in precision.iter_mut().zip(&unknowns.extra) {
@@ -397,9 +397,9 @@ pub(crate) fn link_inertias(
     d: &DVector<f64>,
 ) -> Vec<RigidInertia> {
     let mut inertias = robot.model.inertias().to_vec();
-    for (place, &link) in unknowns.links.iter().enumerate() {
+    for (index, &link) in unknowns.links.iter().enumerate() {
         let mut phi = inertias[link].parameters();
-        for (value, change) in phi.iter_mut().zip(d.rows(10 * place, 10).iter()) {
+        for (value, change) in phi.iter_mut().zip(d.rows(10 * index, 10).iter()) {
             *value += change;
         }
         inertias[link] = RigidInertia::from_parameters(&phi);

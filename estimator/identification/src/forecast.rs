@@ -160,12 +160,12 @@ fn prior(robot: &Robot, measurement: &MeasurementModel<'_>) -> Result<DMatrix<f6
     let unknowns = measurement.unknowns();
     let prior = Prior::new(robot.model.inertias())?.with_roughly(robot.urdf_relative_std);
     let mut root = DMatrix::zeros(unknowns.parameters(), unknowns.parameters());
-    for (place, &link) in unknowns.links.iter().enumerate() {
+    for (index, &link) in unknowns.links.iter().enumerate() {
         let factor = prior.metric(link).cholesky().map(|factor| factor.l());
-        let own = factor.unwrap_or_default().transpose() / (SQRT_2 * prior.expected_tau());
-        let at = LINK_PARAMETERS * place;
+        let block = factor.unwrap_or_default().transpose() / (SQRT_2 * prior.expected_tau());
+        let at = LINK_PARAMETERS * index;
         root.view_mut((at, at), (LINK_PARAMETERS, LINK_PARAMETERS))
-            .copy_from(&own);
+            .copy_from(&block);
     }
     for (precision, column) in unknowns.precision.iter().zip(unknowns.inertial()..) {
         root[(column, column)] = precision.sqrt();
@@ -184,9 +184,9 @@ fn with_known(
     let mut columns = Vec::new();
     for (row, column) in known.columns.iter().enumerate() {
         if let ParameterColumn::Inertial { link, parameter } = *column
-            && let Ok(place) = unknowns.links.binary_search(&link)
+            && let Ok(index) = unknowns.links.binary_search(&link)
         {
-            columns.push((row, LINK_PARAMETERS * place + parameter));
+            columns.push((row, LINK_PARAMETERS * index + parameter));
         }
     }
     for (row, &(sensor, unknown)) in known.calibrations.iter().enumerate() {
@@ -194,13 +194,13 @@ fn with_known(
         columns.extend(column.map(|column| (known.columns.len() + row, column)));
     }
     let rows: Vec<usize> = columns.iter().map(|(row, _)| *row).collect();
-    let mut own = known.root.select_rows(&rows);
+    let mut root = known.root.select_rows(&rows);
     // In units of the deviations, which differ by orders of magnitude.
-    let deviations: Vec<f64> = own.row_iter().map(|row| row.norm()).collect();
-    for (mut row, deviation) in own.row_iter_mut().zip(&deviations) {
+    let deviations: Vec<f64> = root.row_iter().map(|row| row.norm()).collect();
+    for (mut row, deviation) in root.row_iter_mut().zip(&deviations) {
         row /= *deviation;
     }
-    let inverse = own.transpose().qr().r().transpose().try_inverse();
+    let inverse = root.transpose().qr().r().transpose().try_inverse();
     let inverse = inverse.filter(|inverse| inverse.iter().all(|x| x.is_finite()))?;
     let before = prior.nrows();
     // A parameter's rows of the prior are those of its link, all of which is known.

@@ -28,20 +28,20 @@ pub(crate) fn map_with<S, T: Send>(
         .map_or(1, usize::from)
         .min(count);
     if threads < 2 || AT_WORK.get() {
-        let mut own = make();
-        return (0..count).map(|number| work(&mut own, number)).collect();
+        let mut state = make();
+        return (0..count).map(|number| work(&mut state, number)).collect();
     }
     let results: Vec<Mutex<Option<T>>> = (0..count).map(|_| Mutex::new(None)).collect();
     let next = AtomicUsize::new(0);
     let run = || {
         AT_WORK.set(true);
-        let mut own = make();
+        let mut state = make();
         loop {
             let number = next.fetch_add(1, Ordering::Relaxed);
             let Some(result) = results.get(number) else {
                 break;
             };
-            let done = work(&mut own, number);
+            let done = work(&mut state, number);
             if let Ok(mut result) = result.lock() {
                 *result = Some(done);
             }
@@ -75,10 +75,10 @@ mod tests {
     #[test]
     fn nested_calls_run_on_the_same_thread() {
         let threads = map(8, |_| {
-            let own = std::thread::current().id();
+            let caller = std::thread::current().id();
             map(8, |_| std::thread::current().id())
                 .iter()
-                .all(|id| *id == own)
+                .all(|id| *id == caller)
         });
         assert_eq!(threads, [true; 8]);
         // Afterwards all cores are free again.

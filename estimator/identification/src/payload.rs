@@ -94,8 +94,8 @@ pub fn payload(
         ControlFlow::Break(outcome) => return Err(PayloadError::Unusable(reason(*outcome))),
     };
     let unknowns = measurement.unknowns();
-    let place = unknowns.links.iter().position(|link| *link == frame.link);
-    let place = place.ok_or_else(|| PayloadError::Unseen(name()))?;
+    let index = unknowns.links.iter().position(|link| *link == frame.link);
+    let index = index.ok_or_else(|| PayloadError::Unseen(name()))?;
     let clean = exclude_disturbed(&measurement, &mut logs, &mut |_, _| ())?;
     let estimate = clean.estimate;
     clean.undeclared.report(&measurement, &mut logs, &estimate);
@@ -118,7 +118,7 @@ pub fn payload(
         1..4 => (MASS * SIZE).powi(-2),
         _ => (MASS * SIZE * SIZE).powi(-2),
     }));
-    let (added, _) = body(&prior, place, &some, &factor, &x).ok_or(PayloadError::Singular)?;
+    let (added, _) = body(&prior, index, &some, &factor, &x).ok_or(PayloadError::Singular)?;
     let to_frame = frame.pose.inverse();
     let map = Square::from_columns(&std::array::from_fn::<_, LINK_PARAMETERS, _>(|column| {
         let mut unit = [0.0; LINK_PARAMETERS];
@@ -162,22 +162,22 @@ fn reason(outcome: Outcome) -> String {
 /// The inverse of the covariance of these links' parameters; zero for those that are not known.
 fn precision(known: &KnownParameters, links: &[usize]) -> Option<DMatrix<f64>> {
     let mut columns = Vec::new();
-    for (place, link) in links.iter().enumerate() {
+    for (index, link) in links.iter().enumerate() {
         if let Some(at) = known.links.iter().position(|own| own == link) {
             columns.extend((0..LINK_PARAMETERS).map(|i| {
                 let of_known = LINK_PARAMETERS * at + i;
-                (LINK_PARAMETERS * place + i, of_known)
+                (LINK_PARAMETERS * index + i, of_known)
             }));
         }
     }
     // Scaled by the deviations, since kilograms and kg m^2 differ by decades.
     let of_known: Vec<usize> = columns.iter().map(|(_, column)| *column).collect();
-    let mut own = known.root.select_columns(&of_known);
-    let deviations: Vec<f64> = own.column_iter().map(|column| column.norm()).collect();
-    for (mut column, deviation) in own.column_iter_mut().zip(&deviations) {
+    let mut root = known.root.select_columns(&of_known);
+    let deviations: Vec<f64> = root.column_iter().map(|column| column.norm()).collect();
+    for (mut column, deviation) in root.column_iter_mut().zip(&deviations) {
         column /= *deviation;
     }
-    let inverse = own.tr_mul(&own).cholesky()?.inverse();
+    let inverse = root.tr_mul(&root).cholesky()?.inverse();
     let size = LINK_PARAMETERS * links.len();
     let mut precision = DMatrix::zeros(size, size);
     for (i, (row, _)) in columns.iter().enumerate() {

@@ -180,9 +180,9 @@ pub(crate) fn is_between(model: &Model, base: usize, links: &[usize]) -> Vec<boo
     let of_base = links_above(model, base);
     let mut is_between = vec![false; model.dof_count()];
     for &link in links {
-        let own = links_above(model, link);
-        let there = own.iter().filter(|link| !of_base.contains(link));
-        let back = of_base.iter().filter(|link| !own.contains(link));
+        let above = links_above(model, link);
+        let there = above.iter().filter(|link| !of_base.contains(link));
+        let back = of_base.iter().filter(|link| !above.contains(link));
         for dof in there
             .chain(back)
             .filter_map(|link| model.joints()[link - 1].dof)

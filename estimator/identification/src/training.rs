@@ -1,7 +1,7 @@
 //! The logs of an identification: the observations that can be used, why others are excluded, and
 //! the segments in which they are processed.
 
-use crate::dataset::observation::{Annotated, Observation, UnitSet};
+use crate::dataset::observation::{Annotated, Observation, SubtreeSet};
 use crate::dataset::{Dataset, LogRole};
 use crate::finding::{Finding, FindingCode, Severity};
 use crate::measurement::model::MeasurementModel;
@@ -67,10 +67,10 @@ pub(crate) struct PreparedLog {
     pub excluded: Vec<Excluded>,
     pub findings: Vec<Finding>,
     pub refused: bool,
-    /// Of a validation log: the units on which an undeclared disturbance acts, per instant; empty
-    /// if none was looked for. [`Annotated::disturbed`] stays empty there, because the figures of
+    /// Of a validation log: the sub-trees on which an undeclared disturbance acts, per instant;
+    /// empty if none was looked for. [`Annotated::disturbed`] stays empty there, because figures of
     /// such a log include all of its instants.
-    pub disturbed: Vec<UnitSet>,
+    pub disturbed: Vec<SubtreeSet>,
 }
 
 impl PreparedLog {
@@ -395,7 +395,7 @@ pub(crate) fn sample<'a>(
     let mut measurement = measurement.clone();
     let mut appears = vec![0; measurement.unknowns().channels()];
     let mut count_channels = |instant: &Annotated, appears: &mut [usize]| -> bool {
-        let made = measurement.make(instant, &mut rows).is_ok();
+        let made = measurement.compute_rows(instant, &mut rows).is_ok();
         let mut lacked = false;
         for (channel, appears) in appears.iter_mut().enumerate() {
             if made && rows.has(channel) {

@@ -130,8 +130,8 @@ fn remaining(robot: &Robot, subspace: &Identifiable) -> CovarianceRoot {
             .try_inverse();
         // Without an inverse CAD is exact.
         let inverse = inverse.unwrap_or_else(|| SMatrix::identity() * 1e12);
-        let own = inverse * null.rows(first, LINK_PARAMETERS);
-        weighted.rows_mut(first, LINK_PARAMETERS).copy_from(&own);
+        let block = inverse * null.rows(first, LINK_PARAMETERS);
+        weighted.rows_mut(first, LINK_PARAMETERS).copy_from(&block);
     }
     for (row, column) in columns.iter().enumerate() {
         if let ParameterColumn::Offset { sensor, component } = *column {
@@ -142,8 +142,8 @@ fn remaining(robot: &Robot, subspace: &Identifiable) -> CovarianceRoot {
             } else {
                 UNKNOWN_OFFSET[component]
             };
-            let mut own = weighted.row_mut(row);
-            own /= deviation.max(1e-9);
+            let mut weighted_row = weighted.row_mut(row);
+            weighted_row /= deviation.max(1e-9);
         }
     }
     // Columns in their own units, which differ by orders of magnitude.
@@ -235,8 +235,8 @@ impl Knowledge {
                 }
             }
             for (link, spread) in spreads.iter().enumerate() {
-                let own = left.columns(LINK_PARAMETERS * link, LINK_PARAMETERS) * spread;
-                let deviation = own.norm() / (rows.nrows().max(1) as f64).sqrt();
+                let block = left.columns(LINK_PARAMETERS * link, LINK_PARAMETERS) * spread;
+                let deviation = block.norm() / (rows.nrows().max(1) as f64).sqrt();
                 torque.assumed.push((link, deviation));
             }
             let largest_left = end.torque.unwrap_or_default().max(ROUNDING);

@@ -192,7 +192,7 @@ impl FourierSeries {
         numbers: &[f64],
     ) -> Result<Option<Self>, DynamicsError> {
         let count = harmonics(seconds);
-        let mut own = numbers.chunks_exact(1 + 2 * count);
+        let mut chunks = numbers.chunks_exact(1 + 2 * count);
         let still = robot.position_without_samples();
         let joints = limits.iter().zip(still).map(|(limits, still)| {
             let Some(limits) = limits else {
@@ -200,7 +200,7 @@ impl FourierSeries {
             };
             let Limits { lower, upper } = limits.range;
             let half = 0.5 * (upper - lower);
-            let [place, series @ ..] = own.next().unwrap_or_default() else {
+            let [place, series @ ..] = chunks.next().unwrap_or_default() else {
                 return (0.5 * (lower + upper), Vec::new());
             };
             let start = 0.5 * (lower + upper) + 0.8 * half * place.tanh();

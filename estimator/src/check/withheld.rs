@@ -223,8 +223,8 @@ fn trial(setup: &Setup, still: &Still) -> TrialEnd {
     let calibrations = setup.initial.calibrations.iter().enumerate();
     let temperatures: Vec<(usize, Reading)> = calibrations
         .filter_map(|(number, calibration)| {
-            let own = ChannelRole::Sensor(number);
-            let channel = robot.channels.iter().position(|c| c.role == own)?;
+            let role = ChannelRole::Sensor(number);
+            let channel = robot.channels.iter().position(|c| c.role == role)?;
             let celsius = calibration.reference()?;
             Some((channel, Reading::Temperature(Temperature { celsius })))
         })
@@ -257,8 +257,8 @@ fn trial(setup: &Setup, still: &Still) -> TrialEnd {
 
 /// What sensor number `sensor` sends: its load and offset before calibration.
 fn raw(setup: &Setup, still: &Still, sensor: usize) -> proprio_topics::Wrench {
-    let of = |wrenches: &[Wrench]| wrenches.get(sensor).copied().unwrap_or(Wrench::zero());
-    let corrected = of(&still.loads) + of(&setup.initial.offsets);
+    let wrench = |wrenches: &[Wrench]| wrenches.get(sensor).copied().unwrap_or(Wrench::zero());
+    let corrected = wrench(&still.loads) + wrench(&setup.initial.offsets);
     let gain = setup.initial.calibrations.get(sensor).map(|c| *c.gain());
     let inverse = gain.and_then(Matrix6::try_inverse);
     let corrected = Vector6::from(corrected.torque_first());

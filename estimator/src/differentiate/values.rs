@@ -38,11 +38,11 @@ impl<const D: usize> WithSimd for Values<'_, D> {
         let grid = &*self.grid;
         let mut estimate = SignalEstimate::NONE;
         for component in 0..D {
-            let own = self.roughness_square[component];
-            let variance = sum(own) / own.len().max(1) as f64;
+            let squares = self.roughness_square[component];
+            let variance = sum(squares) / squares.len().max(1) as f64;
             let (values, origin) = (self.values[component], self.origin[component]);
             let moments = moments(simd, grid, values, origin);
-            let own = Component {
+            let fit = Component {
                 grid,
                 values,
                 origin,
@@ -52,7 +52,7 @@ impl<const D: usize> WithSimd for Values<'_, D> {
                 products: grid.bases.products(simd, &moments),
                 component,
             };
-            own.estimate(simd, &mut estimate);
+            fit.estimate(simd, &mut estimate);
         }
         estimate
     }
@@ -80,12 +80,12 @@ fn moments<S: Simd>(simd: S, grid: &Grid, values: &[f64], origin: f64) -> [PerWi
             let factors = simd.mul_add_e_f64s(x, last, powers[vectors - 1]);
             sums[vectors - 1] = simd.mul_add_e_f64s(x, factors, sums[vectors - 1]);
         }
-        let mut own = [0.0; LANES];
-        for (to, sum) in S::as_mut_simd_f64s(&mut own).0.iter_mut().zip(&sums) {
+        let mut parts = [0.0; LANES];
+        for (to, sum) in S::as_mut_simd_f64s(&mut parts).0.iter_mut().zip(&sums) {
             *to = *sum;
         }
         for k in 0..LANES {
-            before[k] += own[k];
+            before[k] += parts[k];
             moments[k][window] = before[k];
         }
         from = samples;

@@ -177,9 +177,9 @@ impl fmt::Display for Parameters {
             )?;
         }
         self.links.iter().try_for_each(|link| link.write(f))?;
-        for (place, sensor) in self.sensors.iter().enumerate() {
-            let deviation = self.offset_deviation(place).unwrap_or_default();
-            sensor.write(f, &deviation, self.calibration_deviation(place))?;
+        for (index, sensor) in self.sensors.iter().enumerate() {
+            let deviation = self.offset_deviation(index).unwrap_or_default();
+            sensor.write(f, &deviation, self.calibration_deviation(index))?;
         }
         self.joints.iter().try_for_each(|joint| joint.write(f))?;
         for drive in &self.drives {
@@ -192,8 +192,8 @@ impl fmt::Display for Parameters {
                 .split_at_checked(column + 1)
                 .unwrap_or((numbers, &[]));
             numbers = rest;
-            for (place, number) in own.iter().enumerate() {
-                f.write_char(if place == 0 { '[' } else { ',' })?;
+            for (index, number) in own.iter().enumerate() {
+                f.write_char(if index == 0 { '[' } else { ',' })?;
                 write!(f, "{number}")?;
             }
             f.write_str("],\n")?;

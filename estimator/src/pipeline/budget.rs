@@ -49,13 +49,13 @@ impl Pipeline {
         budget.torque = torque.copied().unwrap_or(JointTorque::ABSENT);
         let bound = setup.max_deviation.get(dof).copied();
         budget.bound = bound.unwrap_or(f64::INFINITY);
-        let own = uncertainty.torque_variance(solver, dof);
+        let variance = uncertainty.torque_variance(solver, dof);
         let alternative = doubt.map_or(0.0, |doubt| doubt.deviation);
         let step = steps.torque().get(dof).copied().unwrap_or(0.0);
         let least = alternative.max(step);
-        budget.deviation = match own.is_nan() {
+        budget.deviation = match variance.is_nan() {
             true => f64::NAN,
-            false => own.sqrt().max(least),
+            false => variance.sqrt().max(least),
         };
         let rests_on = dependences.torques.get(dof).copied().unwrap_or_default();
         add_inputs(budget, setup, inputs, &rests_on, |sensor| {
@@ -74,12 +74,12 @@ impl Pipeline {
                 }
             },
         );
-        if least > own.sqrt() {
+        if least > variance.sqrt() {
             let source = match alternative >= step {
                 true => Source::Alternative,
                 false => Source::Step,
             };
-            budget.add(part(source, "", least * least - own));
+            budget.add(part(source, "", least * least - variance));
         }
         budget.sort();
         if let Some(leading) = doubt.and_then(|doubt| doubt.leading) {
@@ -162,9 +162,9 @@ fn add_inputs(
 fn disturbance(setup: &Setup, dof: usize, residuals: &[Residual]) -> Option<Line> {
     let structure = &setup.robot.structure;
     let subtrees = structure.subtrees();
-    let own = structure.moved_by(dof).iter();
-    let own = own.filter_map(|link| subtrees.get(structure.subtree_of(*link)?));
-    let sensors = own.fold(SensorSet::EMPTY, |all, own| all.union(&own.sensors));
+    let moved = structure.moved_by(dof).iter();
+    let moved = moved.filter_map(|link| subtrees.get(structure.subtree_of(*link)?));
+    let sensors = moved.fold(SensorSet::EMPTY, |all, own| all.union(&own.sensors));
     let named = residuals
         .iter()
         .zip(subtrees)

@@ -208,7 +208,7 @@ mod tests {
     fn an_encoder_that_stopped_at_once_is_stuck_once_a_residual_spoke_against_it() {
         let max_silence = Nanos::from_millis(100);
         let mut sanity = Sanity::of_encoder(0.0);
-        let look = |sanity: &mut Sanity, ms: i64, position: f64| {
+        let check = |sanity: &mut Sanity, ms: i64, position: f64| {
             let position = [position, f64::NAN, f64::NAN, f64::NAN, f64::NAN, f64::NAN];
             sanity.look(
                 Nanos::from_millis(ms),
@@ -219,21 +219,21 @@ mod tests {
         };
         let motion = |ms: i64| (ms as f64 / 300.0).sin();
         for ms in (0..300).step_by(5) {
-            look(&mut sanity, ms, motion(ms));
+            check(&mut sanity, ms, motion(ms));
             sanity.suspect(true);
             assert!(!sanity.may_be_stuck(true), "{ms}");
         }
         for ms in (300..400).step_by(5) {
-            look(&mut sanity, ms, motion(295));
+            check(&mut sanity, ms, motion(295));
         }
         assert!(sanity.may_be_stuck(true) && !sanity.may_be_stuck(false));
         sanity.suspect(false);
         assert!(!sanity.may_be_stuck(false));
         sanity.suspect(true);
-        look(&mut sanity, 400, motion(295));
+        check(&mut sanity, 400, motion(295));
         assert!(sanity.may_be_stuck(false));
         for ms in (405..500).step_by(5) {
-            look(&mut sanity, ms, motion(295) + 0.1 * motion(ms - 400));
+            check(&mut sanity, ms, motion(295) + 0.1 * motion(ms - 400));
         }
         assert!(!sanity.may_be_stuck(true) && !sanity.may_be_stuck(false));
     }

@@ -169,7 +169,7 @@ impl Inputs {
             let corrected = calibration.apply(&wrench(raw.value), celsius);
             // The effect of an uncertain calibration depends on the reading.
             let kelvin = calibration.temperature_rise(celsius);
-            let parameters = &mut at.uncertainty.parameters;
+            let parameters = &mut at.uncertainty.propagation;
             parameters.set_extra_variance(sensor, extra);
             parameters.set_calibration_point(sensor, &corrected, kelvin);
             (*reading, *missing) = (corrected - *offset, by_temperature != [0.0; 6]);

@@ -229,8 +229,8 @@ impl Contacts {
 
     fn touch(&self, contact: usize, t: Nanos) -> TouchSum {
         let mut touch = TouchSum::default();
-        let own = self.patches.iter().enumerate();
-        for (number, patch) in own.filter(|(_, patch)| patch.contact() == contact) {
+        let patches = self.patches.iter().enumerate();
+        for (number, patch) in patches.filter(|(_, patch)| patch.contact() == contact) {
             patch.add_touch(number, t.saturating_sub(self.delay), &mut touch);
         }
         touch

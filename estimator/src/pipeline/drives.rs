@@ -191,11 +191,11 @@ impl Drives {
                 continue;
             };
             let Some(drive) = &own.drive else { continue };
-            let Some(place) = out.drives.get_mut(out.count as usize) else {
+            let Some(slot) = out.drives.get_mut(out.count as usize) else {
                 break;
             };
             out.count += 1;
-            *place = DriveTorque {
+            *slot = DriveTorque {
                 joint: u32::try_from(joint).unwrap_or(u32::MAX),
                 ..DriveTorque::ABSENT
             };
@@ -205,8 +205,8 @@ impl Drives {
                     let signal = drive.signal.of(report);
                     let (by_drive, [variance, inherited]) =
                         drive.torque(signal, velocity, acceleration);
-                    place.torque = by_drive;
-                    place.standard_deviation = (variance + inherited).sqrt();
+                    slot.torque = by_drive;
+                    slot.standard_deviation = (variance + inherited).sqrt();
                     match torque.valid {
                         1 if by_drive.is_finite() => {
                             let difference = by_drive - torque.torque;
@@ -218,9 +218,9 @@ impl Drives {
                                 difference,
                                 deviation,
                             );
-                            place.deviate = comparison.deviate;
-                            place.ratio = comparison.ratio();
-                            place.agreement = comparison.agreement();
+                            slot.deviate = comparison.deviate;
+                            slot.ratio = comparison.ratio();
+                            slot.agreement = comparison.agreement();
                             any_disagrees |= comparison.disagrees;
                             (Reason::None, NO_CAUSE)
                         }
@@ -230,8 +230,8 @@ impl Drives {
                 }
                 Err(reason) => (reason, own.number()),
             };
-            place.reason = reason.in_memory();
-            place.cause = cause;
+            slot.reason = reason.in_memory();
+            slot.cause = cause;
         }
         if any_disagrees {
             self.name_candidates(at, dependences);
@@ -251,8 +251,8 @@ impl Drives {
             ..
         } = &mut self.estimate;
         let mut add = |kind: Candidate, name: &str, joint: u32| {
-            if let Some(place) = candidates.get_mut(*candidate_count as usize) {
-                *place = NamedCandidate {
+            if let Some(slot) = candidates.get_mut(*candidate_count as usize) {
+                *slot = NamedCandidate {
                     name: Name::new(name).unwrap_or(Name::EMPTY),
                     kind: kind.in_memory(),
                     joint,

@@ -143,7 +143,7 @@ fn write_inertia(setup: &Setup, solution: &Solution, out: &mut InertiaEstimate) 
             _ => root.column(column).norm(),
         };
         let accepted = u32::from(component.is_accepted);
-        for (place, (&link, body)) in component.links.iter().zip(&component.bodies).enumerate() {
+        for (index, (&link, body)) in component.links.iter().zip(&component.bodies).enumerate() {
             let Some(to) = out.links.get_mut(links) else {
                 break;
             };
@@ -151,14 +151,14 @@ fn write_inertia(setup: &Setup, solution: &Solution, out: &mut InertiaEstimate) 
             *to = LinkInertia {
                 name: name(setup.robot.model.link_name(link)),
                 parameters: body.parameters(),
-                standard_deviation: std::array::from_fn(|i| deviation(10 * place + i)),
+                standard_deviation: std::array::from_fn(|i| deviation(10 * index + i)),
                 motion: component.motion,
                 rows: component.rows,
                 group,
                 accepted,
             };
         }
-        for (place, (&sensor, offset)) in
+        for (index, (&sensor, offset)) in
             component.sensors.iter().zip(&component.offsets).enumerate()
         {
             let Some(to) = out.offsets.get_mut(offsets) else {
@@ -170,7 +170,7 @@ fn write_inertia(setup: &Setup, solution: &Solution, out: &mut InertiaEstimate) 
                 .channels
                 .iter()
                 .find(|c| c.role == ChannelRole::Sensor(sensor));
-            let six = |i: usize| deviation(parameters + 6 * place + i);
+            let six = |i: usize| deviation(parameters + 6 * index + i);
             *to = SensorOffset {
                 name: channel.map_or(Name::EMPTY, |channel| name(&channel.name)),
                 force: offset.force.into(),
@@ -443,9 +443,10 @@ impl OnlineIdentification {
             // Separate statistics: angular acceleration may be absent at times.
             let mut none = [SignalStatistics::default(); 3];
             let of_axis = first + 3 * axis..first + 3 * axis + 3;
-            let own = self.statistics.get_mut(of_axis);
-            let [of_rate, of_angular, of_linear]: &mut [SignalStatistics; 3] =
-                own.and_then(|own| own.try_into().ok()).unwrap_or(&mut none);
+            let statistics = self.statistics.get_mut(of_axis);
+            let [of_rate, of_angular, of_linear]: &mut [SignalStatistics; 3] = statistics
+                .and_then(|own| own.try_into().ok())
+                .unwrap_or(&mut none);
             let gyro = self.differentiator.fit(3 + axis, of_rate, (sigma, 1));
             let alpha = match self.differentiator.is_complete(6 + axis) {
                 true => self.differentiator.fit(6 + axis, of_angular, (f64::NAN, 0))[0],
@@ -528,20 +529,20 @@ impl OnlineIdentification {
                 let _ = parameters.model.set_inertia(link, *body);
             }
             for (&sensor, offset) in component.sensors.iter().zip(&component.offsets) {
-                if let Some(place) = parameters.offsets.get_mut(sensor) {
-                    *place = *offset;
+                if let Some(slot) = parameters.offsets.get_mut(sensor) {
+                    *slot = *offset;
                 }
             }
             let found = component.noise.iter().zip(&component.worst);
             for (&sensor, (found, worst)) in component.sensors.iter().zip(found) {
                 let structure = &setup.robot.structure;
                 let [found, worst] = [found, worst].map(|v| excess(structure, sensor, v));
-                if let Some(place) = parameters.excess_variance.get_mut(sensor) {
+                if let Some(slot) = parameters.excess_variance.get_mut(sensor) {
                     let most = match touched.contains(sensor) {
-                        true => *place,
+                        true => *slot,
                         false => [f64::INFINITY; 6],
                     };
-                    *place = std::array::from_fn(|i| found[i].min(most[i]).max(worst[i]));
+                    *slot = std::array::from_fn(|i| found[i].min(most[i]).max(worst[i]));
                 }
             }
         }

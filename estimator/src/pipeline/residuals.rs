@@ -27,7 +27,7 @@
 //! plausible without it for [`FREE`]. One that was there before the residual could not be tested,
 //! because of a fault, may still be there after it.
 
-use super::steps::{SIGNIFICANT, Step, TIME_CONSTANT, kept};
+use super::offset_steps::{OffsetStep, SIGNIFICANT, TIME_CONSTANT, kept};
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{
@@ -99,7 +99,7 @@ struct SubtreeState {
     residual: SubtreeResidual,
     mean: Option<Mean>,
     /// What the residual may be instead of a contact.
-    steps: Vec<Step>,
+    steps: Vec<OffsetStep>,
     /// When it was last tested, and for how long the residual was plausible without a contact
     /// \[s\].
     tested: Nanos,
@@ -134,7 +134,7 @@ impl ResidualMonitor {
         let nothing = |number: usize| SubtreeState {
             residual: SubtreeResidual::NOTHING,
             mean: None,
-            steps: Step::of_subtree(structure, number),
+            steps: OffsetStep::of_subtree(structure, number),
             tested: Nanos::MIN,
             free: 0.0,
             lately: 0.0,
@@ -152,7 +152,7 @@ impl ResidualMonitor {
     }
 
     /// Each sub-tree's number, and what its residual may be instead of a contact.
-    pub(super) fn steps(&self) -> impl Iterator<Item = (usize, &Step)> {
+    pub(super) fn steps(&self) -> impl Iterator<Item = (usize, &OffsetStep)> {
         let all = self.subtrees.iter().enumerate();
         all.flat_map(|(number, state)| state.steps.iter().map(move |step| (number, step)))
     }
@@ -230,7 +230,7 @@ impl ResidualMonitor {
                 if !known.is_empty() {
                     state.lingering = None;
                 }
-                state.steps.iter_mut().for_each(Step::end);
+                state.steps.iter_mut().for_each(OffsetStep::end);
                 continue;
             };
             let b = Vector6::from(
@@ -295,7 +295,7 @@ impl ResidualMonitor {
         for subtree in &mut self.subtrees {
             (subtree.residual, subtree.mean) = (SubtreeResidual::NOTHING, None);
             subtree.lately = 0.0;
-            subtree.steps.iter_mut().for_each(Step::end);
+            subtree.steps.iter_mut().for_each(OffsetStep::end);
         }
     }
 }

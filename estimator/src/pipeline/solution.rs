@@ -4,11 +4,11 @@
 use super::Pipeline;
 use super::channels::At;
 use super::contacts::Place;
+use super::offset_steps::OffsetStepCover;
 use super::residuals::{self, ResidualMonitor, SubtreeResidual};
-use super::steps::StepCover;
 use super::validity::{Dependences, ValidityCheck, first_fault};
 use crate::setup::Setup;
-use crate::uncertainty::{Solution, Uncertainty};
+use crate::uncertainty::{OperatingPoint, Uncertainty};
 use proprio_dynamics::{ContactSet, Dependence, Determinacy, DofSet, SensorSet, Solver, Structure};
 use proprio_identification::online::Doubt;
 use proprio_identification::robot::ChannelRole;
@@ -68,7 +68,7 @@ impl Pipeline {
                 solver.solve(model, structure, kinematics, &inputs.readings, assumed, &[])
             })
             .and_then(|()| solver.update_deviations(structure));
-        let solution = Solution {
+        let point = OperatingPoint {
             t,
             model,
             structure,
@@ -84,7 +84,7 @@ impl Pipeline {
         let place_std =
             |contact: usize| places.get(contact).map_or_else(Default::default, |p| p.std);
         solved
-            .and_then(|()| self.uncertainty.update(&solution, place_std))
+            .and_then(|()| self.uncertainty.update(&point, place_std))
             .is_ok()
     }
 
@@ -202,7 +202,7 @@ struct Judge<'a> {
     solver: &'a Solver,
     uncertainty: &'a Uncertainty,
     residuals: &'a ResidualMonitor,
-    steps: &'a StepCover,
+    steps: &'a OffsetStepCover,
     /// Of the contacts.
     places: &'a [Place],
     dependences: &'a Dependences,
@@ -271,8 +271,8 @@ impl Judge<'_> {
     fn torque(&self, dof: usize) -> JointTorque {
         let least = self.doubts(dof).map_or(0.0, |doubt| doubt.deviation);
         let step = self.steps.torque().get(dof).copied().unwrap_or(0.0);
-        let own = self.uncertainty.torque_std(self.solver, dof);
-        let deviation = own.max(least).max(step);
+        let std = self.uncertainty.torque_std(self.solver, dof);
+        let deviation = std.max(least).max(step);
         let bound = self.setup.max_deviation.get(dof);
         let (mut reason, mut cause) = self.torque_reason(dof);
         let is_uncertain = bound.is_some_and(|most| deviation > *most) || least.is_infinite();
@@ -280,7 +280,7 @@ impl Judge<'_> {
             reason = Reason::Uncertain;
         }
         let torque = self.solver.torque().get(dof).copied();
-        let torque = torque.filter(|x| self.is_solved && x.is_finite() && !own.is_nan());
+        let torque = torque.filter(|x| self.is_solved && x.is_finite() && !std.is_nan());
         if torque.is_none() {
             (reason, cause) = (Reason::NotFinite, NO_CAUSE);
         }
@@ -327,9 +327,9 @@ impl Judge<'_> {
             _ => {}
         }
         let wrench = result.wrench.force_first();
-        let own = self.uncertainty.contact_std(self.solver, contact);
+        let deviation = self.uncertainty.contact_std(self.solver, contact);
         let deviation: [f64; 6] =
-            std::array::from_fn(|i| own[i].max(self.steps.contact(contact, wrench[i])));
+            std::array::from_fn(|i| deviation[i].max(self.steps.contact(contact, wrench[i])));
         let is_finite = result.wrench.is_finite() && deviation.iter().all(|x| x.is_finite());
         if !self.is_solved || !is_finite {
             (reason, cause) = (Reason::NotFinite, NO_CAUSE);

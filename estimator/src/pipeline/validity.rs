@@ -24,18 +24,18 @@ impl Dependences {
         if self.active.replace(*active) == Some(*active) {
             return;
         }
-        for (dof, place) in self.torques.iter_mut().enumerate() {
-            *place = structure
+        for (dof, dependence) in self.torques.iter_mut().enumerate() {
+            *dependence = structure
                 .torque_dependence(dof, kinematics, active)
                 .unwrap_or_default();
         }
-        for (contact, place) in self.contacts.iter_mut().enumerate() {
-            *place = structure
+        for (contact, dependence) in self.contacts.iter_mut().enumerate() {
+            *dependence = structure
                 .contact_dependence(contact, kinematics, active)
                 .unwrap_or_default();
         }
-        for (number, place) in self.subtrees.iter_mut().enumerate() {
-            *place = structure.subtree_dependence(number, kinematics, active);
+        for (number, dependence) in self.subtrees.iter_mut().enumerate() {
+            *dependence = structure.subtree_dependence(number, kinematics, active);
         }
     }
 }

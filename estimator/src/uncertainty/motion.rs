@@ -47,8 +47,8 @@ const STEP: f64 = 1e-4;
 /// does not change S more than the motion of the robot does in that time.
 const JUMP: [f64; 2] = [0.01, 0.1];
 
-/// A solution, with all that it was computed from: the point of linearisation.
-pub(crate) struct Solution<'a> {
+/// The point of linearisation: a solution, with all that it was computed from.
+pub(crate) struct OperatingPoint<'a> {
     pub(crate) t: Nanos,
     pub(crate) model: &'a Model,
     pub(crate) structure: &'a Structure,
@@ -185,7 +185,7 @@ impl MotionErrors {
     ///
     /// # Errors
     /// Sizes differ, or a number is not finite.
-    pub(super) fn update(&mut self, point: &Solution<'_>) -> Result<(), DynamicsError> {
+    pub(super) fn update(&mut self, point: &OperatingPoint<'_>) -> Result<(), DynamicsError> {
         self.deviation.fill(0.0);
         let key = Some((
             *point.active,
@@ -222,7 +222,7 @@ impl MotionErrors {
     fn compute_sensitivity(
         &mut self,
         column: usize,
-        point: &Solution<'_>,
+        point: &OperatingPoint<'_>,
     ) -> Result<(), DynamicsError> {
         let dofs = self.dofs;
         let (accelerations, positions) = self.perturbed.split_at_mut(dofs);

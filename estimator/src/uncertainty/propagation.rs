@@ -151,8 +151,8 @@ impl Propagation {
     /// Sets the variance that a sensor's offset has at present in addition to the covariance: of
     /// each channel [torque; force] [Nm^2, N^2], independent of all else. Initially zero.
     pub fn set_extra_variance(&mut self, sensor: usize, variance: [f64; 6]) {
-        if let Some(place) = self.extra.get_mut(sensor) {
-            *place = variance;
+        if let Some(slot) = self.extra.get_mut(sensor) {
+            *slot = variance;
         }
     }
 
@@ -267,13 +267,13 @@ impl WithSimd for Update<'_> {
             if !part.ends.is_empty() {
                 *imbalance = part.covariance_of_all(simd);
             }
-            for (place, link) in part.links.iter().enumerate().skip(1) {
+            for (index, link) in part.links.iter().enumerate().skip(1) {
                 let Some(dof) = structure.dof_of(link.link) else {
                     continue;
                 };
                 let (axis, response) = solver.torque_rows(link.link);
                 // The deviation of a sum is at most the sum of the deviations.
-                torque[dof] += part.variance(simd, place, axis, response).sqrt();
+                torque[dof] += part.variance(simd, index, axis, response).sqrt();
             }
             for contact in subtree.contacts.iter() {
                 let motions = solver.contact_rows(contact);

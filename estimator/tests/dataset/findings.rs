@@ -235,7 +235,7 @@ fn what_turns_round_or_rests_at_its_extreme_is_not_saturated_and_what_is_cut_off
     /// The findings on fx and on the elbow's torque, in half a minute of two joints that swing
     /// together, with stops if their range is below one. Both are the given functions of the joint
     /// positions, in steps of 1/200 and 1/2000 of their range.
-    fn told(
+    fn findings(
         hertz: f64,
         furthest: f64,
         torque: impl Fn(usize, f64) -> f64,
@@ -267,30 +267,30 @@ fn what_turns_round_or_rests_at_its_extreme_is_not_saturated_and_what_is_cut_off
     let none: [String; 0] = [];
     for hertz in [0.1, 0.2, 1.0] {
         assert_eq!(
-            told(hertz, 1.0, |_, x| x, |x| x),
+            findings(hertz, 1.0, |_, x| x, |x| x),
             none,
             "turns round at {hertz} Hz"
         );
     }
-    assert_eq!(told(0.05, 0.6, |_, x| x, |x| x), none, "rests");
+    assert_eq!(findings(0.05, 0.6, |_, x| x, |x| x), none, "rests");
     // The gravity load of a link, largest while the joint passes that position.
     assert_eq!(
-        told(0.02, 1.0, |_, x| (1.8 * x).cos(), |x| x),
+        findings(0.02, 1.0, |_, x| (1.8 * x).cos(), |x| x),
         none,
         "passes"
     );
     // Every eighth sample is a new one.
     let held = |i: usize, _: f64| (std::f64::consts::TAU * 0.6 * 0.08 * (i / 8) as f64).cos();
-    assert_eq!(told(0.2, 1.0, held, |x| x), none, "is slow");
+    assert_eq!(findings(0.2, 1.0, held, |x| x), none, "is slow");
     for limit in [0.95, 0.9, 0.85] {
-        let found = told(1.0, 1.0, |_, x| x.max(-limit), |x| x.min(limit));
+        let found = findings(1.0, 1.0, |_, x| x.max(-limit), |x| x.min(limit));
         for (name, value) in [
             ("joint/elbow: torque", -0.004 * (1000.0 * limit)),
             ("wrench/ft: fx", 0.1 * (100.0 * limit)),
         ] {
             let expected = format!("{name} is saturated at {value}");
             assert!(
-                found.iter().any(|told| told.starts_with(&expected)),
+                found.iter().any(|finding| finding.starts_with(&expected)),
                 "{expected}: {found:?}"
             );
         }
@@ -491,13 +491,13 @@ fn the_logs_of_a_real_kuka_are_clean() {
 fn a_wrong_model_and_a_late_start_are_no_defects() {
     let robot = robot("");
     // Every mass is a third too large, every centre of mass is displaced.
-    let mut wrong = robot.clone();
+    let mut altered = robot.clone();
     for (link, inertia) in robot.model.inertias().iter().enumerate() {
         let mut parameters = inertia.parameters().map(|p| 1.33 * p);
         parameters[1] += 0.02 * parameters[0];
         parameters[2] -= 0.03 * parameters[0];
         let changed = RigidInertia::from_parameters(&parameters);
-        wrong.model.set_inertia(link, changed).unwrap();
+        altered.model.set_inertia(link, changed).unwrap();
     }
     // At rest for six seconds; then the motion starts, within one second.
     let begin = |joint: usize, t: f64| {
@@ -521,7 +521,7 @@ fn a_wrong_model_and_a_late_start_are_no_defects() {
             ] {
                 alarms.extend(
                     table
-                        .findings(&wrong)
+                        .findings(&altered)
                         .into_iter()
                         .map(|own| format!("{seed}, {rate} Hz: {}", own.text)),
                 );

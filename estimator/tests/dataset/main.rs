@@ -14,7 +14,7 @@ use proprio_dynamics::spatial::{RigidInertia, Wrench};
 use proprio_dynamics::{InverseDynamics, JointState, Kinematics};
 use proprio_estimator::config::Config;
 use proprio_estimator::differentiate::{Settings as WindowSettings, Window};
-use proprio_estimator::reading;
+use proprio_estimator::sample_log;
 use proprio_estimator::setup::Setup;
 use proprio_identification::dataset::observation::Observation;
 use proprio_identification::dataset::smooth::{Scratch, Smoother};
@@ -164,7 +164,7 @@ impl Table {
 }
 
 fn read(robot: &Robot, log: impl std::io::Read) -> Dataset {
-    reading::dataset(robot, "log", LogRole::Train, log).expect("a log")
+    sample_log::dataset(robot, "log", LogRole::Train, log).expect("a log")
 }
 
 const COLUMNS: [&str; 8] = [
@@ -338,7 +338,7 @@ fn a_quintic_is_reproduced_on_any_stamps() {
             Nanos::from_seconds(t)
         })
         .collect();
-    let of = |t: f64| {
+    let exact_at = |t: f64| {
         let u = t - 1.0;
         [
             0.3 + 0.7 * u - 0.4 * u.powi(2) + 0.2 * u.powi(3) - 0.1 * u.powi(4) + 0.05 * u.powi(5),
@@ -346,7 +346,7 @@ fn a_quintic_is_reproduced_on_any_stamps() {
             -0.8 + 1.2 * u - 1.2 * u.powi(2) + u.powi(3),
         ]
     };
-    let values: Vec<f64> = stamps.iter().map(|t| of(t.seconds())[0]).collect();
+    let values: Vec<f64> = stamps.iter().map(|t| exact_at(t.seconds())[0]).collect();
     let smoother = Smoother::new(&stamps, &values, Nanos::from_millis(50));
     assert!(smoother.sigma() < 1e-9);
     let scratch = &mut Scratch::default();
@@ -354,7 +354,7 @@ fn a_quintic_is_reproduced_on_any_stamps() {
         let t = Nanos::from_seconds(0.5 + 0.07 * f64::from(i));
         let estimates = smoother.at(t, 0..=2, 0.3, scratch).unwrap();
         for (m, tolerance) in [(0, 1e-9), (1, 1e-7), (2, 1e-5)] {
-            let (estimate, exact) = (estimates[m], of(t.seconds())[m]);
+            let (estimate, exact) = (estimates[m], exact_at(t.seconds())[m]);
             // Alone as well as with the others.
             assert_eq!(smoother.at(t, m..=m, 0.3, scratch).unwrap()[m], estimate);
             assert!(
@@ -386,12 +386,12 @@ fn a_clean_log_has_no_defects_and_its_instants_are_true() {
             usable.len(),
             instants.observations().len()
         );
-        let of = |f: &dyn Fn(&Observation) -> f64| rms(usable.iter().map(|i| f(i)));
+        let rms_of = |f: &dyn Fn(&Observation) -> f64| rms(usable.iter().map(|i| f(i)));
         for joint in 0..2 {
             let truth = |i: &Observation| motion(joint, i.t.seconds());
-            let position = of(&|i| i.position[joint] - truth(i)[0]);
-            let velocity = of(&|i| i.velocity[joint] - truth(i)[1]);
-            let acceleration = of(&|i| i.acceleration[joint] - truth(i)[2]);
+            let position = rms_of(&|i| i.position[joint] - truth(i)[0]);
+            let velocity = rms_of(&|i| i.velocity[joint] - truth(i)[1]);
+            let acceleration = rms_of(&|i| i.acceleration[joint] - truth(i)[2]);
             println!(
                 "{rate} Hz, joint {joint}: {position:.2e} rad, {velocity:.2e} rad/s, \
                  {acceleration:.2e} rad/s^2"
@@ -407,7 +407,7 @@ fn a_clean_log_has_no_defects_and_its_instants_are_true() {
             .zip(OFFSET)
             .enumerate()
         {
-            let error = of(&|i| {
+            let error = rms_of(&|i| {
                 i.readings[0].force_first()[k]
                     - offset
                     - truth(&robot, i.t.seconds()).0.force_first()[k]

@@ -74,8 +74,8 @@ fn encoder_that_counts_backwards_is_named() {
         let columns = ["position", "velocity", "acceleration"].map(|what| format!("/{what}"));
         let header = log.lines().next().expect("a header").split(',');
         let is_turned = |name: &&str| {
-            let mut own = joints.iter().map(|joint| format!("joint/{joint}"));
-            own.any(|joint| columns.iter().any(|column| *name == joint.clone() + column))
+            let mut names = joints.iter().map(|joint| format!("joint/{joint}"));
+            names.any(|joint| columns.iter().any(|column| *name == joint.clone() + column))
         };
         let turned = header
             .filter(is_turned)
@@ -83,13 +83,14 @@ fn encoder_that_counts_backwards_is_named() {
         let findings = run(&setup, &[("log", LogRole::Train, &turned)], &[])
             .findings
             .into_iter();
-        let own = findings
+        let errors = findings
             .filter(|f| [FindingCode::WrongSign, FindingCode::EncoderOffset].contains(&f.code));
-        own.map(|f| {
-            assert!(f.text.contains("Encoder zeros and delays were not tested"));
-            f.subject
-        })
-        .collect()
+        errors
+            .map(|f| {
+                assert!(f.text.contains("Encoder zeros and delays were not tested"));
+                f.subject
+            })
+            .collect()
     };
     for joints in [&["j4"][..], &["j2"], &["j5"]] {
         let expected: Vec<String> = joints
@@ -112,12 +113,12 @@ fn what_can_show_counts_torques_beside_wrenches() {
         &simulate(&setup, &truth, 6.0, 0.01, 6),
         &simulate_torques(&setup, &truth, 6.0, 0.05, 6, |_, _| true),
     );
-    let of = |inputs: &[IdentificationInput]| {
+    let ranks = |inputs: &[IdentificationInput]| {
         let outcome = run(&setup, &[("log", LogRole::Train, &log)], inputs);
         (outcome.rank, outcome.structural_rank)
     };
     let (wrench, torque) = (IdentificationInput::Wrench, IdentificationInput::Torque);
-    let (own, both) = (of(&[wrench]), of(&[wrench, torque]));
+    let (own, both) = (ranks(&[wrench]), ranks(&[wrench, torque]));
     assert_eq!(own.0, own.1);
     assert!(both.1 > own.1 && both.0 <= both.1, "{own:?} {both:?}");
 }
@@ -133,7 +134,7 @@ fn joint_whose_zero_is_elsewhere_in_some_logs_is_named() {
     let clean: Vec<String> = (0..3)
         .map(|i| simulate(&setup, &real(&setup, 3), 12.0, motion[i], 3 + i as u64))
         .collect();
-    let told = |count: usize, joint: &str, by: [f64; 3]| -> Vec<(String, String)> {
+    let found = |count: usize, joint: &str, by: [f64; 3]| -> Vec<(String, String)> {
         let off = |i: usize| change(&clean[i], &format!("joint/{joint}/position"), |q| q + by[i]);
         let off: Vec<String> = (0..count).map(off).collect();
         let logs: Vec<_> = off
@@ -142,14 +143,14 @@ fn joint_whose_zero_is_elsewhere_in_some_logs_is_named() {
             .map(|(log, name)| (name, LogRole::Train, &**log))
             .collect();
         let findings = run(&setup, &logs, &[]).findings.into_iter();
-        let own = findings.filter(|f| f.code == FindingCode::EncoderOffset);
-        own.map(|f| (f.subject, f.text)).collect()
+        let offsets = findings.filter(|f| f.code == FindingCode::EncoderOffset);
+        offsets.map(|f| (f.subject, f.text)).collect()
     };
-    assert_eq!(told(3, "j4", [0.0; 3]), []);
+    assert_eq!(found(3, "j4", [0.0; 3]), []);
     let told = |count: usize, joint: &str, by: [f64; 3]| {
-        let told = told(count, joint, by);
-        let [(subject, text)] = told.as_slice() else {
-            panic!("{joint} {by:?}: {told:?}")
+        let found = found(count, joint, by);
+        let [(subject, text)] = found.as_slice() else {
+            panic!("{joint} {by:?}: {found:?}")
         };
         println!("{count} logs, {by:?}: {text}");
         assert_eq!(subject, joint, "{text}");
@@ -247,7 +248,8 @@ fn what_can_not_be_is_said_of_a_log_that_is_only_estimated_from() {
     let found = |log: &str| -> Vec<FindingCode> {
         let findings = implausible(
             &setup.robot,
-            reading::dataset(&setup.robot, "", LogRole::Validate, log.as_bytes()).expect("a log"),
+            sample_log::dataset(&setup.robot, "", LogRole::Validate, log.as_bytes())
+                .expect("a log"),
         );
         findings.iter().map(|finding| finding.code).collect()
     };
@@ -279,7 +281,7 @@ fn what_can_not_be_is_said_of_a_log_that_is_only_estimated_from() {
         .expect("its own");
     let turned = of_all(&wrench, -1.0);
     let codes = |setup: &Setup| {
-        let log = reading::dataset(&setup.robot, "", LogRole::Validate, turned.as_bytes());
+        let log = sample_log::dataset(&setup.robot, "", LogRole::Validate, turned.as_bytes());
         implausible(&setup.robot, log.expect("a log"))
     };
     assert_eq!(codes(&identified), codes(&setup));
@@ -321,7 +323,7 @@ fn simulated_arm_is_identified_and_its_uncertainty_is_true() {
             let truth = real(&setup, seed);
             let right = Calibration::new(cross_talk(0.01, 700 + seed), Wrench::zero(), None);
             let log = miscalibrated(&simulate(&setup, &truth, 12.0, memory, seed), &right);
-            let dataset = reading::dataset(&setup.robot, "arm", LogRole::Train, log.as_bytes())
+            let dataset = sample_log::dataset(&setup.robot, "arm", LogRole::Train, log.as_bytes())
                 .expect("a log");
             let outcome =
                 identify(&setup.robot, vec![dataset], &[], &mut |_| {}).expect("an outcome");

@@ -67,7 +67,7 @@ fn a_payload_is_what_a_link_carries_more_than_before() {
             translation: Vec3::new(0.0, 0.03, 0.1),
         };
         let found = |log: &str| {
-            let dataset = reading::dataset(&setup.robot, "log", LogRole::Train, log.as_bytes());
+            let dataset = sample_log::dataset(&setup.robot, "log", LogRole::Train, log.as_bytes());
             let (frame, known) = (Frame { link, pose }, known(&reference, &setup.robot));
             let logs = vec![dataset.expect("a log")];
             payload(&setup.robot, &known, &frame, logs, &[]).expect("a payload")
@@ -87,11 +87,11 @@ fn a_payload_is_what_a_link_carries_more_than_before() {
         let (tensor, tensor_std) = carried.about_centre();
         let off = centre - expected.centre().unwrap();
         let of_axes = off.iter().zip(centre_std.iter());
-        let mut own: Vec<f64> = of_axes.map(|(e, s)| e / s).collect();
+        let mut ratios: Vec<f64> = of_axes.map(|(e, s)| e / s).collect();
         let off = tensor - expected.about_centre();
-        own.extend(off.iter().zip(tensor_std.iter()).map(|(e, s)| e / s));
-        own.push((mass - kilograms) / std);
-        deviations.extend(own);
+        ratios.extend(off.iter().zip(tensor_std.iter()).map(|(e, s)| e / s));
+        ratios.push((mass - kilograms) / std);
+        deviations.extend(ratios);
         assert!(centre_std.amax() < 0.02, "{centre_std}");
         let nothing = found(&again);
         false_masses += usize::from(nothing.is_significant());
@@ -270,13 +270,13 @@ fn of_two_sensors_the_turned_one_is_named() {
     let setup = arm_with(&["ft", "wrist"]);
     let log = simulate(&setup, &real(&setup, 3), 10.0, 0.01, 3);
     for turned in [vec!["ft"], vec!["wrist"], vec!["ft", "wrist"]] {
-        let mut wrong = log.clone();
+        let mut text = log.clone();
         for sensor in &turned {
             for axis in AXES {
-                wrong = change(&wrong, &format!("wrench/{sensor}/{axis}"), |x| -x);
+                text = change(&text, &format!("wrench/{sensor}/{axis}"), |x| -x);
             }
         }
-        let outcome = run(&setup, &[("turned", LogRole::Train, &wrong)], &[]);
+        let outcome = run(&setup, &[("turned", LogRole::Train, &text)], &[]);
         assert!(
             matches!(outcome.verdict, Verdict::Nothing(_)),
             "{:?}",
@@ -312,7 +312,7 @@ fn readings_of_two_sensors_are_compared_as_they_are() {
         .collect();
     let header: Vec<&str> = log.lines().next().expect("a header").split(',').collect();
     for (sensor, cut) in ["ft", "wrist"].iter().zip(setup.robot.structure.sensors()) {
-        let own = &outcome.logs[0]
+        let of_sensor = &outcome.logs[0]
             .sensors
             .iter()
             .find(|s| s.name == *sensor)
@@ -355,7 +355,7 @@ fn readings_of_two_sensors_are_compared_as_they_are() {
             );
             // The difference has the noise of both sensors. (A torque also has that of the other's
             // force times the distance.)
-            let rms = own.rms.identified[axis];
+            let rms = of_sensor.rms.identified[axis];
             let force = |axis: usize| -> f64 {
                 let squares = setup
                     .robot
@@ -366,15 +366,15 @@ fn readings_of_two_sensors_are_compared_as_they_are() {
                 squares.sum::<f64>().sqrt()
             };
             assert!(
-                rms > 0.95 * noise && rms < own.rms.cad_fitted[axis],
+                rms > 0.95 * noise && rms < of_sensor.rms.cad_fitted[axis],
                 "{sensor} {word}: {:?}",
-                own.rms
+                of_sensor.rms
             );
             if axis < 3 {
                 assert!(
                     rms < 1.3 * force(axis) + 0.02,
                     "{sensor} {word}: {:?}",
-                    own.rms
+                    of_sensor.rms
                 );
             }
         }

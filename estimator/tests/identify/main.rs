@@ -22,7 +22,7 @@ use proprio_estimator::export::{known, parameters};
 use proprio_estimator::inertial::InertialState;
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::setup::Setup;
-use proprio_estimator::{offline, reading};
+use proprio_estimator::{offline, sample_log};
 use proprio_identification::robot::{BaseMotion, IdentificationInput, TorqueSide};
 use proprio_identification::{
     Finding, FindingCode, JointOutcome, LogOutcome, LogRole, Outcome, Predicted, Severity,
@@ -60,7 +60,8 @@ fn between(log: &str, from: f64, to: f64) -> String {
 
 fn run(setup: &Setup, logs: &[(&str, LogRole, &str)], inputs: &[IdentificationInput]) -> Outcome {
     let dataset = |(file, role, text): &(&str, LogRole, &str)| {
-        reading::dataset_or_unreadable(&setup.robot, file, *role, text.as_bytes()).expect("a log")
+        sample_log::dataset_or_unreadable(&setup.robot, file, *role, text.as_bytes())
+            .expect("a log")
     };
     let datasets = logs.iter().map(dataset).collect();
     let outcome = identify(&setup.robot, datasets, inputs, &mut |_| {}).expect("an outcome");
@@ -765,8 +766,8 @@ fn with_torques(wrenches: &str, torques: &str) -> String {
         .map(|name| name.ends_with("/torque"))
         .collect();
     let rows = wrenches.lines().zip(torques.lines()).map(|(row, torques)| {
-        let own = torques.split(',').zip(&is_torque).filter(|(_, is)| **is);
-        own.fold(row.to_owned(), |row, (cell, _)| row + "," + cell) + "\n"
+        let cells = torques.split(',').zip(&is_torque).filter(|(_, is)| **is);
+        cells.fold(row.to_owned(), |row, (cell, _)| row + "," + cell) + "\n"
     });
     rows.collect()
 }
@@ -820,12 +821,12 @@ fn miscalibrated(log: &str, right: &Calibration) -> String {
             cells[place] = sent[axis].to_string();
         }
         // Once a second.
-        let told = if number % 100 == 0 {
+        let cell = if number % 100 == 0 {
             celsius.to_string()
         } else {
             String::new()
         };
-        text += &format!("{},{told}\n", cells.join(","));
+        text += &format!("{},{cell}\n", cells.join(","));
     }
     text
 }
@@ -878,8 +879,8 @@ fn before_the_sensor(
     let mut dynamics = InverseDynamics::new(truth);
     let (mut square, mut inside, mut sum, mut count) = (0.0, 0.0, 0.0, 0.0);
     for row in 0..log["t"].len() {
-        let of = |what: &str| ARM_JOINTS.map(|joint| log[&format!("joint/{joint}/{what}")][row]);
-        let (q, dq, ddq) = (of("position"), of("velocity"), of("acceleration"));
+        let arm = |what: &str| ARM_JOINTS.map(|joint| log[&format!("joint/{joint}/{what}")][row]);
+        let (q, dq, ddq) = (arm("position"), arm("velocity"), arm("acceleration"));
         move_to(&mut kinematics, truth, &(q, dq, ddq));
         dynamics.update(truth, &kinematics, &[]).expect("a state");
         let error = got["torque/j2"][row] - dynamics.torque()[1];
@@ -951,7 +952,7 @@ fn judged_alike(setup: &Setup, parameters: &Parameters, log: &str, predicted: &P
         .expect("estimates");
     let assessment = assessor.finish();
     assert_eq!(assessment.changes, 0);
-    let of = |p: &Predicted| {
+    let errors = |p: &Predicted| {
         let [once, drifting] = [&p.relative_error, &p.relative_error_with_drift];
         let each = p
             .sensors
@@ -960,7 +961,7 @@ fn judged_alike(setup: &Setup, parameters: &Parameters, log: &str, predicted: &P
         let whole = [once.cad, once.identified, drifting.cad, drifting.identified];
         whole.into_iter().chain(each).collect::<Vec<f64>>()
     };
-    let (own, other) = (of(&assessment.predicted), of(predicted));
+    let (own, other) = (errors(&assessment.predicted), errors(predicted));
     assert_eq!((own.len(), other.len()), (16, 16));
     for (own, other) in own.iter().zip(&other) {
         assert!((own / other - 1.0).abs() < 1e-6, "{own} {other}");

@@ -206,7 +206,7 @@ fn a_touch_in_held_out_data_is_told() {
         ("touched", LogRole::Validate, &touched),
     ];
     let outcome = run(&setup, &logs, &[IdentificationInput::Wrench]);
-    let told: Vec<Vec<&Finding>> = (outcome.logs.iter())
+    let disturbances: Vec<Vec<&Finding>> = (outcome.logs.iter())
         .map(|log| {
             log.findings
                 .iter()
@@ -214,9 +214,12 @@ fn a_touch_in_held_out_data_is_told() {
                 .collect()
         })
         .collect();
-    assert!(told[0].is_empty() && told[1].is_empty(), "{told:?}");
-    let [note] = told[2].as_slice() else {
-        panic!("{told:?}")
+    assert!(
+        disturbances[0].is_empty() && disturbances[1].is_empty(),
+        "{disturbances:?}"
+    );
+    let [note] = disturbances[2].as_slice() else {
+        panic!("{disturbances:?}")
     };
     assert_eq!(
         (note.severity, &*note.subject),
@@ -251,8 +254,12 @@ fn jumps_and_grips_in_held_out_data_are_told() {
     let setup = arm();
     let [train, again] = [15, 17].map(|seed| simulate(&setup, &real(&setup, 5), 20.0, 3.0, seed));
     let changed = |rows: Range<usize>, log: &str| {
-        let own = |row: usize, value: f64| value + if rows.contains(&row) { 12.0 } else { 0.0 };
-        change_rows(&change_rows(log, "wrench/ft/fx", own), "wrench/ft/fz", own)
+        let jump = |row: usize, value: f64| value + if rows.contains(&row) { 12.0 } else { 0.0 };
+        change_rows(
+            &change_rows(log, "wrench/ft/fx", jump),
+            "wrench/ft/fz",
+            jump,
+        )
     };
     let (slipped, gripped) = (changed(900..usize::MAX, &again), changed(900..1100, &again));
     let logs = [
@@ -334,7 +341,7 @@ fn a_jump_of_an_offset_is_told_and_does_no_harm() {
             (1.0 + (row as f64 - 900.0) / f64::max(100.0 * seconds, 1.0)).clamp(0.0, 1.0)
         };
         let slip = change_rows(&train, &column, |row, value| value + 5.0 * share(row));
-        let of = |train: &str| {
+        let outcome_of = |train: &str| {
             let logs = [
                 ("train", LogRole::Train, train),
                 ("rest", LogRole::Validate, &*rest),
@@ -343,7 +350,7 @@ fn a_jump_of_an_offset_is_told_and_does_no_harm() {
             assert_eq!(outcome.verdict, Verdict::Identified);
             outcome
         };
-        let (free, jumped) = (of(&train), of(&slip));
+        let (free, jumped) = (outcome_of(&train), outcome_of(&slip));
         let named = |outcome: &Outcome| -> Vec<FindingCode> {
             let findings = outcome.logs.iter().flat_map(|log| &log.findings);
             findings.map(|f| f.code).collect()
@@ -449,7 +456,7 @@ fn offsets_and_drifts_are_no_fault_of_the_parameters() {
         };
         header.to_owned() + "\n" + &rows.map(row).collect::<String>()
     };
-    let of = |table: &str| {
+    let predicted = |table: &str| {
         let logs = [
             ("first", LogRole::Train, &first[..]),
             ("second", LogRole::Validate, table),
@@ -458,7 +465,7 @@ fn offsets_and_drifts_are_no_fault_of_the_parameters() {
         outcome.logs[1].predicted.clone()
     };
     let [still, offset, drifting] =
-        [second.clone(), changed(0.0), changed(1.0)].map(|table| of(&table));
+        [second.clone(), changed(0.0), changed(1.0)].map(|table| predicted(&table));
     let near = |a: f64, b: f64| (a / b - 1.0).abs() < 1e-5;
     for (a, b) in [(&still, &offset), (&still, &drifting)] {
         let (a, b) = (&a.relative_error_with_drift, &b.relative_error_with_drift);
@@ -474,12 +481,12 @@ fn offsets_and_drifts_are_no_fault_of_the_parameters() {
         "{a:?} {b:?}"
     );
     let rms = |predicted: &Predicted| {
-        let own = predicted
+        let sensor = predicted
             .sensors
             .iter()
             .find(|(name, _)| name == "r_leg_ft_sensor")
             .expect("it is compared");
-        own.1.cad[0]
+        sensor.1.cad[0]
     };
     let (a, b) = (rms(&still), rms(&drifting));
     // A drift of 1 N/s over some ten seconds, about its mean, in addition to the readings.

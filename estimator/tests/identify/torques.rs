@@ -28,14 +28,14 @@ fn the_number_of_cores_changes_nothing() {
     };
     let on_one = std::thread::scope(|scope| {
         let alone = scope.spawn(|| {
-            let own = Pid::from_raw(0);
-            let all = sched_getaffinity(own).expect("the cores");
+            let this_thread = Pid::from_raw(0);
+            let all = sched_getaffinity(this_thread).expect("the cores");
             let core = (0..CpuSet::count())
                 .find(|&core| all.is_set(core) == Ok(true))
                 .expect("a core");
             let mut one = CpuSet::new();
             one.set(core).expect("a core");
-            sched_setaffinity(own, &one).expect("one core");
+            sched_setaffinity(this_thread, &one).expect("one core");
             assert_eq!(
                 std::thread::available_parallelism().map_or(0, usize::from),
                 1
@@ -154,7 +154,7 @@ fn noise_of_a_torque_that_was_seldom_measured_is_known() {
         joint != 5 || (1080..1240).contains(&i)
     });
     let outcome = run(&setup, &[("long", LogRole::Train, &log)], &TORQUE);
-    let of = |joint: &str| {
+    let deviation = |joint: &str| {
         let name = format!("joint/{joint}/torque");
         outcome
             .channels
@@ -165,9 +165,9 @@ fn noise_of_a_torque_that_was_seldom_measured_is_known() {
     };
     for joint in ["j5", "j6"] {
         assert!(
-            (of(joint) / 0.02 - 1.0).abs() < 0.3,
+            (deviation(joint) / 0.02 - 1.0).abs() < 0.3,
             "{joint}: {}",
-            of(joint)
+            deviation(joint)
         );
     }
 }
@@ -263,16 +263,16 @@ fn a_negative_rotor_is_named() {
         &[("log", LogRole::Train, &at_the_motors(&log, &rotors, 0.5))],
         &TORQUE,
     );
-    let of = |joint: &str| {
+    let rotor = |joint: &str| {
         outcome
             .rotors
             .iter()
             .find(|r| r.joint == joint)
             .expect("a rotor")
     };
-    assert_eq!(of("j4").inertia, 0.0);
+    assert_eq!(rotor("j4").inertia, 0.0);
     // A rotor that does not exist is negative by chance only.
-    let none = of("j6");
+    let none = rotor("j6");
     assert!(
         (0.0..3.0 * none.deviation).contains(&none.inertia),
         "{none:?}"
@@ -432,14 +432,14 @@ fn late_readings_are_found_with_their_deviation() {
             off.abs() < 4.0 * deviation + 0.03 * 0.01 * late.abs() && deviation < 2e-3,
             "{offset:?}"
         );
-        let told = outcome
+        let offsets = outcome
             .findings
             .iter()
             .filter(|f| f.code == FindingCode::TimeOffset);
-        let told: Vec<&str> = told.map(|f| f.text.as_str()).collect();
-        assert_eq!(told.len(), usize::from(late != 0.0), "{told:?}");
+        let texts: Vec<&str> = offsets.map(|f| f.text.as_str()).collect();
+        assert_eq!(texts.len(), usize::from(late != 0.0), "{texts:?}");
         let word = if late > 0.0 { "behind" } else { "ahead of" };
-        assert!(told.iter().all(|text| text.contains(word)), "{told:?}");
+        assert!(texts.iter().all(|text| text.contains(word)), "{texts:?}");
     }
 }
 

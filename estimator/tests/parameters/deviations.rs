@@ -226,9 +226,9 @@ proptest! {
                     Unknown::Gain { of, .. } => -read[of],
                     Unknown::Temperature { .. } => kelvin,
                 };
-                let own = root.column(column) * factor;
+                let scaled = root.column(column) * factor;
                 let mut sum = together.column_mut(10 * all.len() + 6 * sensor + unknown.channel());
-                sum += own;
+                sum += scaled;
                 column += 1;
             }
         }

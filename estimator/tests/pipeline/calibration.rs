@@ -249,13 +249,13 @@ fn without_a_temperature_torques_are_less_certain() {
         }
         pipeline.finish();
         let torques = pipeline.poll().unwrap().torques;
-        let told: Vec<&str> = pipeline.without_temperature().collect();
+        let missing: Vec<&str> = pipeline.without_temperature().collect();
         let deviations: Vec<f64> = torques
             .joints()
             .iter()
             .map(|j| j.standard_deviation)
             .collect();
-        (deviations, told == ["l_arm_ft_sensor"])
+        (deviations, missing == ["l_arm_ft_sensor"])
     };
     let known = std(Some(30.0), 0.0);
     assert!(!known.1);

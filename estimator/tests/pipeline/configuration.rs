@@ -282,11 +282,11 @@ fn what_carries_an_imu_need_not_be_named() {
             .all(|name| named[*name] == others[*name] && !named[*name][9].is_empty())
     );
     // It is told; and on the part of the robot beyond the sensor a contact carries nothing.
-    let told = |setup: &Setup| setup.warnings().iter().any(|w| w.contains("does not fly"));
-    assert!(told(&setup(unnamed)));
-    assert!(!told(&setup(possible)));
+    let warns = |setup: &Setup| setup.warnings().iter().any(|w| w.contains("does not fly"));
+    assert!(warns(&setup(unnamed)));
+    assert!(!warns(&setup(possible)));
     // What may fly says so.
-    assert!(!told(&setup(|config| {
+    assert!(!warns(&setup(|config| {
         config.contact[0].presence = Occurrence::Possible;
     })));
 }

@@ -10,7 +10,7 @@ fn an_undeclared_contact_is_detected() {
     let count_free = free.len();
     let log = joined(&header, &[(&free, 0.0), (&pushed, 60.0)]);
     let found = estimates_of(possible_hand_contact, &log, |_| [0.0; 6]);
-    let told = estimates_of(
+    let declared = estimates_of(
         |config| {
             possible_hand_contact(config);
             config.contact.last_mut().unwrap().presence = Occurrence::Always;
@@ -26,18 +26,18 @@ fn an_undeclared_contact_is_detected() {
     let (before, after) = is_found.split_at(count_free);
     let [before, after] = [before, after].map(|of| of.iter().filter(|found| **found).count());
     assert!(before == 0 && after > 190, "{before} {after}");
-    for (name, cells) in &told {
+    for (name, cells) in &declared {
         // Standard deviations are those of the posture in which contacts changed.
         if name.starts_with("residual/") || name.contains("_std") || name == "contact/hand/detected"
         {
             continue;
         }
         let pairs = cells.iter().zip(&found[name]).zip(&is_found);
-        for ((told, found), is_found) in pairs {
-            assert!(!is_found || told == found, "{name}: {told} {found}");
+        for ((declared, found), is_found) in pairs {
+            assert!(!is_found || declared == found, "{name}: {declared} {found}");
         }
     }
-    assert!(told["contact/hand/detected"].iter().all(|d| d == "0"));
+    assert!(declared["contact/hand/detected"].iter().all(|d| d == "0"));
     let names = found["residual/l_upper_arm/reason"].iter().zip(&is_found);
     assert!(
         names
@@ -51,7 +51,7 @@ fn an_undeclared_contact_is_detected() {
             .all(|(std, is_found)| std.is_empty() != *is_found)
     );
     assert!(
-        told["residual/l_upper_arm/significance"]
+        declared["residual/l_upper_arm/significance"]
             .iter()
             .all(String::is_empty)
     );
@@ -149,9 +149,9 @@ fn an_unexplained_residual_withholds_the_torques_of_its_sub_tree() {
                 );
             }
         }
-        let told = |number: usize| found["residual/l_upper_arm/reason"][number].as_str();
+        let reason = |number: usize| found["residual/l_upper_arm/reason"][number].as_str();
         let expected = |n: usize| if push(n) > 0.0 { "unexplained" } else { "" };
-        assert!((0..201).all(|n| matches!(n, 50 | 100) || told(n) == expected(n)));
+        assert!((0..201).all(|n| matches!(n, 50 | 100) || reason(n) == expected(n)));
         // The residual is the added wrench, with opposite sign: it acts from parent to child.
         let force: f64 = ["fx", "fy", "fz"]
             .map(|axis| {

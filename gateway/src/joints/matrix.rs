@@ -156,8 +156,8 @@ fn inverse(rows: &[Vec<f64>]) -> Option<Vec<Vec<f64>>> {
     for column in 0..n {
         let size = |row: &Vec<f64>| row.get(column).map_or(0.0, |x| x.abs());
         let largest = (column..n).max_by(|a, b| {
-            let of = |i: usize| work.get(i).map_or(0.0, size);
-            of(*a).total_cmp(&of(*b))
+            let row_size = |i: usize| work.get(i).map_or(0.0, size);
+            row_size(*a).total_cmp(&row_size(*b))
         })?;
         work.swap(column, largest);
         let mut pivot_row = work.get(column)?.clone();
@@ -267,23 +267,32 @@ mod tests {
 
     #[test]
     fn a_matrix_that_is_no_coupling_is_refused() {
-        let of = |matrix: &[&[f64]]| {
+        let condition = |matrix: &[&[f64]]| {
             let rows: Vec<Vec<f64>> = matrix.iter().map(|row| row.to_vec()).collect();
             Matrix::new(&rows, 2).map(|m| m.condition())
         };
-        assert_eq!(of(&[&[1.0, 0.0]]), Err(MatrixError::Shape(2)));
-        assert_eq!(of(&[&[1.0, 0.0], &[0.0]]), Err(MatrixError::Shape(2)));
+        assert_eq!(condition(&[&[1.0, 0.0]]), Err(MatrixError::Shape(2)));
         assert_eq!(
-            of(&[&[1.0, 0.0], &[0.0, f64::NAN]]),
+            condition(&[&[1.0, 0.0], &[0.0]]),
+            Err(MatrixError::Shape(2))
+        );
+        assert_eq!(
+            condition(&[&[1.0, 0.0], &[0.0, f64::NAN]]),
             Err(MatrixError::NotFinite)
         );
-        assert_eq!(of(&[&[1.0, 2.0], &[2.0, 4.0]]), Err(MatrixError::Singular));
-        assert_eq!(of(&[&[0.0, 0.0], &[1.0, 4.0]]), Err(MatrixError::Singular));
-        let near = of(&[&[1.0, 1.0], &[1.0, 1.001]]);
+        assert_eq!(
+            condition(&[&[1.0, 2.0], &[2.0, 4.0]]),
+            Err(MatrixError::Singular)
+        );
+        assert_eq!(
+            condition(&[&[0.0, 0.0], &[1.0, 4.0]]),
+            Err(MatrixError::Singular)
+        );
+        let near = condition(&[&[1.0, 1.0], &[1.0, 1.001]]);
         assert!(matches!(near, Err(MatrixError::Condition(c)) if c > 4000.0 && c < 4010.0));
         // The size of the numbers is no matter.
-        assert_eq!(of(&[&[1e-4, 1e-4], &[-1e-4, 1e-4]]), Ok(2.0));
-        assert_eq!(of(&[&[0.0, 1.0], &[-1.0, 0.0]]), Ok(1.0));
+        assert_eq!(condition(&[&[1e-4, 1e-4], &[-1e-4, 1e-4]]), Ok(2.0));
+        assert_eq!(condition(&[&[0.0, 1.0], &[-1.0, 0.0]]), Ok(1.0));
     }
 
     proptest! {

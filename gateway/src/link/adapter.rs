@@ -216,12 +216,12 @@ pub fn present(sys: &Path) -> Vec<Present> {
     let mut present: Vec<Present> = (entries.into_iter().flatten().flatten())
         .filter(|entry| text(&entry.path().join("type")).as_deref() == Some(ARPHRD_CAN))
         .map(|entry| {
-            let of = |file: &str| entry.path().join(file);
+            let path = |file: &str| entry.path().join(file);
             Present {
                 interface: entry.file_name().to_string_lossy().into_owned(),
-                usb: usb(&of("device")),
+                usb: usb(&path("device")),
                 // The one that a driver does not set is 0.
-                channel: number(&of("dev_port")).max(number(&of("dev_id"))),
+                channel: number(&path("dev_port")).max(number(&path("dev_id"))),
             }
         })
         .collect();

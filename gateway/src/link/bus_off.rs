@@ -120,48 +120,48 @@ mod tests {
             classes: 0x44,
             data: [0, 0x4C, 0, 0, 0, 0x7F, 0x7F, 0],
         };
-        let mut own = BusOff::default();
-        own.report(error, MS(0));
-        own.look(true, MS(10_000));
-        assert!(!own.is_suspected() && !own.is_off());
+        let mut bus = BusOff::default();
+        bus.report(error, MS(0));
+        bus.look(true, MS(10_000));
+        assert!(!bus.is_suspected() && !bus.is_off());
     }
 
     #[test]
     fn silence_or_a_lost_carrier_confirms_a_report_and_a_frame_refutes_it() {
         let reported = || {
-            let mut own = BusOff::default();
-            own.report(OFF, MS(0));
-            assert!(own.is_suspected() && !own.is_off());
-            own
+            let mut bus = BusOff::default();
+            bus.report(OFF, MS(0));
+            assert!(bus.is_suspected() && !bus.is_off());
+            bus
         };
-        let mut own = reported();
-        own.look(true, PATIENCE - Nanos(1));
-        assert!(!own.is_off());
-        own.look(true, PATIENCE);
-        assert!(own.is_off() && !own.is_suspected());
-        own.look(true, LINK_WATCH - Nanos(1));
-        assert!(own.is_off());
-        own.look(true, LINK_WATCH);
-        assert!(!own.is_off(), "the carrier is there");
+        let mut bus = reported();
+        bus.look(true, PATIENCE - Nanos(1));
+        assert!(!bus.is_off());
+        bus.look(true, PATIENCE);
+        assert!(bus.is_off() && !bus.is_suspected());
+        bus.look(true, LINK_WATCH - Nanos(1));
+        assert!(bus.is_off());
+        bus.look(true, LINK_WATCH);
+        assert!(!bus.is_off(), "the carrier is there");
 
-        let mut own = reported();
-        own.look(false, MS(1));
-        assert!(own.is_off());
-        own.look(false, MS(60_000));
-        assert!(own.is_off(), "until the carrier is back");
-        own.report(
+        let mut bus = reported();
+        bus.look(false, MS(1));
+        assert!(bus.is_off());
+        bus.look(false, MS(60_000));
+        assert!(bus.is_off(), "until the carrier is back");
+        bus.report(
             ErrorFrame {
                 classes: 0x100,
                 ..OFF
             },
             MS(60_001),
         );
-        assert!(!own.is_off(), "restarted");
+        assert!(!bus.is_off(), "restarted");
 
-        let mut own = reported();
-        own.receive();
-        own.look(true, MS(1000));
-        assert!(!own.is_off() && !own.is_suspected());
+        let mut bus = reported();
+        bus.receive();
+        bus.look(true, MS(1000));
+        assert!(!bus.is_off() && !bus.is_suspected());
     }
 
     /// Reports every 10 ms, a frame every 60 ms: each belief is wrong.

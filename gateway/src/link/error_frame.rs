@@ -166,8 +166,8 @@ mod tests {
         for (classes, data, causes, words) in golden {
             let frame = frame(classes, data);
             assert_eq!(frame.causes().collect::<Vec<_>>(), causes, "{frame:?}");
-            let told = frame.to_string().to_lowercase();
-            assert!(told.contains(&words.to_lowercase()), "{told} {words}");
+            let text = frame.to_string().to_lowercase();
+            assert!(text.contains(&words.to_lowercase()), "{text} {words}");
         }
         let all: Vec<E> = frame(0x3FF, [0xFF; 8]).causes().collect();
         assert_eq!(all, E::ALL, "in the order of the counters");

@@ -255,12 +255,12 @@ impl<R: BufRead> LogReader<R> {
     /// The first lines or objects that could not be read: `line 7: why`.
     pub fn bad(&self) -> impl Iterator<Item = String> {
         let part = self.part();
-        let told = move |(number, error): &(u64, LineError)| match error {
+        let text = move |(number, error): &(u64, LineError)| match error {
             // Of the whole file.
             LineError::NoLog(_) => error.to_string(),
             _ => format!("{part} {number}: {error}"),
         };
-        self.report.first_bad.iter().map(told)
+        self.report.first_bad.iter().map(text)
     }
 
     /// Why a log without a frame has none.

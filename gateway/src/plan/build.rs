@@ -539,9 +539,9 @@ mod tests {
             },
         ];
         let sensors = builder.sensors(&device("hand"), &outputs).unwrap();
-        let of = |o: &OutputPlan| (o.number, o.channel, o.kind);
+        let key = |o: &OutputPlan| (o.number, o.channel, o.kind);
         assert_eq!(
-            sensors.iter().map(of).collect::<Vec<_>>(),
+            sensors.iter().map(key).collect::<Vec<_>>(),
             [(0, 0, Kind::Wrench), (7, 1, Kind::Skin)]
         );
         let names: Vec<&str> = builder

@@ -104,7 +104,7 @@ impl Wiring {
         })
     }
 
-    /// The coupling that has motor `name`, and its place there.
+    /// The coupling that has motor `name`, and its index there.
     fn motor(&self, name: &str) -> Option<(usize, usize)> {
         let places = self
             .couplings
@@ -112,25 +112,25 @@ impl Wiring {
             .map(|(raw, _)| raw.motors.iter().position(|m| m == name));
         places
             .enumerate()
-            .find_map(|(coupling, place)| Some((coupling, place?)))
+            .find_map(|(coupling, index)| Some((coupling, index?)))
     }
 
     /// The name of the channel of joint or motor `name`; a motor's is that of the joint in its
     /// place.
     pub(super) fn channel_name<'a>(&'a self, name: &'a str) -> &'a str {
         self.motor(name)
-            .and_then(|(coupling, place)| self.couplings.get(coupling)?.0.joints.get(place))
+            .and_then(|(coupling, index)| self.couplings.get(coupling)?.0.joints.get(index))
             .map_or(name, String::as_str)
     }
 
     /// The number of the channel `name`, if it is a joint's.
     pub(super) fn channel(&self, name: &str) -> Option<u32> {
         let shaft = self.plan.shafts.iter().find(|shaft| shaft.name == name);
-        let own = shaft.and_then(|shaft| match shaft.role {
+        let channel = shaft.and_then(|shaft| match shaft.role {
             ShaftRole::Joint(channel) => Some(channel),
             ShaftRole::Motor(..) => None,
         });
-        own.or_else(|| {
+        channel.or_else(|| {
             let couplings = self.couplings.iter().zip(&self.channels);
             let mut joints = couplings.flat_map(|((raw, _), known)| raw.joints.iter().zip(known));
             joints.find_map(|(joint, channel)| channel.filter(|_| joint == name))
@@ -164,15 +164,15 @@ impl Wiring {
         };
         let role = match self.motor(&raw.name) {
             None => ShaftRole::Joint(channel),
-            Some((coupling, place)) => {
+            Some((coupling, index)) => {
                 let joint = self
                     .channels
                     .get_mut(coupling)
-                    .and_then(|c| c.get_mut(place));
+                    .and_then(|c| c.get_mut(index));
                 if let Some(known) = joint {
                     *known = Some(channel);
                 }
-                ShaftRole::Motor(coupling, place)
+                ShaftRole::Motor(coupling, index)
             }
         };
         let at = self.attach(&raw.name, role, input);
@@ -191,13 +191,13 @@ impl Wiring {
             });
             shafts.len() - 1
         });
-        let place = shafts.get_mut(number).map_or(0, |shaft| {
+        let index = shafts.get_mut(number).map_or(0, |shaft| {
             shaft.inputs.push(input);
             shaft.inputs.len() - 1
         });
         ShaftInput {
             shaft: number,
-            place,
+            index,
             wrap: None,
         }
     }
@@ -304,8 +304,8 @@ impl Wiring {
                     let joint = shafts.get(joint.shaft);
                     joint.is_some_and(|joint| joint.name == shaft.name)
                 };
-                let place = coupling.joints.iter().position(is_it)?;
-                let motor = shafts.get(*coupling.motors.get(place)?)?;
+                let index = coupling.joints.iter().position(is_it)?;
+                let motor = shafts.get(*coupling.motors.get(index)?)?;
                 match motor.position()?.origin {
                     Origin::Device(device, _) => device,
                     Origin::Coupling(_) => return None,

@@ -150,8 +150,8 @@ fn sync(devices: &[FoundDevice]) -> String {
     let Some(first) = devices.iter().find(waits) else {
         return String::new();
     };
-    let own = format!("{}_{}", first.finding.driver, first.finding.address);
-    let prefix = first.name.strip_suffix(&own).unwrap_or_default();
+    let usual_name = format!("{}_{}", first.finding.driver, first.finding.address);
+    let prefix = first.name.strip_suffix(&usual_name).unwrap_or_default();
     let name = quoted(&format!("{prefix}canopen_sync"));
     let who = line(&first.name);
     format!(
@@ -332,9 +332,9 @@ mod tests {
             heard.on_frame(&Frame::new(Id::standard(raw), &data[..len]));
         }
         for raw in [0x7A0, 0x730] {
-            let mut own = Traffic::new();
-            own.on_frame(&Frame::new(Id::standard(raw), &[0xFF, 0x0C, 2, 0, 8]));
-            let text = file("r", &[bus("b", devices(&own, "b_"))]);
+            let mut traffic = Traffic::new();
+            traffic.on_frame(&Frame::new(Id::standard(raw), &[0xFF, 0x0C, 2, 0, 8]));
+            let text = file("r", &[bus("b", devices(&traffic, "b_"))]);
             let plan = Plan::parse(&text, Path::new("."));
             let plan = plan.unwrap_or_else(|e| panic!("{e}\n{text}"));
             let drivers: Vec<&str> = plan.buses[0].devices.iter().map(|d| &*d.driver).collect();

@@ -357,12 +357,12 @@ fn deadlines_are_honoured(bus: &dyn Fixture) {
 
 fn own_frames_do_not_come_back(bus: &dyn Fixture) {
     let (mut a, mut b) = (bus.join(&[]), bus.join(&[]));
-    let of = |who: u16, i: u8| Frame::new(Id::standard(who), &[i]);
+    let frame = |who: u16, i: u8| Frame::new(Id::standard(who), &[i]);
     for i in 0..40 {
-        send(&mut *a, &of(1, i));
-        send(&mut *b, &of(2, i));
+        send(&mut *a, &frame(1, i));
+        send(&mut *b, &frame(2, i));
     }
-    let expected = |who| (0..40).map(|i| of(who, i)).collect::<Vec<_>>();
+    let expected = |who| (0..40).map(|i| frame(who, i)).collect::<Vec<_>>();
     assert_eq!(
         exactly(&mut *a, 40).iter().map(bare).collect::<Vec<_>>(),
         expected(2)

@@ -161,7 +161,7 @@ fn a_log_of_several_buses_is_taken_apart_by_interface_then_by_name() {
         (Some("can1"), "can0"),
         (None, "right"),
     ];
-    let told = |this, buses: &[_]| {
+    let replayed = |this, buses: &[_]| {
         let mut link = Replay::open(&path, Pace::Fast, Matching::of(buses, this), &[]).unwrap();
         let mut ids = Vec::new();
         while let Received::Frame(frame) = link.recv(now()) {
@@ -170,7 +170,7 @@ fn a_log_of_several_buses_is_taken_apart_by_interface_then_by_name() {
         assert_eq!(link.unmatched() + ids.len() as u64, 5);
         (ids, link.note())
     };
-    let ids = |this, buses: &[_]| told(this, buses).0;
+    let ids = |this, buses: &[_]| replayed(this, buses).0;
     assert_eq!(ids(0, &buses), [1, 3, 5]);
     assert_eq!(
         ids(1, &buses),
@@ -178,10 +178,10 @@ fn a_log_of_several_buses_is_taken_apart_by_interface_then_by_name() {
         "can0 is the other bus's interface, although it is this bus's name"
     );
     assert!(ids(2, &buses).is_empty());
-    assert_eq!(told(0, &buses[..1]), (vec![1, 3, 5], None));
+    assert_eq!(replayed(0, &buses[..1]), (vec![1, 3, 5], None));
     // A single bus takes all if the log was recorded under another name; that is told if they may
     // be several buses.
-    let (all, note) = told(0, &[(Some("can7"), "arm")]);
+    let (all, note) = replayed(0, &[(Some("can7"), "arm")]);
     assert_eq!(all, [1, 2, 3, 4, 5]);
     let note = note.unwrap();
     assert!(

@@ -24,9 +24,9 @@ impl OwnInterface {
             std::process::id(),
             COUNT.fetch_add(1, Ordering::Relaxed)
         );
-        let own = Self { name };
-        own.create();
-        own
+        let this = Self { name };
+        this.create();
+        this
     }
 
     fn create(&self) {
@@ -87,26 +87,26 @@ fn a_lost_interface_is_told_and_found_again() {
     if !vcan() {
         return;
     }
-    let own = OwnInterface::new();
-    let mut link = SocketCan::open(&own.name, &[Claim::exclusive(Id::standard(7))]).unwrap();
+    let interface = OwnInterface::new();
+    let mut link = SocketCan::open(&interface.name, &[Claim::exclusive(Id::standard(7))]).unwrap();
     let wanted = Frame::new(Id::standard(7), &[1]);
-    own.peer_sends(&wanted);
+    interface.peer_sends(&wanted);
     assert_eq!(bare(&frame(&mut link)), wanted);
 
-    own.ip("link set dev NAME down");
+    interface.ip("link set dev NAME down");
     assert_eq!(link.recv(now() + PATIENCE), Received::StateChanged);
     assert_eq!(link.state(), LinkState::Down);
     assert_eq!(link.send(&wanted), Err(TransmitError::NotUp));
     // Down from the start.
     assert_eq!(
-        SocketCan::open(&own.name, &[]).unwrap().state(),
+        SocketCan::open(&interface.name, &[]).unwrap().state(),
         LinkState::Down
     );
     silent(&mut link);
-    own.ip("link set dev NAME up");
+    interface.ip("link set dev NAME up");
     changes_to(&mut link, LinkState::Up);
-    own.peer_sends(&Frame::new(Id::standard(8), &[]));
-    own.peer_sends(&wanted);
+    interface.peer_sends(&Frame::new(Id::standard(8), &[]));
+    interface.peer_sends(&wanted);
     assert_eq!(
         bare(&frame(&mut link)),
         wanted,
@@ -114,30 +114,30 @@ fn a_lost_interface_is_told_and_found_again() {
     );
 
     for _ in 0..2 {
-        own.ip("link del dev NAME");
+        interface.ip("link del dev NAME");
         assert_eq!(link.recv(now() + PATIENCE), Received::StateChanged);
         assert_eq!(link.state(), LinkState::Gone);
         assert_eq!(link.send(&wanted), Err(TransmitError::NotUp));
         silent(&mut link);
         assert_eq!(link.recv(Nanos::ZERO), Received::TimedOut);
-        own.create();
+        interface.create();
         changes_to(&mut link, LinkState::Up);
-        own.peer_sends(&Frame::new(Id::extended(7), &[]));
-        own.peer_sends(&wanted);
+        interface.peer_sends(&Frame::new(Id::extended(7), &[]));
+        interface.peer_sends(&wanted);
         assert_eq!(bare(&frame(&mut link)), wanted);
         silent(&mut link);
     }
     // Detected when sending, reported when receiving.
-    own.ip("link del dev NAME");
+    interface.ip("link del dev NAME");
     assert_eq!(link.send(&wanted), Err(TransmitError::NotUp));
     assert_eq!(
         (link.state(), link.recv(Nanos::ZERO)),
         (LinkState::Gone, Received::StateChanged)
     );
     // Created again, but down.
-    own.ip("link add dev NAME type vcan");
+    interface.ip("link add dev NAME type vcan");
     changes_to(&mut link, LinkState::Down);
-    own.ip("link set dev NAME mtu 16 up");
+    interface.ip("link set dev NAME mtu 16 up");
     changes_to(&mut link, LinkState::Up);
     // Without mtu 72 there is no CAN FD.
     assert_eq!(
@@ -216,14 +216,14 @@ fn error_frames_are_handed_on_and_set_the_state() {
     if !vcan() {
         return;
     }
-    let own = OwnInterface::new();
-    let mut link = SocketCan::open(&own.name, &[Claim::exclusive(Id::standard(7))]).unwrap();
+    let interface = OwnInterface::new();
+    let mut link = SocketCan::open(&interface.name, &[Claim::exclusive(Id::standard(7))]).unwrap();
     // A driver sends these frames; on a virtual interface any program may.
     let error = |classes: &str, data: &str| {
         let frame = format!("{classes}#{data}");
         assert!(
             Command::new("cansend")
-                .args([&own.name, &frame])
+                .args([&interface.name, &frame])
                 .status()
                 .unwrap()
                 .success()
@@ -268,7 +268,7 @@ fn error_frames_are_handed_on_and_set_the_state() {
     error_frame(&mut link);
     changes_to(&mut link, LinkState::BusOff);
     let wanted = Frame::new(Id::standard(7), &[1]);
-    own.peer_sends(&wanted);
+    interface.peer_sends(&wanted);
     assert_eq!(
         (link.recv(now() + PATIENCE), link.state()),
         (Received::StateChanged, LinkState::Up)
@@ -287,11 +287,11 @@ fn bus_off_ends_while_there_is_a_carrier() {
     if !vcan() {
         return;
     }
-    let own = OwnInterface::new();
-    let mut link = SocketCan::open(&own.name, &[]).unwrap();
+    let interface = OwnInterface::new();
+    let mut link = SocketCan::open(&interface.name, &[]).unwrap();
     assert!(
         Command::new("cansend")
-            .args([&own.name, "20000040#0000000000000000"])
+            .args([&interface.name, "20000040#0000000000000000"])
             .status()
             .unwrap()
             .success()
@@ -303,9 +303,9 @@ fn bus_off_ends_while_there_is_a_carrier() {
     // The flags of a real controller lag behind by up to a second.
     assert!(now() - since > Nanos::from_millis(1000));
     // Down is not bus-off, and up again is up.
-    own.ip("link set dev NAME down");
+    interface.ip("link set dev NAME down");
     changes_to(&mut link, LinkState::Down);
-    own.ip("link set dev NAME up");
+    interface.ip("link set dev NAME up");
     changes_to(&mut link, LinkState::Up);
 }
 
@@ -315,7 +315,7 @@ fn an_interface_without_a_carrier_is_not_up() {
     if !vcan() {
         return;
     }
-    let own = OwnInterface {
+    let interface = OwnInterface {
         name: format!("px{}", std::process::id()),
     };
     let peer = OwnInterface {
@@ -323,15 +323,15 @@ fn an_interface_without_a_carrier_is_not_up() {
     };
     let add = format!(
         "link add dev {} type vxcan peer name {}",
-        own.name, peer.name
+        interface.name, peer.name
     );
     let made = Command::new("/usr/sbin/ip").args(add.split(' ')).status();
     if !made.is_ok_and(|status| status.success()) {
         println!("skipped: this kernel has no vxcan");
         return;
     }
-    own.ip("link set dev NAME up");
-    let mut link = SocketCan::open(&own.name, &[]).unwrap();
+    interface.ip("link set dev NAME up");
+    let mut link = SocketCan::open(&interface.name, &[]).unwrap();
     assert_eq!(link.state(), LinkState::NoCarrier);
     let frame = Frame::new(Id::standard(7), &[1]);
     assert_eq!(link.send(&frame), Err(TransmitError::NotUp));
@@ -351,17 +351,17 @@ fn a_full_queue_is_told_at_once() {
     if !vcan() {
         return;
     }
-    let own = OwnInterface::new();
+    let interface = OwnInterface::new();
     let shape = format!(
         "qdisc add dev {} root tbf rate 1kbit burst 16b limit 160b",
-        own.name
+        interface.name
     );
     let made = Command::new("/usr/sbin/tc").args(shape.split(' ')).status();
     if !made.is_ok_and(|status| status.success()) {
         println!("skipped: this kernel has no tbf");
         return;
     }
-    let mut link = SocketCan::open(&own.name, &[]).unwrap();
+    let mut link = SocketCan::open(&interface.name, &[]).unwrap();
     let frame = Frame::new(Id::standard(7), &[1]);
     let full = (0..40).find(|_| link.send(&frame) == Err(TransmitError::Full));
     assert!((8..20).contains(&full.unwrap()), "{full:?}");
@@ -389,19 +389,19 @@ fn the_kernel_tells_what_it_knows_of_an_interface() {
     if !vcan() {
         return;
     }
-    let own = OwnInterface::new();
+    let interface = OwnInterface::new();
     let mut netlink = Netlink::default();
-    let before = netlink.ask(&own.name).unwrap();
-    own.peer_sends(&Frame::new(Id::standard(7), &[1]));
-    let after = netlink.ask(&own.name).unwrap();
+    let before = netlink.ask(&interface.name).unwrap();
+    interface.peer_sends(&Frame::new(Id::standard(7), &[1]));
+    let after = netlink.ask(&interface.name).unwrap();
     assert_eq!(after.tx_frames, before.tx_frames + 1);
     assert_eq!(
         (after.fd, after.controller.get()),
         (1, Some(Controller::Unknown))
     );
-    own.ip("link set dev NAME down");
-    own.ip("link set dev NAME mtu 16");
-    assert_eq!(netlink.ask(&own.name).unwrap().fd, 0);
+    interface.ip("link set dev NAME down");
+    interface.ip("link set dev NAME mtu 16");
+    assert_eq!(netlink.ask(&interface.name).unwrap().fd, 0);
 }
 
 #[test]

@@ -6,7 +6,7 @@ mod offline;
 mod plan;
 
 use proprio_drivers::{Board, Frames, Mode, Spec};
-use proprio_gateway::decoder::{Decoder, build};
+use proprio_gateway::devices::{BusDevices, build};
 use proprio_gateway::inbox::{Replacement, Reply, Request};
 use proprio_gateway::offline::{decode, encode};
 use proprio_gateway::plan::Plan;
@@ -108,7 +108,7 @@ fn ms(ms: f64) -> Nanos {
 /// A bus with its boards.
 struct Rig {
     plan: Plan,
-    decoder: Decoder,
+    devices: BusDevices,
     boards: Vec<Box<dyn Board>>,
     status: Arc<BusStatus>,
 }
@@ -119,7 +119,7 @@ impl Rig {
         let bus = &plan.buses[0];
         let status = Arc::new(BusStatus::new(0, bus));
         let mode = Mode::Listen;
-        let decoder = Decoder::new(0, bus, Some(mode), Arc::clone(&status)).unwrap();
+        let devices = BusDevices::new(0, bus, Some(mode), Arc::clone(&status)).unwrap();
         let boards = bus.devices.iter().map(|device| {
             let spec = Spec {
                 mode,
@@ -129,7 +129,7 @@ impl Rig {
         });
         Self {
             boards: boards.collect(),
-            decoder,
+            devices,
             status,
             plan,
         }
@@ -161,10 +161,10 @@ impl Rig {
         let board = &mut self.boards[device];
         board.encode(0, &reading, quality, &mut frames).unwrap();
         let mut samples = Vec::new();
-        self.decoder.poll_transmit(t, |_, _| {});
+        self.devices.poll_transmit(t, |_, _| {});
         for frame in &frames {
             let frame = frame.at(t, StampKind::Software);
-            self.decoder
+            self.devices
                 .on_frame(&frame, |sample| samples.push(*sample));
         }
         samples
@@ -183,8 +183,8 @@ impl Rig {
             .joints
             .inverse(&output.input.unwrap(), output.map)
             .unwrap();
-        let of = |channel: &u32| joints[self.plan.channels[*channel as usize].name.as_str()];
-        let states: Vec<JointState> = inverse.channels.iter().map(of).collect();
+        let state = |channel: &u32| joints[self.plan.channels[*channel as usize].name.as_str()];
+        let states: Vec<JointState> = inverse.channels.iter().map(state).collect();
         let state = inverse.device(inverse.shaft(&states));
         self.send(device, t, state, Quality::GOOD)
     }
@@ -201,7 +201,7 @@ impl Rig {
             outputs: new.outputs,
         });
         let number = u16::try_from(device).unwrap();
-        let reply = self.decoder.request(number, request, Nanos::ZERO);
+        let reply = self.devices.request(number, request, Nanos::ZERO);
         assert!(matches!(reply, Some(Reply::Replaced(_))), "at once");
     }
 
@@ -429,29 +429,32 @@ fn flags_of_a_motor_are_those_of_its_joints() {
     let with_yaw = text.replace("[[bus.coupling]]", &format!("{encoders}[[bus.coupling]]"));
     for text in [SHOULDER, &with_yaw] {
         let mut rig = Rig::new(text);
-        let mut of = |device: usize, quality: Quality, at: f64| -> Vec<Quality> {
+        let mut send = |device: usize, quality: Quality, at: f64| -> Vec<Quality> {
             let samples = rig.send(device, ms(at), moving(0.0, 0.0), quality);
             samples.iter().map(|s| s.header.quality).collect()
         };
         let (good, fault) = (Quality::GOOD, Quality::DEVICE_FAULT);
-        of(0, good, 0.0);
-        of(1, fault, 1.0);
-        assert_eq!(of(2, good, 2.0), [good, fault, fault]);
+        send(0, good, 0.0);
+        send(1, fault, 1.0);
+        assert_eq!(send(2, good, 2.0), [good, fault, fault]);
         // Replaced by a good one before it was used.
-        of(0, fault, 4.0);
-        of(0, good, 5.0);
-        of(1, good, 6.0);
+        send(0, fault, 4.0);
+        send(0, good, 5.0);
+        send(1, good, 6.0);
         // M^-T is an upper triangle: the third motor's torque is in that of each joint.
-        assert_eq!(of(2, Quality::DRIVE_FAULT, 7.0), [Quality::DRIVE_FAULT; 3]);
-        of(0, Quality::DRIVE_FAULT, 8.0);
-        of(1, good, 9.0);
+        assert_eq!(
+            send(2, Quality::DRIVE_FAULT, 7.0),
+            [Quality::DRIVE_FAULT; 3]
+        );
+        send(0, Quality::DRIVE_FAULT, 8.0);
+        send(1, good, 9.0);
         let drive = Quality::DRIVE_FAULT;
-        assert_eq!(of(2, good, 10.0), [drive, drive, good]);
+        assert_eq!(send(2, good, 10.0), [drive, drive, good]);
         // A gap before a reading that was overtaken is still a gap before the sample.
-        of(0, good, 40.0);
-        of(0, good, 41.0);
-        of(1, good, 42.0);
-        assert_eq!(of(2, good, 43.0), [GAP, GAP, GAP]);
+        send(0, good, 40.0);
+        send(0, good, 41.0);
+        send(1, good, 42.0);
+        assert_eq!(send(2, good, 43.0), [GAP, GAP, GAP]);
     }
 }
 
@@ -683,8 +686,8 @@ fn a_replaced_source_marks_what_it_changes() {
     // A motor of a coupling: its joints are marked, the others are not.
     let mut rig = Rig::new(SHOULDER);
     let round = |rig: &mut Rig, at: f64| -> Vec<Quality> {
-        let of = |device: usize| rig.send(device, ms(at), moving(0.0, 0.0), Quality::GOOD);
-        let samples: Vec<Sample> = [0, 1, 2].into_iter().flat_map(of).collect();
+        let send = |device: usize| rig.send(device, ms(at), moving(0.0, 0.0), Quality::GOOD);
+        let samples: Vec<Sample> = [0, 1, 2].into_iter().flat_map(send).collect();
         samples.iter().map(|s| s.header.quality).collect()
     };
     let good = Quality::GOOD;

@@ -106,11 +106,11 @@ fn kept(format: LogFormat, mut entry: Entry) -> Option<Entry> {
 
 /// Asserts that the files in `folder` have the messages of its candump log.
 fn assert_same_messages(folder: &Path) -> usize {
-    let of = |name: &str| read(&std::fs::read(folder.join(name)).unwrap());
-    let truth = of("bus.log");
+    let frames = |name: &str| read(&std::fs::read(folder.join(name)).unwrap());
+    let truth = frames("bus.log");
     assert_eq!(truth.report.bad, 0);
     for (name, format) in FILES {
-        let found = of(name);
+        let found = frames(name);
         assert_eq!(found.format, Some(format), "{name}");
         assert_eq!(found.report.bad, 0, "{name}: {:?}", found.report);
         let expected = truth.entries.iter().cloned();
@@ -503,10 +503,10 @@ fn a_log_cut_anywhere_yields_a_beginning_of_its_frames() {
             most = count;
             // Every line that ended is read, and a line or object that did not is told.
             let binary = log.starts_with(b"LOGG");
-            let told = found.report.bad > 0;
+            let is_told = found.report.bad > 0;
             if binary {
-                assert!(told || end == 0 || count == whole.len(), "{name}: {end}");
-            } else if !told {
+                assert!(is_told || end == 0 || count == whole.len(), "{name}: {end}");
+            } else if !is_told {
                 assert_eq!(read(&[&log[..end], b"\n"].concat()).entries.len(), count);
             }
             assert!(found.report.bad <= 1, "{name}: {end}: {:?}", found.report);
@@ -664,9 +664,9 @@ fn logs_are_replayed_at_their_pace() {
     let pdf = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(pdf.path(), "%PDF-1.7\n").unwrap();
     let error = Replay::open(pdf.path(), Pace::Recorded, None, &[]).unwrap_err();
-    let told = error.to_string();
+    let text = error.to_string();
     assert!(
-        told.contains("it holds no frame: it is a PDF document"),
-        "{told}"
+        text.contains("it holds no frame: it is a PDF document"),
+        "{text}"
     );
 }

@@ -112,10 +112,10 @@ impl fmt::Write for Line {
     fn write_str(&mut self, text: &str) -> fmt::Result {
         for letter in text.chars() {
             let start = usize::from(self.length);
-            let Some(place) = self.bytes.get_mut(start..start + letter.len_utf8()) else {
+            let Some(slot) = self.bytes.get_mut(start..start + letter.len_utf8()) else {
                 return Err(fmt::Error);
             };
-            letter.encode_utf8(place);
+            letter.encode_utf8(slot);
             self.length += u8::try_from(letter.len_utf8()).unwrap_or(0);
         }
         Ok(())
@@ -216,8 +216,8 @@ impl TorqueBudget {
         if let Some(own) = parts.iter_mut().find(same) {
             own.variance += part.variance;
             own.travel = own.travel.max(part.travel);
-        } else if let Some(place) = self.parts.get_mut(count) {
-            *place = part;
+        } else if let Some(slot) = self.parts.get_mut(count) {
+            *slot = part;
             self.count += 1;
         } else if let Some(last) = self.parts.last_mut() {
             *last = BudgetPart {

@@ -343,16 +343,16 @@ mod tests {
 
     #[test]
     fn counts_are_integers_of_their_range() {
-        let of = |kind, v| Reading::from_values(kind, &[v; VALUES]);
+        let reading = |kind, v| Reading::from_values(kind, &[v; VALUES]);
         for bad in [f64::NAN, f64::INFINITY, 0.5, 5e9, -5e9] {
-            assert_eq!(of(Kind::Gauges, bad), None);
-            assert_eq!(of(Kind::Actuator, bad), None);
-            assert_eq!(of(Kind::Skin, bad), None);
+            assert_eq!(reading(Kind::Gauges, bad), None);
+            assert_eq!(reading(Kind::Actuator, bad), None);
+            assert_eq!(reading(Kind::Skin, bad), None);
         }
-        assert_eq!(of(Kind::Actuator, -1.0), None);
-        assert_eq!(of(Kind::Gauges, 3e9), None);
-        assert!(of(Kind::Gauges, -2_147_483_648.0).is_some());
-        assert!(of(Kind::Actuator, 4_294_967_295.0).is_some());
+        assert_eq!(reading(Kind::Actuator, -1.0), None);
+        assert_eq!(reading(Kind::Gauges, 3e9), None);
+        assert!(reading(Kind::Gauges, -2_147_483_648.0).is_some());
+        assert!(reading(Kind::Actuator, 4_294_967_295.0).is_some());
     }
 
     proptest! {

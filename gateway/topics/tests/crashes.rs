@@ -133,8 +133,8 @@ fn a_watch_tells_a_killed_gateway_from_one_that_has_left() {
     let config = DomainConfig::new(base.path(), "test");
     let domain = Domain::open(&config).unwrap();
     let mut watch = Watch::<GatewayHealth>::default();
-    let mut look = || watch.look(&domain, "icub", monotonic());
-    assert_eq!(look(), Presence::NotStarted);
+    let mut state = || watch.look(&domain, "icub", monotonic());
+    assert_eq!(state(), Presence::NotStarted);
     let start = || {
         let mut child = spawn("writer", &config);
         await_ready(&mut child, || ());
@@ -147,16 +147,16 @@ fn a_watch_tells_a_killed_gateway_from_one_that_has_left() {
     ];
     for (end, went) in ends {
         let first = start();
-        assert_eq!(look(), Presence::Running);
+        assert_eq!(state(), Presence::Running);
         end(first);
-        assert_eq!([look(), look()], [went; 2]);
+        assert_eq!([state(), state()], [went; 2]);
         let second = start();
-        assert_eq!(look(), Presence::Running);
+        assert_eq!(state(), Presence::Running);
         end(second);
         let third = start();
-        assert_eq!([look(), look()], [went, Presence::Running]);
+        assert_eq!([state(), state()], [went, Presence::Running]);
         end(third);
-        assert_eq!(look(), went);
+        assert_eq!(state(), went);
     }
 }
 

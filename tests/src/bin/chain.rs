@@ -34,8 +34,8 @@ fn main() -> ExitCode {
     };
     let seeds = first.parse().expect("a seed")..=last.parse::<u64>().expect("a seed");
     let meant = |name: &str, all: &[&str]| {
-        let own: Vec<&&str> = words.iter().filter(|word| all.contains(word)).collect();
-        own.is_empty() || own.iter().any(|word| **word == name)
+        let named: Vec<&&str> = words.iter().filter(|word| all.contains(word)).collect();
+        named.is_empty() || named.iter().any(|word| **word == name)
     };
     let names: Vec<&str> = Fault::ALL.iter().map(|(name, _)| *name).collect();
     let families: Vec<&str> = FAMILIES.iter().map(|family| family.name).collect();
@@ -80,8 +80,8 @@ fn main() -> ExitCode {
         },
     );
     let those = |is: &dyn Fn(&Case) -> bool| -> Vec<&Shown> {
-        let own = shown.iter().filter(|(case, _)| is(case));
-        own.map(|(_, shown)| shown).collect()
+        let lines = shown.iter().filter(|(case, _)| is(case));
+        lines.map(|(_, shown)| shown).collect()
     };
     table("fault", &names, |name| those(&|case| case.fault.0 == name));
     table("family", &families, |name| {

@@ -64,14 +64,14 @@ fn named(names: &[&str]) -> Vec<(&'static str, Trouble)> {
 
 /// The line of the table, and how many runs break the promise.
 fn line(outcomes: &[(&u64, Outcome)]) -> (String, usize) {
-    let of = || outcomes.iter().map(|(_, outcome)| outcome);
-    let broken = of().filter(|outcome| outcome.is_broken()).count();
-    let [all, valid] = [0, 1].map(|k| of().map(|outcome| outcome.late[k]).sum::<usize>());
-    let mut deviations: Vec<f64> = of().map(|outcome| outcome.deviation).collect();
+    let all_outcomes = || outcomes.iter().map(|(_, outcome)| outcome);
+    let broken = all_outcomes().filter(|outcome| outcome.is_broken()).count();
+    let [all, valid] = [0, 1].map(|k| all_outcomes().map(|outcome| outcome.late[k]).sum::<usize>());
+    let mut deviations: Vec<f64> = all_outcomes().map(|outcome| outcome.deviation).collect();
     deviations.retain(|deviation| deviation.is_finite());
     deviations.sort_by(f64::total_cmp);
     let deviation = deviations.get(deviations.len() / 2).copied();
-    let worst = of().filter_map(|outcome| outcome.worst.as_ref());
+    let worst = all_outcomes().filter_map(|outcome| outcome.worst.as_ref());
     let worst = worst.max_by(|a, b| a.share.total_cmp(&b.share));
     let worst = worst.map_or_else(String::new, |worst| {
         let (error, deviations) = (worst.error, worst.deviations);
@@ -82,7 +82,7 @@ fn line(outcomes: &[(&u64, Outcome)]) -> (String, usize) {
     });
     let share = valid as f64 / all.max(1) as f64;
     let deviation = deviation.map_or_else(String::new, |d| format!("{d:.3}"));
-    let mut named: Vec<f64> = of().map(Outcome::named).collect();
+    let mut named: Vec<f64> = all_outcomes().map(Outcome::named).collect();
     named.retain(|named| named.is_finite());
     let count = named.len();
     let named = match count {

@@ -243,14 +243,14 @@ impl ChainRig {
             !robot.cad.joints().iter().any(|joint| moving(&joint.kind))
         };
         let mut robot = (0..).map(|k| Robot::new(seed + 1000 * k)).find(is_rotary)?;
-        let of = |kind: Kind, random: &mut Random| {
+        let pick = |kind: Kind, random: &mut Random| {
             if kind == family.kind {
                 return family;
             }
             let all: Vec<&Family> = FAMILIES.iter().filter(|f| f.kind == kind).collect();
             *all[random.below(all.len())]
         };
-        let families = [Kind::Wrench, Kind::Imu, Kind::Joint].map(|kind| of(kind, random));
+        let families = [Kind::Wrench, Kind::Imu, Kind::Joint].map(|kind| pick(kind, random));
         let finest = families[2].half_step / families[2].ratio;
         let noise = 4.8e-4_f64.max(finest + 1e-4);
         set(
@@ -286,10 +286,10 @@ impl ChainRig {
             plan: plan.clone(),
         };
         let settings = settings(&plan);
-        let wrong = |e: &dyn std::fmt::Display| -> ! { panic!("{}: {e}\n{text}", robot.name) };
+        let fail = |e: &dyn std::fmt::Display| -> ! { panic!("{}: {e}\n{text}", robot.name) };
         Some(Self {
-            simulation: Simulation::new(&simulated, &settings).unwrap_or_else(|e| wrong(&e)),
-            boards: Simulator::new(&simulated, &settings, t0).unwrap_or_else(|e| wrong(&e)),
+            simulation: Simulation::new(&simulated, &settings).unwrap_or_else(|e| fail(&e)),
+            boards: Simulator::new(&simulated, &settings, t0).unwrap_or_else(|e| fail(&e)),
             name: format!("{}; {}", robot.name, families.map(|f| f.name).join(", ")),
             setup,
             plan,

@@ -341,8 +341,8 @@ mod tests {
         let (a, b) = (Sines::new(1.0, random), Sines::new(0.3, random));
         let h = 1e-4;
         for t in [0.3, 2.0, 17.0] {
-            let of = |t: f64| product(a.at(t), b.at(t));
-            let ([before, ..], [x, v, acceleration], [after, ..]) = (of(t - h), of(t), of(t + h));
+            let at = |t: f64| product(a.at(t), b.at(t));
+            let ([before, ..], [x, v, acceleration], [after, ..]) = (at(t - h), at(t), at(t + h));
             assert!(((after - before) / (2.0 * h) - v).abs() < 1e-6);
             assert!(((after - 2.0 * x + before) / (h * h) - acceleration).abs() < 1e-5);
         }

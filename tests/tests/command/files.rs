@@ -32,16 +32,16 @@ fn estimates_from_files_are_those_of_other_libraries() {
         let truth = table(&text);
         for config in ["imu.toml", "fixed.toml"] {
             place.write("log.csv", &text);
-            let told = place
+            let report = place
                 .run(&[
                     "estimate", "--config", config, "--log", "log.csv", "--out", "e.csv", "--json",
                 ])
                 .good()
                 .json();
             assert_eq!(
-                (&told["estimates"], &told["torques_withheld"]),
+                (&report["estimates"], &report["torques_withheld"]),
                 (&201.into(), &0.into()),
-                "{told}"
+                "{report}"
             );
             let estimates = table(&place.read("e.csv"));
             assert_eq!(estimates["t"], truth["t"]);
@@ -239,15 +239,16 @@ fn the_simulator_tells_what_it_did_as_json() {
             "--json",
         ])
         .good();
-    let told = ran.json();
+    let summary = ran.json();
     let push = "link l_hand is pushed at contact hand with up to 10 N and 0.3 Nm, from 0.2 s to \
                 0.3 s; nobody declares it (--skin does)";
     assert!(ran.err.contains(push), "{}", ran.err);
     assert!(
-        told["sent"].as_u64().unwrap() > 500 && told["lost_on_request"].as_u64().unwrap() > 20,
-        "{told}"
+        summary["sent"].as_u64().unwrap() > 500
+            && summary["lost_on_request"].as_u64().unwrap() > 20,
+        "{summary}"
     );
-    assert_eq!(told["truth_rows"], 501);
+    assert_eq!(summary["truth_rows"], 501);
     assert_eq!(table(&place.read("truth.csv"))["t"].len(), 501);
     // It runs until it is stopped.
     let mut process = place.start(&["simulate", "--json"]);

@@ -56,7 +56,7 @@ fn a_mixed_bus_on_the_screen_of_candump_decodes() {
     ]
     .concat();
     place.write("gateway.toml", &config);
-    let told = place
+    let report = place
         .run(&[
             "decode",
             "--config",
@@ -70,7 +70,7 @@ fn a_mixed_bus_on_the_screen_of_candump_decodes() {
         ])
         .good()
         .json();
-    for device in told["devices"].as_array().unwrap() {
+    for device in report["devices"].as_array().unwrap() {
         assert!(device["refusal"].is_null(), "{device}");
     }
     let samples = table(&place.read("s.csv"));
@@ -150,8 +150,8 @@ fn every_candump_format_gives_the_same_samples() {
     let wanted = values(&reference);
     for (name, absolute, text) in formats(&log) {
         let ran = decode(&text);
-        let told: Json = serde_json::from_str(ran.err.lines().last().unwrap()).unwrap();
-        assert_eq!(told["bad_lines"], 0, "{name}: {}", ran.err);
+        let report: Json = serde_json::from_str(ran.err.lines().last().unwrap()).unwrap();
+        assert_eq!(report["bad_lines"], 0, "{name}: {}", ran.err);
         if absolute {
             assert!(ran.out == reference, "{name}: not the same table");
         } else {

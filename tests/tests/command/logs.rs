@@ -33,27 +33,27 @@ fn bad_rows_are_named_and_take_nothing_else_with_them() {
         "good.csv",
         "--assess",
     ];
-    let told = place
+    let ran = place
         .run(&[&assess[..], &["--out", "a.out"]].concat())
         .good();
     // In that configuration the hand may always be touched.
     assert!(
-        told.err.contains("no F/T reading can be predicted"),
+        ran.err.contains("no F/T reading can be predicted"),
         "{}",
-        told.err
+        ran.err
     );
-    let told = place
+    let report = place
         .run(&[&assess[..], &["--out", "a.out", "--json"]].concat())
         .good()
         .json();
-    let assessment = &told["assessment"];
+    let assessment = &report["assessment"];
     assert!(
         assessment["changes"] == 0 && assessment["torques"].is_object(),
-        "{told}"
+        "{report}"
     );
     assert!(
         assessment["predicted"]["relative_error"]["cad"].is_null(),
-        "{told}"
+        "{report}"
     );
     let clean = place.estimate("good.csv", "good.out");
     assert_eq!(
@@ -81,13 +81,13 @@ fn bad_rows_are_named_and_take_nothing_else_with_them() {
         (40, "some of fx fy fz"),
         (50, "t is \"soon\""),
     ] {
-        let told = dirty
+        let lines = dirty
             .err
             .lines()
             .filter(|l| l.starts_with(&format!("bad.csv: line {line}: skipped: ")));
-        let told: Vec<_> = told.collect();
+        let lines: Vec<_> = lines.collect();
         assert!(
-            told.len() == 1 && told[0].contains(what),
+            lines.len() == 1 && lines[0].contains(what),
             "line {line}: {}",
             dirty.err
         );
@@ -152,11 +152,14 @@ fn faults_and_gaps_of_a_log_are_in_its_table_of_samples() {
         gap.len() == 1 && (3.0..3.1).contains(&gap[0]),
         "one reading after the lost half: {gap:?}"
     );
-    let told = place.estimate("samples.csv", "estimates.csv").json();
-    let withheld = told["withheld_by_reason"].as_object().unwrap();
+    let report = place.estimate("samples.csv", "estimates.csv").json();
+    let withheld = report["withheld_by_reason"].as_object().unwrap();
     let sum: u64 = withheld.values().map(|count| count.as_u64().unwrap()).sum();
-    assert!(withheld["device_fault"].as_u64().unwrap() > 1000, "{told}");
-    assert_eq!(told["torques_withheld"], sum, "{told}");
+    assert!(
+        withheld["device_fault"].as_u64().unwrap() > 1000,
+        "{report}"
+    );
+    assert_eq!(report["torques_withheld"], sum, "{report}");
     let text = place.read("estimates.csv");
     let mut rows = text.lines().map(|line| line.split(',').collect::<Vec<_>>());
     let header = rows.next().unwrap();
@@ -247,8 +250,8 @@ fn stamps_that_go_backwards_are_counted_and_take_nothing_else_with_them() {
         "{}",
         dirty.err
     );
-    let told = format!("bad.log: at line {} the time steps back by ", motor + 2);
-    assert!(dirty.err.contains(&told), "{}", dirty.err);
+    let line = format!("bad.log: at line {} the time steps back by ", motor + 2);
+    assert!(dirty.err.contains(&line), "{}", dirty.err);
 }
 
 #[test]
@@ -483,7 +486,7 @@ fn encode_and_decode_are_inverses_within_half_a_step() {
     let place = Place::new();
     let samples = oracle("icub_left_arm_mujoco.csv");
     place.write("samples.csv", &samples);
-    let told = place
+    let report = place
         .run(&[
             "encode",
             "--config",
@@ -497,15 +500,19 @@ fn encode_and_decode_are_inverses_within_half_a_step() {
         .good()
         .json();
     assert_eq!(
-        (&told["rows"], &told["samples"], &told["refused"]),
+        (&report["rows"], &report["samples"], &report["refused"]),
         (&201.into(), &(201 * 9).into(), &0.into()),
-        "{told}"
+        "{report}"
     );
-    let told = place.decode("session.log", "again.csv").json();
+    let report = place.decode("session.log", "again.csv").json();
     assert_eq!(
-        (&told["samples"], &told["bad_lines"], &told["unclaimed"]),
+        (
+            &report["samples"],
+            &report["bad_lines"],
+            &report["unclaimed"]
+        ),
         (&(201 * 9).into(), &0.into(), &0.into()),
-        "{told}"
+        "{report}"
     );
     let (before, after) = (table(&samples), table(&place.read("again.csv")));
     let mut compared = 0;
@@ -612,11 +619,11 @@ fn standard_input_and_output_serve_as_files() {
         )
         .good();
     assert_eq!(decoded.out.lines().count(), 202);
-    let told = decoded.err.lines().last().unwrap();
+    let summary = decoded.err.lines().last().unwrap();
     assert_eq!(
-        serde_json::from_str::<Json>(told).unwrap()["samples"],
+        serde_json::from_str::<Json>(summary).unwrap()["samples"],
         201 * 9,
-        "{told}"
+        "{summary}"
     );
     let estimated = place
         .run_with(
@@ -704,8 +711,8 @@ fn a_decoded_session_is_the_simulators_truth() {
         ..SimulationSettings::default()
     };
     place.write("session.log", &session(4.0, &settings));
-    let told = place.decode("session.log", "s.csv").json();
-    for device in told["devices"].as_array().unwrap() {
+    let report = place.decode("session.log", "s.csv").json();
+    for device in report["devices"].as_array().unwrap() {
         assert!(
             device["refusal"].is_null() && device["counts"].as_object().unwrap().is_empty(),
             "{device}"

@@ -319,11 +319,11 @@ fn every_verb_has_help() {
             if std::env::split_paths(&places).any(|place| place.join(&program).exists()) {
                 continue;
             }
-            let told = [
+            let expected = [
                 "is not installed",
                 &format!("cargo install --path bridge/{verb}"),
             ];
-            place.run(&[verb, "--help"]).fails(1, &told);
+            place.run(&[verb, "--help"]).fails(1, &expected);
             continue;
         }
         let help = place.run(&[verb, "--help"]).good();
@@ -346,12 +346,12 @@ fn every_verb_has_help() {
             .lines()
             .filter(|l| l.trim_start().starts_with("--"))
         {
-            let told = option
+            let parts = option
                 .trim_start()
                 .split("  ")
                 .filter(|part| !part.trim().is_empty())
                 .count();
-            assert!(told >= 2, "{verb}: {option:?} says nothing");
+            assert!(parts >= 2, "{verb}: {option:?} says nothing");
         }
     }
     assert!(place.run(&["--version"]).good().out.starts_with("proprio "));
@@ -701,12 +701,12 @@ fn demo_of(joints: usize, place: &Place, seconds: f64, more: &[&str]) -> Json {
 fn reasons(place: &Place) -> BTreeMap<String, usize> {
     let text = place.read("d/estimates.csv");
     let names: Vec<&str> = text.lines().next().unwrap().split(',').collect();
-    let of = |part: &str| {
+    let columns = |part: &str| {
         (0..names.len())
             .filter(|i| names[*i].starts_with(part))
             .collect::<Vec<_>>()
     };
-    let (valid, reason, torque) = (of("valid/"), of("reason/"), of("torque/"));
+    let (valid, reason, torque) = (columns("valid/"), columns("reason/"), columns("torque/"));
     let mut counts = BTreeMap::new();
     for line in text.lines().skip(1) {
         let cells: Vec<&str> = line.split(',').collect();

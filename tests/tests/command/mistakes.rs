@@ -307,10 +307,10 @@ fn what_the_gateway_does_not_publish_is_told() {
         ];
         place.run(&args)
     };
-    let told = check("gateway.toml").good().out;
+    let out = check("gateway.toml").good().out;
     assert!(
-        told.contains("gateway.toml publishes all channels that the estimator reads\n"),
-        "{told}"
+        out.contains("gateway.toml publishes all channels that the estimator reads\n"),
+        "{out}"
     );
     let gateway = place.read("gateway.toml");
     place.write("other.toml", &gateway.replace("l_elbow", "l_elbov"));
@@ -659,8 +659,8 @@ fn what_may_not_be_done_is_told() {
 #[test]
 fn the_doctor_looks_at_everything() {
     let place = Place::new();
-    let told = place.run(&["doctor", "--json"]).good().json();
-    let checks: Vec<&str> = told
+    let report = place.run(&["doctor", "--json"]).good().json();
+    let checks: Vec<&str> = report
         .as_array()
         .unwrap()
         .iter()
@@ -678,7 +678,7 @@ fn the_doctor_looks_at_everything() {
     ] {
         assert!(checks.contains(&check), "{checks:?}");
     }
-    for finding in told.as_array().unwrap() {
+    for finding in report.as_array().unwrap() {
         let verdict = finding["verdict"].as_str().unwrap();
         assert!(["ok", "lacking", "failed"].contains(&verdict), "{finding}");
         assert_eq!(
@@ -687,7 +687,7 @@ fn the_doctor_looks_at_everything() {
             "what lacks has a remedy: {finding}"
         );
     }
-    let can = told
+    let can = report
         .as_array()
         .unwrap()
         .iter()
@@ -700,8 +700,8 @@ fn the_doctor_looks_at_everything() {
     let verdict = |base: &Path| {
         let mut command = place.command(&["doctor", "--json"]);
         command.env("PROPRIO_RUNTIME_DIR", base);
-        let told = finish(command, b"", "doctor").good().json();
-        let mut of_memory = told.as_array().unwrap().iter();
+        let report = finish(command, b"", "doctor").good().json();
+        let mut of_memory = report.as_array().unwrap().iter();
         of_memory.find(|f| f["check"] == "shared memory").unwrap()["verdict"].clone()
     };
     assert_eq!(verdict(&place.rig.domain.base), "ok");

@@ -23,7 +23,7 @@ use proprio_estimator::offline::estimate;
 use proprio_estimator::parameters::{Offset, Parameters, Provenance};
 use proprio_estimator::pipeline::{Estimate, Job, Pipeline};
 use proprio_estimator::setup::Setup;
-use proprio_estimator::{files, reading};
+use proprio_estimator::{files, sample_log};
 use proprio_identification::online::{DetectedChange, ObservationCounts, Paused};
 use proprio_identification::{FindingCode, LogRole, Outcome, Severity, Verdict, identify};
 use proprio_topics::csv::{Row, SeriesValue, TableReader, Value, What};
@@ -254,13 +254,13 @@ impl Table {
     /// of the logs.
     fn rows_at(&self, stamps: &[f64]) -> Vec<usize> {
         let tick = |t: f64| (t * 1e5).round() as i64;
-        let own: BTreeMap<i64, usize> = self
+        let rows: BTreeMap<i64, usize> = self
             .column("t")
             .iter()
             .enumerate()
             .map(|(row, t)| (tick(*t), row))
             .collect();
-        stamps.iter().map(|t| own[&tick(*t)]).collect()
+        stamps.iter().map(|t| rows[&tick(*t)]).collect()
     }
 
     /// The rows with a value in column `name`.
@@ -597,7 +597,7 @@ fn standing(log: &str, until: f64, times: usize) -> String {
 fn identified(sessions: &Sessions, logs: &[(&str, &str, LogRole)]) -> Outcome {
     let robot = sessions.setup(Urdf::Cad, None).robot;
     let dataset = |(file, text, role): &(&str, &str, LogRole)| {
-        reading::dataset_or_unreadable(&robot, file, *role, text.as_bytes()).unwrap()
+        sample_log::dataset_or_unreadable(&robot, file, *role, text.as_bytes()).unwrap()
     };
     let datasets = logs.iter().map(dataset).collect();
     identify(&robot, datasets, &[], &mut |_| {}).unwrap()
@@ -651,13 +651,13 @@ fn must_be_good(what: &str, sessions: &Sessions, outcome: &Outcome) {
         outcome.verdict, outcome.tau, outcome.least_retained_fraction
     );
     let cad = without_noise(sessions, sessions.setup(Urdf::Cad, None));
-    let own = without_noise(sessions, with(sessions.setup(Urdf::Cad, None), outcome));
+    let identified = without_noise(sessions, with(sessions.setup(Urdf::Cad, None), outcome));
     let (log, name) = (sessions.log("validate"), "validate");
     let run = |setup: Setup| scores(sessions, name, &log, setup, |_| true);
     let noisy_exact = run(sessions.setup_touched(Urdf::True, Some(name)));
     let noisy_cad = run(sessions.setup_touched(Urdf::Cad, Some(name)));
     let noisy_own = run(with(sessions.setup_touched(Urdf::Cad, Some(name)), outcome));
-    for (joint, score) in &own {
+    for (joint, score) in &identified {
         println!(
             "  {joint}: without noise CAD {:.4}, identified {:.4} +- {:.4} Nm; with noise CAD \
              {:.4}, identified {:.4} +- {:.4}, exact {:.4} Nm",
@@ -671,7 +671,7 @@ fn must_be_good(what: &str, sessions: &Sessions, outcome: &Outcome) {
         );
     }
     let mut covered = Vec::new();
-    for (joint, score) in &own {
+    for (joint, score) in &identified {
         let (error, cad) = (score.error, cad[joint].error);
         let [exact, off, noisy] =
             [&noisy_exact, &noisy_cad, &noisy_own].map(|scores| scores[joint].error);

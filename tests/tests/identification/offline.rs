@@ -287,12 +287,12 @@ fn a_payload_picked_up_within_a_log_is_noticed_and_told() {
             }
             // `... +0.501 +- 0.001 kg, first moment -0.0008, +0.0027, +0.0296 +- ...`
             let (before, after) = said[0].1.split_once(" kg, first moment ").expect("a body");
-            let told = |text: &str| {
+            let parsed = |text: &str| {
                 text.trim()
                     .parse::<f64>()
                     .unwrap_or_else(|e| panic!("{text}: {e}"))
             };
-            let own = told(
+            let found = parsed(
                 before
                     .split(": ")
                     .last()
@@ -301,10 +301,10 @@ fn a_payload_picked_up_within_a_log_is_noticed_and_told() {
                     .next()
                     .unwrap(),
             );
-            assert!((own - mass).abs() < 0.01, "{own} kg, not {mass}");
+            assert!((found - mass).abs() < 0.01, "{found} kg, not {mass}");
             for (part, centre) in after.split(" +- ").next().unwrap().split(", ").zip(&centre) {
                 assert!(
-                    (told(part) - mass * centre).abs() < 0.001,
+                    (parsed(part) - mass * centre).abs() < 0.001,
                     "{part} kg m of {centre} m"
                 );
             }

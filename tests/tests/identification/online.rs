@@ -183,11 +183,12 @@ fn pushes_that_nobody_declares_are_found_where_they_act() {
                         names.iter().position(|name| name == joint).unwrap(),
                         truth.column(&format!("joint/{joint}/torque"))[at],
                     );
-                    let told = e.torques.joints()[number];
-                    if told.valid == 1 && !tau.is_nan() {
-                        errors.push(told.torque - tau);
-                        within +=
-                            usize::from((told.torque - tau).abs() < 2.0 * told.standard_deviation);
+                    let torque = e.torques.joints()[number];
+                    if torque.valid == 1 && !tau.is_nan() {
+                        errors.push(torque.torque - tau);
+                        within += usize::from(
+                            (torque.torque - tau).abs() < 2.0 * torque.standard_deviation,
+                        );
                         count += 1;
                     }
                 }
@@ -430,7 +431,7 @@ fn a_state_is_resumed_and_one_that_does_not_fit_is_refused() {
     let mut early = f64::NAN;
     let joint = "l_elbow";
     let truth = Table::new(&log);
-    let told = {
+    let resumed_estimates = {
         let mut end = Some(resumed);
         told_from(&log, 0, &mut end).0
     };
@@ -439,7 +440,9 @@ fn a_state_is_resumed_and_one_that_does_not_fit_is_refused() {
         .into_iter()
         .filter_map(|row| {
             let t = truth.column("t")[row];
-            let at = told.iter().find(|e| (e.t.seconds() - t).abs() < 1e-6)?;
+            let at = resumed_estimates
+                .iter()
+                .find(|e| (e.t.seconds() - t).abs() < 1e-6)?;
             let is_early = t > begin + 4.0 && t < begin + 7.0;
             is_early.then(|| {
                 at.torques.joints()[3].torque - truth.column(&format!("joint/{joint}/torque"))[row]

@@ -44,7 +44,7 @@ fn without_noise_the_torques_are_those_of_mujoco() {
 #[test]
 fn with_noise_the_true_urdf_is_as_near_as_noise_explains_and_cad_is_not() {
     for sessions in robots() {
-        let own = |name: &str, urdf, log: &str, counts: &dyn Fn(f64) -> bool| {
+        let scores_of = |name: &str, urdf, log: &str, counts: &dyn Fn(f64) -> bool| {
             scores(
                 &sessions,
                 name,
@@ -55,7 +55,8 @@ fn with_noise_the_true_urdf_is_as_near_as_noise_explains_and_cad_is_not() {
         };
         for name in ["train", "validate"] {
             let log = sessions.log(name);
-            let [exact, cad] = [Urdf::True, Urdf::Cad].map(|urdf| own(name, urdf, &log, &|_| true));
+            let [exact, cad] =
+                [Urdf::True, Urdf::Cad].map(|urdf| scores_of(name, urdf, &log, &|_| true));
             for (joint, score) in &exact {
                 let Score {
                     error,

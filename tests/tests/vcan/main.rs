@@ -12,7 +12,7 @@ mod traffic;
 use proprio_drivers::{Claim, Frame};
 use proprio_estimator::setup::Setup;
 use proprio_gateway::clock::{Clock as _, Monotonic, sleep_until};
-use proprio_gateway::decoder::Decoder;
+use proprio_gateway::devices::BusDevices;
 use proprio_gateway::link::send_by;
 use proprio_gateway::link::socketcan::SocketCan;
 use proprio_gateway::log;
@@ -222,8 +222,8 @@ fn torques_agree_with_the_truth() {
     simulator.wait();
     recorder.take();
 
-    let told: serde_json::Value = serde_json::from_str(&simulator.output()).expect("a summary");
-    let sent = told["sent"].as_u64().expect("a number");
+    let summary: serde_json::Value = serde_json::from_str(&simulator.output()).expect("a summary");
+    let sent = summary["sent"].as_u64().expect("a number");
     let health = health.fresh();
     let frames: u64 = health.buses().iter().map(|b| b.frames).sum();
     let dropped: u64 = health
@@ -601,7 +601,7 @@ fn interfaces_go_and_come_back() {
 fn claims(plan: &Plan, number: usize) -> Vec<Claim> {
     let bus = &plan.buses[number];
     let status = Arc::new(BusStatus::new(0, bus));
-    Decoder::new(0, bus, None, status)
+    BusDevices::new(0, bus, None, status)
         .expect("devices")
         .claims()
 }
@@ -707,12 +707,12 @@ fn skewed_buses(
     for (number, values) in recorder.by_channel() {
         let channel = &plan.channels[number as usize];
         assert_eq!(values, offline[&channel.name], "{}", channel.name);
-        let own = recorder
+        let all_there = recorder
             .taken
             .iter()
             .filter(|s| s.channel == number)
             .all(|s| s.header.bus as usize == channel.bus);
-        assert!(own, "{}", channel.name);
+        assert!(all_there, "{}", channel.name);
     }
 
     let samples = rig.path("samples.csv");

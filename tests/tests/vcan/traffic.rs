@@ -27,19 +27,19 @@ fn error_frames_reach_health_and_log() {
     }
     can::run("cansend vcan0 20000004#0001000000000000");
     can::run("cansend vcan0 20000008#0000040B00000000");
-    let told = health.wait("the errors", |h| errors(h, BusError::Protocol) == 1);
-    let bus = &told.buses()[0];
+    let state = health.wait("the errors", |h| errors(h, BusError::Protocol) == 1);
+    let bus = &state.buses()[0];
     assert_eq!(
-        [BusError::Passive, BusError::RxOverflow, BusError::Bus].map(|c| errors(&told, c)),
+        [BusError::Passive, BusError::RxOverflow, BusError::Bus].map(|c| errors(&state, c)),
         [10, 1, 0]
     );
     assert_eq!((bus.error_frames, bus.dropped), (12, 1));
-    assert_eq!(told.buses()[1].error_frames, 0, "the other bus has none");
+    assert_eq!(state.buses()[1].error_frames, 0, "the other bus has none");
     // What the kernel knows of a virtual interface.
-    let told = health.wait("the interface's totals", |h| {
+    let state = health.wait("the interface's totals", |h| {
         h.buses()[0].interface.rx_frames >= 12
     });
-    assert_eq!(told.buses()[0].interface.fd, 1);
+    assert_eq!(state.buses()[0].interface.fd, 1);
 
     // A bus-off with "back to active" in the same frame, as candleLight sends it, is only counted.
     for _ in 0..5 {
@@ -47,8 +47,8 @@ fn error_frames_reach_health_and_log() {
     }
     health.wait("the reports", |h| errors(h, BusError::BusOff) == 5);
     std::thread::sleep(Duration::from_millis(300));
-    let told = health.fresh();
-    assert_eq!(told.buses()[0].link, LinkState::Up);
+    let state = health.fresh();
+    assert_eq!(state.buses()[0].link, LinkState::Up);
     can::run("cansend vcan0 20000040#0000000000000000");
     health.wait("bus-off", |h| h.buses()[0].link == LinkState::BusOff);
     can::run("cansend vcan0 20000100#0000000000000000");

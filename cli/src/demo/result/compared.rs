@@ -324,12 +324,12 @@ mod tests {
         assert_eq!(learning, ([1.0, 2.0, 1.0], 4, [1.0, 0.75]));
         // Withheld throughout: no figure.
         let after = compared.phase(compared.settled, Nanos::MAX).unwrap();
-        let told = PhaseAccuracy::json(Some(&after), &["elbow".to_owned()]);
+        let json = PhaseAccuracy::json(Some(&after), &["elbow".to_owned()]);
         let expected = json!({
             "cad": {"elbow": null}, "identified": {"elbow": null}, "valid_estimates": {"elbow": 0},
             "valid_share": 0.0, "within_2_sigma": null,
         });
-        assert_eq!(told, expected);
+        assert_eq!(json, expected);
         assert!(
             compared
                 .phase(Nanos::from_seconds(20.0), Nanos::MAX)

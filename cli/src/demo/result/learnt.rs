@@ -91,7 +91,7 @@ pub(super) fn courses(
             .find(|(n, _)| n == name)
             .map(|(_, values)| *values)
     };
-    for (place, link) in last.links.iter().enumerate() {
+    for (index, link) in last.links.iter().enumerate() {
         let name = link.name.as_str();
         let (Some(truth), Some(cad)) = (find(&experiment.truth, name), find(&experiment.cad, name))
         else {
@@ -103,7 +103,7 @@ pub(super) fn courses(
             .enumerate()
         {
             let points = watched.learnt.iter().filter_map(|learnt| {
-                let link = learnt.links.get(place)?;
+                let link = learnt.links.get(index)?;
                 Some((
                     compared.time(learnt.t),
                     *link.parameters.get(i)?,
@@ -119,14 +119,14 @@ pub(super) fn courses(
             });
         }
     }
-    for (place, offset) in last.offsets.iter().enumerate() {
+    for (index, offset) in last.offsets.iter().enumerate() {
         let name = offset.name.as_str();
         let Some((_, truth)) = experiment.offsets.iter().find(|(n, _)| n == name) else {
             continue;
         };
         for (i, (part, truth)) in AXES.into_iter().zip(truth).enumerate() {
             let points = watched.learnt.iter().filter_map(|learnt| {
-                let offset = learnt.offsets.get(place)?;
+                let offset = learnt.offsets.get(index)?;
                 let value = offset.force.iter().chain(&offset.torque).nth(i)?;
                 Some((
                     compared.time(learnt.t),

@@ -3,7 +3,7 @@
 use super::{STATE, Synced, actuator, at, claimed, joints, near, pair, session};
 use crate::rig::{Rig, board, count, decode, encode, frame, joint, listener, options, spec};
 use proprio_drivers::objects::{ObjectEntry, Objects};
-use proprio_drivers::{Decoded, Frame, Mode, Output, State};
+use proprio_drivers::{Decoded, Frame, Mode, StampedReading, State};
 use proprio_topics::{Counter, Nanos, Quality, Reading, Refusal, StampKind};
 use std::f64::consts::TAU;
 
@@ -191,12 +191,12 @@ fn a_drive_is_asked_for_its_mapping_and_started() {
     let read = joints(&rig.readings);
     assert!((9..=10).contains(&read.len()));
     // By a timer: the first reading is made before the other process data have come.
-    for output in &read[1..] {
-        let state = joint(&output.reading);
+    for stamped in &read[1..] {
+        let state = joint(&stamped.reading);
         assert!((state.position - 1.5).abs() < TAU / 8192.0);
         assert!((state.velocity + 2.0).abs() < TAU / 8192.0);
         assert!((state.torque - 0.25).abs() < 0.5e-3 && (state.current - 1.1).abs() < 2.6e-3);
-        assert_eq!(output.quality, Quality::GOOD);
+        assert_eq!(stamped.quality, Quality::GOOD);
     }
     assert!(joint(&read[0].reading).velocity.is_nan());
     let plain = encode(
@@ -244,16 +244,16 @@ fn both(n: u8, ms: f64) -> [Frame; 3] {
 }
 
 /// Number, time and gap of each reading; its two values must be of the same cycle.
-fn cycles(readings: &[Output]) -> Vec<(i32, f64, bool)> {
-    let one = |output: &Output| {
-        let state = joint(&output.reading);
+fn cycles(readings: &[StampedReading]) -> Vec<(i32, f64, bool)> {
+    let one = |stamped: &StampedReading| {
+        let state = joint(&stamped.reading);
         let number = state.position * 4.0 / TAU;
         assert!(
             near(state.velocity * 60.0 / TAU, number),
             "two cycles: {state:?}"
         );
-        let gap = output.quality.contains(Quality::GAP_BEFORE);
-        (number.round() as i32, output.acquired.0 as f64 / 1e6, gap)
+        let gap = stamped.quality.contains(Quality::GAP_BEFORE);
+        (number.round() as i32, stamped.acquired.0 as f64 / 1e6, gap)
     };
     readings.iter().map(one).collect()
 }
@@ -370,9 +370,9 @@ fn a_drive_measures_by_sync_of_the_host() {
     synced.run(200);
     let read = joints(&synced.readings);
     assert!(read.len() >= 34, "{}", read.len());
-    for output in &read {
-        assert_eq!(output.acquired.0 % 5_000_000, 0);
-        let state = joint(&output.reading);
+    for stamped in &read {
+        assert_eq!(stamped.acquired.0 % 5_000_000, 0);
+        let state = joint(&stamped.reading);
         assert!((state.velocity + 2.0).abs() < 2e-3 && (state.torque - 0.25).abs() < 1e-3);
     }
     // A frame in twenty is lost: then two cycles.
@@ -458,12 +458,12 @@ fn scales_that_a_drive_does_not_tell_are_those_of_its_file() {
             continue;
         }
         // A quarter of the 4096 counts of a turn, half of 0.5 Nm, and all of 4 A.
-        let told = joint(&readings[0].reading);
+        let state = joint(&readings[0].reading);
         assert!(
-            near(told.position, TAU / 4.0) && near(told.torque, 0.25),
-            "{told:?}"
+            near(state.position, TAU / 4.0) && near(state.torque, 0.25),
+            "{state:?}"
         );
-        assert!(near(told.current, 4.0), "{told:?}");
+        assert!(near(state.current, 4.0), "{state:?}");
         let right = [
             "001000", "A86000", "8F6001", "8F6002", "181001", "766000", "756000", "806000",
         ];

@@ -78,8 +78,8 @@ fn mistakes_are_told() {
         name: format!("More{n}"),
         ..messages()[0].clone()
     }));
-    let told = problem(&path("G.X"), many, 0).unwrap();
-    assert!(told.contains("More5, More6 and 2 more"), "{told}");
+    let text = problem(&path("G.X"), many, 0).unwrap();
+    assert!(text.contains("More5, More6 and 2 more"), "{text}");
 }
 
 /// The gateway reads the file that the keys name.
@@ -93,7 +93,7 @@ fn the_file_is_that_of_the_keys() {
 /// Identifiers of 29 bits are shifted too, up to the largest one.
 #[test]
 fn the_address_shifts_long_identifiers() {
-    let of = |id: u32, address| {
+    let most = |id: u32, address| {
         let mut messages = messages();
         messages[0].id = Ok(Id::extended(id));
         let mut options = options("dbc", WRENCH);
@@ -102,9 +102,9 @@ fn the_address_shifts_long_identifiers() {
         let ids = device.claims().iter().map(|claim| claim.id);
         ids.max()
     };
-    assert_eq!(of(0x18FF_0000, 0x21), Some(Id::extended(0x18FF_0021)));
-    assert_eq!(of(0x1FFF_FFF0, 0xF), Some(Id::extended(0x1FFF_FFFF)));
-    assert_eq!(of(0x1FFF_FFF0, 0x10), None);
+    assert_eq!(most(0x18FF_0000, 0x21), Some(Id::extended(0x18FF_0021)));
+    assert_eq!(most(0x1FFF_FFF0, 0xF), Some(Id::extended(0x1FFF_FFFF)));
+    assert_eq!(most(0x1FFF_FFF0, 0x10), None);
 }
 
 /// A simulated device sends the number that is read back as the value: less its offset, in steps
@@ -140,12 +140,15 @@ fn factor_offset_and_unit_are_those_of_the_file() {
         let joints: &[u8] = if kind == "joint" { &[0] } else { &[] };
         let frame = at(0x13, &[0, 0, 50, 0, 0, 0, 0, 0], 1.0);
         let (readings, _) = decode(&mut *listener("dbc", &keys, joints), &[frame]);
-        let told = match readings[0].reading {
+        let value_read = match readings[0].reading {
             Reading::Joint(state) => state.torque,
             Reading::Actuator(actuator) => actuator.duty,
             other => panic!("{other:?}"),
         };
-        assert!((told / 50.0 / value - 1.0).abs() < 1e-12, "{unit}: {told}");
+        assert!(
+            (value_read / 50.0 / value - 1.0).abs() < 1e-12,
+            "{unit}: {value_read}"
+        );
     }
 }
 
@@ -167,13 +170,13 @@ fn what_can_not_be_used_harms_nothing_else() {
     };
     assert_eq!(numbers(&readings), [(7, 7)]);
     let named = |keys: &str| problem(keys, messages.clone(), 0).unwrap();
-    let told = named(DRIVE);
-    assert!(told.contains("0x1e36001e has more than 11 bits"), "{told}");
-    let told = named(
+    let text = named(DRIVE);
+    assert!(text.contains("0x1e36001e has more than 11 bits"), "{text}");
+    let text = named(
         "file = \"device.dbc\"\n[[reading]]\nkind = \"temperature\"\n\
          fields.temperature = \"State.Temperature\"\n",
     );
-    assert!(told.contains("State.Temperature\": 65 bits"), "{told}");
+    assert!(text.contains("State.Temperature\": 65 bits"), "{text}");
 }
 
 /// Long names and short ones; an identifier where one name is that of two messages.
@@ -208,16 +211,16 @@ fn messages_have_two_names_and_an_identifier() {
     messages.push(messages[3].clone());
     assert_eq!(celsius("State.Temperature", &messages, id), 1);
     messages[5].id = Ok(Id::extended(0x13));
-    let told = problem(&keys("State.Temperature"), messages.clone(), 0).unwrap();
+    let text = problem(&keys("State.Temperature"), messages.clone(), 0).unwrap();
     assert!(
-        told.contains(
+        text.contains(
             "several messages \"State\": StateOfTheMotor 0x013, StateOfTheMotor 0x00000013"
         ),
-        "{told}"
+        "{text}"
     );
     assert!(
-        told.contains("write the identifier of one of them"),
-        "{told}"
+        text.contains("write the identifier of one of them"),
+        "{text}"
     );
     assert_eq!(celsius("0x013.Temperature", &messages, id), 1);
     assert_eq!(
@@ -228,29 +231,29 @@ fn messages_have_two_names_and_an_identifier() {
         celsius("0x00000013.Temperature", &messages, Id::extended(0x13)),
         1
     );
-    let told = problem(&keys("0x77.Temperature"), messages.clone(), 0).unwrap();
-    assert!(told.contains("no message with this identifier"), "{told}");
+    let text = problem(&keys("0x77.Temperature"), messages.clone(), 0).unwrap();
+    assert!(text.contains("no message with this identifier"), "{text}");
     // Neither its name nor its identifier tells it from another.
     let mut twice = messages.clone();
     twice[5].id = Ok(Id::standard(0x13));
     twice[5].size = 4;
     for path in ["State.Temperature", "0x013.Temperature"] {
-        let told = problem(&keys(path), twice.clone(), 0).unwrap();
-        assert!(told.contains("several messages"), "{told}");
+        let text = problem(&keys(path), twice.clone(), 0).unwrap();
+        assert!(text.contains("several messages"), "{text}");
         assert!(
-            told.contains("give each another name in the file"),
-            "{told}"
+            text.contains("give each another name in the file"),
+            "{text}"
         );
     }
     twice[5].name = "Other".to_owned();
     twice[5].long_name = None;
-    let told = problem(&keys("0x013.Temperature"), twice.clone(), 0).unwrap();
-    assert!(told.contains("write the name of one of them"), "{told}");
+    let text = problem(&keys("0x013.Temperature"), twice.clone(), 0).unwrap();
+    assert!(text.contains("write the name of one of them"), "{text}");
     assert_eq!(celsius("State.Temperature", &twice, id), 1);
     let again = messages[3].signals[1].clone();
     messages[3].signals.push(again);
-    let told = problem(&keys("0x013.Temperature"), messages, 0).unwrap();
-    assert!(told.contains("several signals \"Temperature\""), "{told}");
+    let text = problem(&keys("0x013.Temperature"), messages, 0).unwrap();
+    assert!(text.contains("several signals \"Temperature\""), "{text}");
 }
 
 /// A message of J1939 with one temperature, and its file.
@@ -326,16 +329,16 @@ fn frames_of_j1939_are_told_by_their_group() {
 
     let keys = "file = \"device.dbc\"\n[[reading]]\nkind = \"temperature\"\n\
                 fields.temperature = \"G0.Temperature\"\n";
-    let told = problem(keys, group(&engine), 1).unwrap();
+    let text = problem(keys, group(&engine), 1).unwrap();
     assert!(
-        told.contains("source_address tells the devices apart"),
-        "{told}"
+        text.contains("source_address tells the devices apart"),
+        "{text}"
     );
     let asks = format!("source_address = 3\nj1939 = false\n{keys}");
-    let told = problem(&asks, group(&engine), 0).unwrap();
+    let text = problem(&asks, group(&engine), 0).unwrap();
     assert!(
-        told.contains("source_address: none of its messages is one of J1939"),
-        "{told}"
+        text.contains("source_address: none of its messages is one of J1939"),
+        "{text}"
     );
 }
 

@@ -6,7 +6,7 @@ use crate::rig::{
     supervisor, texts, wrench,
 };
 use proprio_drivers::{
-    Decoded, Device, Frame, Frames, Id, Mode, NotSent, Output, SpecError, State,
+    Decoded, Device, Frame, Frames, Id, Mode, NotSent, SpecError, StampedReading, State,
 };
 use proprio_topics::{Counter, Nanos, Quality, Refusal, Saturation, StampKind};
 use proptest::array::uniform6;
@@ -60,13 +60,13 @@ fn jr3(keys: &str, halves: &[(&str, f64)]) -> Found {
     let keys = format!("full_scale_n = [16384, 1, 1]\nfull_scale_nm = [16384, 1, 1]\n{keys}");
     let frames: Vec<Frame> = halves.iter().map(|(name, ms)| half(name, *ms)).collect();
     let (readings, faults) = decode(&mut *listener("jr3_can", &keys, &[]), &frames);
-    let of = |output: &Output| {
-        let read = wrench(&output.reading);
-        let counter = f64::from((output.device_counter as u16).cast_signed());
-        assert_eq!([read.force[0], read.torque[0]], [counter; 2], "{output:?}");
-        (output.device_counter, output.quality)
+    let counter = |stamped: &StampedReading| {
+        let read = wrench(&stamped.reading);
+        let counter = f64::from((stamped.device_counter as u16).cast_signed());
+        assert_eq!([read.force[0], read.torque[0]], [counter; 2], "{stamped:?}");
+        (stamped.device_counter, stamped.quality)
     };
-    (readings.iter().map(of).collect(), faults_of(&faults))
+    (readings.iter().map(counter).collect(), faults_of(&faults))
 }
 
 #[test]
@@ -221,7 +221,7 @@ fn a_jr3_is_asked_started_and_stopped() {
     assert_eq!(rig.sent[rig.sent.len() - 3..], commands);
     // The board never stopped, and was started again with another zero.
     assert_eq!(rig.readings[7].quality, GAP);
-    let changed = |r: &&Output| r.quality.contains(Quality::ZERO_CHANGED);
+    let changed = |r: &&StampedReading| r.quality.contains(Quality::ZERO_CHANGED);
     assert_eq!(rig.readings[8..].iter().filter(changed).count(), 1);
     rig.device.stop(rig.now);
     rig.run(30);
@@ -247,7 +247,7 @@ fn all_readings_around_a_new_zero_of_a_jr3_are_marked() {
         let mut rig = Rig::started("jr3_can", JR3, Mode::Supervise, sent);
         rig.board_loses = Box::new(move |_, frame| ack_lost && frame.len() == 1);
         rig.run(150);
-        let changed = |r: &Output| r.quality.contains(Quality::ZERO_CHANGED);
+        let changed = |r: &StampedReading| r.quality.contains(Quality::ZERO_CHANGED);
         let marks: Vec<bool> = rig.readings.iter().map(changed).collect();
         assert_eq!(marks.len(), 15);
         marks.iter().take_while(|mark| **mark).count()
@@ -604,12 +604,12 @@ fn wrong_keys_of_a_jr3_are_refused() {
             "above 0 and at most 65535",
         ),
     ] {
-        let wrong = SpecError::Key {
+        let refused = SpecError::Key {
             key,
             value,
             expected,
         };
-        assert_eq!(refused_at("jr3_can", keys, 1), wrong);
+        assert_eq!(refused_at("jr3_can", keys, 1), refused);
     }
     // The key that is named is the one of the wrong number, and 65535 is the most that fits.
     for (at, key) in (0..6).zip([["full_scale_n"; 3], ["full_scale_nm"; 3]].concat()) {
@@ -618,12 +618,12 @@ fn wrong_keys_of_a_jr3_are_refused() {
             all[at] = value;
             let (force, torque) = all.split_at(3);
             let keys = format!("full_scale_n = {force:?}\nfull_scale_nm = {torque:?}");
-            let wrong = SpecError::Key {
+            let refused = SpecError::Key {
                 key,
                 value,
                 expected: "above 0 and at most 65535",
             };
-            assert_eq!(refused_at("jr3_can", &keys, 1), wrong);
+            assert_eq!(refused_at("jr3_can", &keys, 1), refused);
         }
     }
     let most = "full_scale_n = [65535, 65535, 65535]\nfull_scale_nm = [65535, 65535, 65535]";
@@ -636,12 +636,12 @@ fn wrong_keys_of_a_jr3_are_refused() {
     assert_eq!(half, SpecError::Incomplete { given, missing });
     for address in [0, 128] {
         let (least, most) = (1, 127);
-        let wrong = SpecError::Address {
+        let refused = SpecError::Address {
             address,
             least,
             most,
         };
-        assert_eq!(refused_at("jr3_can", "", address), wrong);
+        assert_eq!(refused_at("jr3_can", "", address), refused);
     }
     let shown = shown_keys(include_str!("../../../../docs/book/src/devices/jr3_can.md"));
     assert_eq!(options("jr3_can", shown), options("jr3_can", JR3));
@@ -657,12 +657,12 @@ fn two_jr3s_do_not_disturb_each_other() {
         device.claims().to_vec()
     };
     let (one, two) = (claims(1), claims(0x7F));
-    let own = |claims: &[proprio_drivers::Claim]| {
-        let own = claims.iter().filter(|claim| claim.exclusive);
-        own.map(|claim| claim.id.raw()).collect::<Vec<_>>()
+    let exclusive = |claims: &[proprio_drivers::Claim]| {
+        let claims = claims.iter().filter(|claim| claim.exclusive);
+        claims.map(|claim| claim.id.raw()).collect::<Vec<_>>()
     };
-    assert_eq!(own(&one), [0x601, 0x681, 0x101, 0x701]);
-    assert_eq!(own(&two), [0x67F, 0x6FF, 0x17F, 0x77F]);
+    assert_eq!(exclusive(&one), [0x601, 0x681, 0x101, 0x701]);
+    assert_eq!(exclusive(&two), [0x67F, 0x6FF, 0x17F, 0x77F]);
     assert!(!one.iter().any(|a| two.iter().any(|b| a.overlaps(b))));
 }
 

@@ -5,7 +5,7 @@ use crate::rig::{
     Rig, board, decode, encode, frame, listener, options, reading, refused_at, shown_keys, spec,
     texts, wrench,
 };
-use proprio_drivers::{Frame, Frames, Id, Mode, Output, SpecError, State};
+use proprio_drivers::{Frame, Frames, Id, Mode, SpecError, StampedReading, State};
 use proprio_topics::{Counter, Nanos, Quality, Saturation, StampKind};
 use proptest::array::uniform3;
 use proptest::prelude::*;
@@ -90,13 +90,13 @@ fn opto(halves: &[&str]) -> Found {
     let frames: Vec<Frame> = halves.iter().map(|name| opto_half(name, 0.0)).collect();
     let mut device = listener("optoforce_daq", "counts_per_newton = [1, 1, 1]", &[]);
     let (readings, faults) = decode(&mut *device, &frames);
-    let of = |output: &Output| {
-        let force = wrench(&output.reading).force[0];
-        let counter = f64::from((output.device_counter as u16).cast_signed());
-        assert_eq!(force, counter, "halves of two: {output:?}");
-        (output.device_counter, output.quality)
+    let counted = |stamped: &StampedReading| {
+        let force = wrench(&stamped.reading).force[0];
+        let counter = f64::from((stamped.device_counter as u16).cast_signed());
+        assert_eq!(force, counter, "halves of two: {stamped:?}");
+        (stamped.device_counter, stamped.quality)
     };
-    (readings.iter().map(of).collect(), faults_of(&faults))
+    (readings.iter().map(counted).collect(), faults_of(&faults))
 }
 
 #[test]
@@ -175,15 +175,15 @@ fn an_optoforce_force_may_look_like_a_header() {
 fn the_status_of_an_optoforce_marks_its_readings() {
     let low = Saturation::Low;
     let high = Saturation::High;
-    let of = |axis, end| GOOD.with_saturation(axis, end);
+    let at = |axis, end| GOOD.with_saturation(axis, end);
     let fault = GOOD | Quality::DEVICE_FAULT;
     for (status, expected) in [
-        (1 << 9, of(0, low)),
-        (1 << 8, of(1, low)),
-        (1 << 7, of(2, high)),
-        (1 << 6, of(3, high)),
-        (1 << 5, of(4, high)),
-        (1 << 4, of(5, high)),
+        (1 << 9, at(0, low)),
+        (1 << 8, at(1, low)),
+        (1 << 7, at(2, high)),
+        (1 << 6, at(3, high)),
+        (1 << 5, at(4, high)),
+        (1 << 4, at(5, high)),
         (0b1111, GOOD),
         (1 << 10, fault),
         (2 << 10, fault),
@@ -324,7 +324,7 @@ fn all_readings_around_a_new_zero_of_an_optoforce_are_marked() {
         let mut rig = Rig::new("optoforce_daq", &keys, &[], sent);
         rig.board_loses = Box::new(move |_, frame| answer_lost && frame.len() == 7);
         rig.run(150);
-        let changed = |r: &Output| r.quality.contains(Quality::ZERO_CHANGED);
+        let changed = |r: &StampedReading| r.quality.contains(Quality::ZERO_CHANGED);
         let marks: Vec<bool> = rig.readings.iter().map(changed).collect();
         assert_eq!(marks.len(), 15);
         marks.iter().take_while(|mark| **mark).count()
@@ -410,7 +410,7 @@ fn wrong_keys_of_an_optoforce_are_refused() {
         ),
         ("id_config = 0x800", "id_config", 2048.0, "from 0 to 0x7FF"),
     ] {
-        let wrong = SpecError::Key {
+        let refused = SpecError::Key {
             key,
             value,
             expected,
@@ -419,7 +419,7 @@ fn wrong_keys_of_an_optoforce_are_refused() {
             "counts_per_newton" => keys.to_owned(),
             _ => format!("{OPTO}{keys}"),
         };
-        assert_eq!(refused_at("optoforce_daq", &keys, 0x100), wrong);
+        assert_eq!(refused_at("optoforce_daq", &keys, 0x100), refused);
     }
     for (keys, given) in [("filter_hz = 15", "filter_hz"), ("zero = true", "zero")] {
         let missing = "rate_hz";
@@ -429,12 +429,12 @@ fn wrong_keys_of_an_optoforce_are_refused() {
     let same = refused_at("optoforce_daq", &format!("{OPTO}id_config = 0x100"), 0x100);
     assert!(matches!(same, SpecError::Keys { .. }), "{same:?}");
     let (address, least, most) = (0x800, 0, 0x7FF);
-    let wrong = SpecError::Address {
+    let refused = SpecError::Address {
         address,
         least,
         most,
     };
-    assert_eq!(refused_at("optoforce_daq", OPTO, address), wrong);
+    assert_eq!(refused_at("optoforce_daq", OPTO, address), refused);
     let shown = shown_keys(include_str!(
         "../../../../docs/book/src/devices/optoforce_daq.md"
     ));

@@ -152,9 +152,9 @@ fn distribute(
     if let Some(map) = map {
         for (i, share) in shares.iter().enumerate() {
             if i != main && !nothing(share) {
-                let own = from_pseudo(&(map * share.old.pseudo_inertia() * map.transpose()));
-                rest = rest + scaled(&own, -1.0);
-                result[i] = Some(own);
+                let body = from_pseudo(&(map * share.old.pseudo_inertia() * map.transpose()));
+                rest = rest + scaled(&body, -1.0);
+                result[i] = Some(body);
             }
         }
     }
@@ -225,9 +225,9 @@ fn patch(
         return;
     }
     let range = node.range();
-    let own = text.get(range.clone()).unwrap_or_default();
+    let written = text.get(range.clone()).unwrap_or_default();
     let new = element(inertia, None);
-    if own.ends_with("/>") && node.content() == range.end {
+    if written.ends_with("/>") && node.content() == range.end {
         patches.push((range.end - 2..range.end, format!(">{new}</link>")));
     } else {
         patches.push((node.content()..node.content(), new));

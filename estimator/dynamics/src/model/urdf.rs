@@ -13,7 +13,7 @@ mod elements;
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
-use self::elements::{check_expanded, numbers, once, part, place, read_sensors, required};
+use self::elements::{check_expanded, location, numbers, once, part, read_sensors, required};
 use super::xml::{self, Document, ElementRef, XmlError};
 use super::{
     AxisKind, Frame, Joint, JointAxis, JointFacts, JointKind, Limits, MeasurementDirection,
@@ -134,7 +134,7 @@ fn name<'d>(
     match seen.insert(name, seen.len()) {
         None => Ok(name),
         Some(first) => Err(ModelError::Duplicate {
-            place: place(node, node),
+            location: location(node, node),
             kind,
             first: nodes(first).line(),
         }),
@@ -266,7 +266,7 @@ fn read_joint<'d>(
             .get(link)
             .copied()
             .ok_or_else(|| ModelError::UnknownLink {
-                place: place(element, node),
+                location: location(element, node),
                 role,
                 link: link.to_owned(),
             })
@@ -280,7 +280,7 @@ fn read_joint<'d>(
         "floating" | "planar" => None,
         _ => {
             return Err(ModelError::UnsupportedJoint {
-                place: place(node, node),
+                location: location(node, node),
                 kind: word.to_owned(),
             });
         }
@@ -330,7 +330,7 @@ fn axis(node: ElementRef<'_>) -> Result<JointAxis, ModelError> {
     let remedy = "write its direction, such as xyz=\"0 0 1\"";
     required(axis, node, "xyz", remedy)?;
     let direction = numbers(axis, node, "xyz")?.unwrap_or_default();
-    JointAxis::new(Vec3::from(direction)).ok_or_else(|| ModelError::ZeroAxis(place(axis, node)))
+    JointAxis::new(Vec3::from(direction)).ok_or_else(|| ModelError::ZeroAxis(location(axis, node)))
 }
 
 /// The joint that a joint follows, with multiplier and offset.
@@ -379,7 +379,7 @@ impl Tree {
         for (number, joint) in joints.iter().enumerate() {
             if let Some(first) = above[joint.child].replace(number) {
                 return Err(ModelError::TwoParents {
-                    place: place(joint.node, joint.node),
+                    location: location(joint.node, joint.node),
                     link: links[joint.child].name.to_owned(),
                     first: joints[first].name.to_owned(),
                     line: joints[first].node.line(),
@@ -407,7 +407,7 @@ impl Tree {
         }
         if let Some(lost) = reached.iter().position(|&found| !found) {
             let node = links[lost].node;
-            return Err(ModelError::Loop(place(node, node)));
+            return Err(ModelError::Loop(location(node, node)));
         }
         let mut tree = Self {
             // There is one, because it was reached.
@@ -449,7 +449,7 @@ impl Tree {
         match (joints.iter().filter(is_robot)).find(|joint| joint.kind.is_none()) {
             None => Ok(()),
             Some(joint) => Err(ModelError::UnsupportedJoint {
-                place: place(joint.node, joint.node),
+                location: location(joint.node, joint.node),
                 kind: joint.node.attribute("type").unwrap_or_default().to_owned(),
             }),
         }
@@ -505,7 +505,7 @@ impl Coordinates {
                 warnings.push(format!(
                     "{}: its <mimic> joint=\"{leader}\" is not a joint of the URDF: it is taken as \
                      a joint of its own, which is measured or in [locked]",
-                    place(mimic, joint.node)
+                    location(mimic, joint.node)
                 ));
                 joint.mimic = None;
             }
@@ -543,10 +543,10 @@ impl Coordinates {
                 let Some((follows, multiplier, shift)) = leader.mimic else {
                     break;
                 };
-                let wrong = |reason| ModelError::Mimic {
-                    place: leader.node.child("mimic").map_or_else(
-                        || place(leader.node, leader.node),
-                        |mimic| place(mimic, leader.node),
+                let error = |reason| ModelError::Mimic {
+                    location: leader.node.child("mimic").map_or_else(
+                        || location(leader.node, leader.node),
+                        |mimic| location(mimic, leader.node),
                     ),
                     follows: follows.to_owned(),
                     reason,
@@ -555,13 +555,13 @@ impl Coordinates {
                     break;
                 };
                 if next.kind.is_none() {
-                    return Err(wrong(
+                    return Err(error(
                         "is the motion of the whole robot; name a joint of the robot, or remove \
                          the <mimic>",
                     ));
                 }
                 if steps == joints.len() {
-                    return Err(wrong(
+                    return Err(error(
                         "leads back to the joint itself; one of these joints must follow none",
                     ));
                 }
@@ -656,7 +656,7 @@ impl Folding<'_, '_> {
             self.check_body(&members, &inertia, total, &mut model.warnings)?;
             match above {
                 Some((number, ..)) if !has_inertial => {
-                    unknown.push((place(node, node), self.joints[number].name.to_owned()));
+                    unknown.push((location(node, node), self.joints[number].name.to_owned()));
                 }
                 Some((number, ..)) if inertia.mass == 0.0 => model.warnings.push(format!(
                     "link {name}: the body that joint {} moves is massless",
@@ -787,14 +787,14 @@ impl Folding<'_, '_> {
             let others = others.map(|&other| &self.links[other]);
             let others = others.filter(|other| other.has_inertial);
             let names = others.map(|other| other.name.to_owned()).collect();
-            (place(node, link.node), names)
+            (location(node, link.node), names)
         };
         if body.mass < -rounding {
             let mass = |&link: &usize| self.links[link].inertia.mass;
             let worst = (members.iter()).min_by(|a, b| mass(a).total_cmp(&mass(b)));
-            let (place, with) = named(worst);
+            let (location, with) = named(worst);
             return Err(ModelError::NegativeMass {
-                place,
+                location,
                 mass: body.mass,
                 with,
             });
@@ -804,9 +804,9 @@ impl Folding<'_, '_> {
             let worst = members
                 .iter()
                 .min_by(|a, b| negative(a).total_cmp(&negative(b)));
-            let (place, with) = named(worst);
+            let (location, with) = named(worst);
             return Err(ModelError::InertiaNotPositive {
-                place,
+                location,
                 least: moments.min(),
                 with,
             });

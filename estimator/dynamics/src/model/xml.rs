@@ -213,11 +213,11 @@ impl<'t> TreeBuilder<'t> {
         let name = tag.get(..name_end).unwrap_or_default();
         let mut attributes = Vec::new();
         for attribute in Attributes::new(tag, name_end) {
-            let wrong = |error| {
+            let syntax_error = |error| {
                 self.document
                     .wrong(range.start, format!("<{name}>: {error}"))
             };
-            let attribute = attribute.map_err(wrong)?;
+            let attribute = attribute.map_err(syntax_error)?;
             let key = str::from_utf8(attribute.key.into_inner()).unwrap_or_default();
             let value = match attribute.value {
                 Cow::Borrowed(raw) => str::from_utf8(raw).unwrap_or_default(),
@@ -481,23 +481,23 @@ mod tests {
 
     #[test]
     fn tags_that_do_not_fit_have_their_lines() {
-        let wrong = |text: &str| {
+        let error = |text: &str| {
             let XmlError { line, reason } = Document::parse(text).unwrap_err();
             format!("{line}: {reason}")
         };
         assert_eq!(
-            wrong("<a>\n<b>\n</a>"),
+            error("<a>\n<b>\n</a>"),
             "3: </a> where <b> of line 2 is open"
         );
-        assert_eq!(wrong("<a>\n<b>\n</b>\n"), "1: <a> is not closed");
-        assert_eq!(wrong("\n</b><a/>"), "2: </b> closes nothing");
-        assert_eq!(wrong(" \n"), "1: it has no element");
-        assert!(wrong("<a/>\n<b c=d/>").starts_with("2: <b>: "));
-        assert!(wrong("<a/>\n<b c='d' c='e'/>").starts_with("2: <b>: "));
+        assert_eq!(error("<a>\n<b>\n</b>\n"), "1: <a> is not closed");
+        assert_eq!(error("\n</b><a/>"), "2: </b> closes nothing");
+        assert_eq!(error(" \n"), "1: it has no element");
+        assert!(error("<a/>\n<b c=d/>").starts_with("2: <b>: "));
+        assert!(error("<a/>\n<b c='d' c='e'/>").starts_with("2: <b>: "));
         assert!(
-            wrong("<a>\n<!-- ").starts_with("2: "),
+            error("<a>\n<!-- ").starts_with("2: "),
             "{}",
-            wrong("<a>\n<!-- ")
+            error("<a>\n<!-- ")
         );
     }
 }

@@ -306,8 +306,8 @@ impl Recursion<'_> {
         for (number, (visit, hidden)) in self.visits.iter().zip(self.hidden()).enumerate() {
             let Some(hidden) = hidden else { continue };
             let offsets = sides.iter().enumerate().flat_map(|(column, sides)| {
-                let own = sides.iter().filter(|(link, _)| *link == visit.link);
-                own.map(move |(_, carry)| (column, *carry))
+                let carries = sides.iter().filter(|(link, _)| *link == visit.link);
+                carries.map(move |(_, carry)| (column, *carry))
             });
             places[number] = composites.len();
             composites.push(Composite {
@@ -365,8 +365,8 @@ impl Recursion<'_> {
             };
             if let Some((twist, moves)) = &visit.freedom {
                 let measured = torques && inner.is_some();
-                let own = reach.cross(&units.twist(twist), *moves, measured, tolerance);
-                rows.join(&own, tolerance);
+                let reached = reach.cross(&units.twist(twist), *moves, measured, tolerance);
+                rows.join(&reached, tolerance);
             }
             if let (Some(part), None) = (parts[number], inner) {
                 reach.begin(self.measured_twists(part), tolerance);
@@ -384,8 +384,10 @@ impl Recursion<'_> {
         if self.measured == Measurement::Torques {
             return Subspace::empty();
         }
-        let own = self.contacts.iter().filter(|(of, _)| *of == part);
-        let unknown = own.map(|(_, wrench)| self.units.wrench(wrench)).collect();
+        let applied = self.contacts.iter().filter(|(of, _)| *of == part);
+        let unknown = applied
+            .map(|(_, wrench)| self.units.wrench(wrench))
+            .collect();
         Subspace::without(unknown, self.tolerance)
     }
 }

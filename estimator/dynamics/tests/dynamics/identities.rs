@@ -558,8 +558,8 @@ proptest! {
                 .map(|((a, b), (c, d))| (a - b - c + d) / STEP)
                 .collect();
             for (number, (a, b)) in after.contacts().iter().zip(before.contacts()).enumerate() {
-                let own = if number == which { difference } else { Wrench::zero() };
-                errors.extend((a.wrench - b.wrench - own).force_first().map(|x| x / STEP));
+                let change = if number == which { difference } else { Wrench::zero() };
+                errors.extend((a.wrench - b.wrench - change).force_first().map(|x| x / STEP));
             }
             errors
         };
@@ -575,8 +575,8 @@ proptest! {
         let mut stated = PlaceErrors::new(&structure);
         let kinematics = scene.kinematics();
         for std in kinds {
-            let of = |contact: usize| if contact == which { std } else { PlaceStd::default() };
-            stated.update(&structure, &before, &kinematics, of).expect("solved");
+            let std_of = |contact: usize| if contact == which { std } else { PlaceStd::default() };
+            stated.update(&structure, &before, &kinematics, std_of).expect("solved");
             let mut squares = vec![0.0; scene.torque.len() + 6 * scene.contacts.len()];
             for axis in 0..3 {
                 let mut unit = Vec3::zeros();
@@ -675,11 +675,11 @@ proptest! {
             };
             let transmitted = inverse.transmitted(&kinematics, number);
             let in_base = place(child).wrench(&transmitted);
-            let own = random.pose();
+            let pose = random.pose();
             let cases = [
                 (MeasurementFrame::Child, place(child)),
                 (MeasurementFrame::Parent, place(parent)),
-                (MeasurementFrame::Sensor, place(child) * own),
+                (MeasurementFrame::Sensor, place(child) * pose),
             ];
             for (frame, x_bm) in cases {
                 for (direction, sign) in [
@@ -687,7 +687,7 @@ proptest! {
                     (MeasurementDirection::ParentToChild, 1.0),
                 ] {
                     let cut =
-                        SensorCut::new(&model, joint, frame, direction, &own, &noise).unwrap();
+                        SensorCut::new(&model, joint, frame, direction, &pose, &noise).unwrap();
                     let (got, expected) =
                         (cut.reading(&transmitted), x_bm.wrench_back(&in_base) * sign);
                     prop_assert!(
@@ -825,20 +825,20 @@ proptest! {
         let solver = scene.solve(&structure, &active);
         let scale = scene.size();
         for dof in 0..scene.model.dof_count() {
-            let own = [true, false].map(|below| scene.side(&structure, dof, below, &active));
+            let sides = [true, false].map(|below| scene.side(&structure, dof, below, &active));
             let (torque, deviation) = (solver.torque()[dof], solver.torque_deviation()[dof]);
             let side = match structure.route(dof, &active).unwrap() {
-                Route::Child => &own[0],
-                Route::Parent => &own[1],
+                Route::Child => &sides[0],
+                Route::Parent => &sides[1],
                 Route::Fused => {
-                    for side in &own {
+                    for side in &sides {
                         prop_assert!(side.is_free && !side.sensors.is_empty());
                         prop_assert!(deviation <= side.deviation * (1.0 + 1e-9));
                     }
                     continue;
                 }
                 Route::Whole => {
-                    prop_assert!(own.iter().all(|side| !side.is_free));
+                    prop_assert!(sides.iter().all(|side| !side.is_free));
                     continue;
                 }
             };

@@ -172,8 +172,8 @@ impl Scene {
     fn act(&mut self, wrench: ExternalWrench) {
         let kinematics = self.kinematics();
         let mut acting = vec![self.known[0], wrench];
-        let own = self.contacts.iter().zip(&self.truth);
-        acting.extend(own.map(|(spec, wrench)| external(spec, *wrench)));
+        let contacts = self.contacts.iter().zip(&self.truth);
+        acting.extend(contacts.map(|(spec, wrench)| external(spec, *wrench)));
         let inverse = inverse(&self.model, &kinematics, &acting);
         self.known[1].wrench = inverse.base_wrench();
         let cuts = self.readings.iter_mut().zip(&self.sensors);

@@ -347,7 +347,7 @@ impl Question<'_> {
 
 /// A state in which every joint moves as in `motions`.
 fn state(motions: &[JointMotion], random: &mut Random) -> State {
-    let mut of = |moving: f64, locked: f64| -> Vec<f64> {
+    let mut draw = |moving: f64, locked: f64| -> Vec<f64> {
         motions
             .iter()
             .map(|motion| match *motion {
@@ -356,7 +356,7 @@ fn state(motions: &[JointMotion], random: &mut Random) -> State {
             })
             .collect()
     };
-    State([of(3.0, 1.0), of(2.0, 0.0), of(5.0, 0.0)])
+    State([draw(3.0, 1.0), draw(2.0, 0.0), draw(5.0, 0.0)])
 }
 
 /// The closed form's basis is orthonormal and perpendicular to its null vectors, these are
@@ -960,8 +960,8 @@ fn joined(links: usize, seed: u64) {
             .unwrap();
         stacked.eliminate_contacts(Weighting::LengthScale);
         for (part, tree) in parts.iter().zip(stacked.subtrees()) {
-            let own = columns_of(tree.links().iter().copied(), tree.sensors());
-            assert_eq!(part.columns(), own);
+            let columns = columns_of(tree.links().iter().copied(), tree.sensors());
+            assert_eq!(part.columns(), columns);
             let rows: Vec<f64> = (0..tree.remaining())
                 .flat_map(|row| tree.projected_row(row).to_vec())
                 .collect();

@@ -613,19 +613,19 @@ proptest! {
         let mut other = StackedRegressor::new(&scene.structure);
         other.update(&scene.kinematics, &changed, &active, &scene.known).unwrap();
         for (tree, after) in stacked.subtrees().iter().zip(other.subtrees()) {
-            let own: Vec<usize> = tree.sensors().collect();
-            let offsets = columns_of(tree, tree.offset_column(), 6 * own.len());
-            let variances = own.iter().flat_map(|&sensor| {
+            let sensors: Vec<usize> = tree.sensors().collect();
+            let offsets = columns_of(tree, tree.offset_column(), 6 * sensors.len());
+            let variances = sensors.iter().flat_map(|&sensor| {
                 let noise = scene.sensors[sensor].noise();
                 noise.torque.into_iter().chain(noise.force).map(|deviation| deviation * deviation)
             });
-            let variances = DVector::from_iterator(6 * own.len(), variances);
+            let variances = DVector::from_iterator(6 * sensors.len(), variances);
             let expected = &offsets * DMatrix::from_diagonal(&variances) * offsets.transpose();
             prop_assert!(
                 (expected.clone() - tree.covariance()).amax() < 1e-13 * (1.0 + expected.amax())
             );
-            let change = own.iter().flat_map(|&sensor| torque_first(&changes[sensor]));
-            let expected = offsets * DVector::from_iterator(6 * own.len(), change);
+            let change = sensors.iter().flat_map(|&sensor| torque_first(&changes[sensor]));
+            let expected = offsets * DVector::from_iterator(6 * sensors.len(), change);
             let difference: Vec<f64> =
                 after.measured().iter().zip(tree.measured()).map(|(x, y)| x - y).collect();
             prop_assert!(
@@ -676,8 +676,8 @@ proptest! {
                     // determine p.
                     if tree.sensors().count() > 0 {
                         let first = tree.offset_column();
-                        let own = columns_of(tree, first, 6);
-                        let p = own
+                        let offset = columns_of(tree, first, 6);
+                        let p = offset
                             .transpose()
                             .lu()
                             .solve(&DVector::from_row_slice(&projected[first..first + 6]))
@@ -830,8 +830,8 @@ proptest! {
             .collect();
         let mut row = vec![f64::NAN; rows.column_count()];
         let deviation = |row: &[f64]| {
-            let own = &row[10 * scene.model.link_count()..];
-            own.iter()
+            let offsets = &row[10 * scene.model.link_count()..];
+            offsets.iter()
                 .zip(&deviations)
                 .map(|(a, b)| (a * b).powi(2))
                 .sum::<f64>()

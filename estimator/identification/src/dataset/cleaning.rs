@@ -171,9 +171,9 @@ pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
     for (channel, repeat) in channels.iter().zip(&repeats.channels) {
         let mut worst = Disorder::default();
         for stream in recording.streams(channel.role) {
-            let own = stream.order();
-            if own.repeated + own.backward > worst.repeated + worst.backward {
-                worst = own;
+            let order = stream.order();
+            if order.repeated + order.backward > worst.repeated + worst.backward {
+                worst = order;
             }
             stream.measure(max_silence);
         }
@@ -215,14 +215,14 @@ pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
                 ("position", &mut track.position, noise),
                 ("torque", &mut track.torque, 1e-9),
             ] {
-                let own = stream.despike(0, least);
-                found.extend(own.map(|own| outliers(&name, axis, own)));
+                let spikes = stream.despike(0, least);
+                found.extend(spikes.map(|own| outliers(&name, axis, own)));
             }
         }
         if channel.role == ChannelRole::Base {
             for (axis, word) in ["gx", "gy", "gz"].into_iter().enumerate() {
-                let own = recording.imu.angular_velocity.despike(axis, 1e-9);
-                found.extend(own.map(|own| outliers(&label(channel), word, own)));
+                let spikes = recording.imu.angular_velocity.despike(axis, 1e-9);
+                found.extend(spikes.map(|own| outliers(&label(channel), word, own)));
             }
         }
     }

@@ -106,8 +106,8 @@ fn inspect_sensor(
         return;
     }
     let marked = |reason| {
-        let of = stream.faulty.iter().filter(|(_, r)| *r == reason);
-        let mut stamps = of.map(|(t, _)| *t);
+        let samples = stream.faulty.iter().filter(|(_, r)| *r == reason);
+        let mut stamps = samples.map(|(t, _)| *t);
         let first = stamps.next()?;
         Some((first, 1 + stamps.count()))
     };
@@ -220,11 +220,11 @@ fn cut_off<const D: usize>(
     let rests = |run: &&Range<usize>| {
         let (from, to) = (stream.t[run.start], stream.t[run.end - 1]);
         let loaded = |k: usize| {
-            let own = || stream.value[run.start..run.end].iter().map(|v| v[k]);
-            let changes = own().zip(own().skip(1)).map(|(a, b)| (b - a).abs());
+            let values = || stream.value[run.start..run.end].iter().map(|v| v[k]);
+            let changes = values().zip(values().skip(1)).map(|(a, b)| (b - a).abs());
             let changes: Vec<f64> = changes.filter(|change| *change > 0.0).collect();
             let usual = changes.iter().sum::<f64>() / changes.len().max(1) as f64;
-            k != axis && range(own()) > STEEP * usual
+            k != axis && range(values()) > STEEP * usual
         };
         to - from >= FREEZE && !moves(from, to) && !(0..D).any(loaded)
     };
@@ -320,7 +320,7 @@ fn wrong_derivative(
 
 fn units(recording: &Recording, robot: &Robot, found: &mut Vec<Finding>) {
     let mut degrees = (Vec::new(), 0.0_f64);
-    let mut wrong = |channels: String, text: &str| {
+    let mut refuse = |channels: String, text: &str| {
         let text = format!("{channels}: {text}");
         found.push(Finding::refusal(FindingCode::WrongUnits, channels, text));
     };
@@ -349,7 +349,7 @@ fn units(recording: &Recording, robot: &Robot, found: &mut Vec<Finding>) {
                         "a typical proper acceleration of {magnitude:.4} m/s^2 is not near 9.8: \
                          convert it to m/s^2"
                     );
-                    wrong(label(channel), &text);
+                    refuse(label(channel), &text);
                 }
             }
         }
@@ -360,7 +360,7 @@ fn units(recording: &Recording, robot: &Robot, found: &mut Vec<Finding>) {
              degrees: convert all joints to radians",
             degrees.1
         );
-        wrong(degrees.0.join(", "), &text);
+        refuse(degrees.0.join(", "), &text);
     }
 }
 

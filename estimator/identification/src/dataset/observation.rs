@@ -6,9 +6,9 @@ use proprio_dynamics::spatial::Wrench;
 use proprio_dynamics::{BitSet, ContactSet, FrameMotion};
 use proprio_topics::{Nanos, Reason};
 
-/// Parts of the robot whose equations hold or fail together: numbers of sub-trees, and
-/// [`Observation::TORQUES`].
-pub type UnitSet = BitSet<2>;
+/// Numbers of sub-trees, whose equations each hold or fail together. Measured joint torques count
+/// as one more sub-tree, [`Observation::TORQUES`].
+pub type SubtreeSet = BitSet<2>;
 
 /// The values of all channels at one time.
 #[derive(Debug, Clone, PartialEq)]
@@ -44,8 +44,8 @@ pub struct Observation {
 }
 
 impl Observation {
-    /// The unit of all measured joint torques, among the numbers of sub-trees.
-    pub const TORQUES: usize = UnitSet::CAPACITY - 1;
+    /// What stands for all measured joint torques among the numbers of sub-trees.
+    pub const TORQUES: usize = SubtreeSet::CAPACITY - 1;
 
     /// Whether the motion of every joint and of the base is known.
     #[must_use]
@@ -100,9 +100,8 @@ pub(crate) struct Annotated {
     /// Per F/T sensor its noise-free reading by an earlier fit, as [`Observation::readings`]; not
     /// finite where the fit has none. Empty before a fit.
     pub fitted: Vec<Wrench>,
-    /// Units on which an undeclared disturbance (contact or load) was found to act: numbers of
-    /// sub-trees, and [`Observation::TORQUES`] for measured joint torques.
-    pub disturbed: UnitSet,
+    /// Sub-trees on which an undeclared disturbance (contact or load) was found to act.
+    pub disturbed: SubtreeSet,
 }
 
 impl From<Observation> for Annotated {
@@ -111,7 +110,7 @@ impl From<Observation> for Annotated {
         Self {
             observation,
             fitted: Vec::new(),
-            disturbed: UnitSet::default(),
+            disturbed: SubtreeSet::default(),
         }
     }
 }

@@ -40,7 +40,7 @@ const EDGE: Nanos = Nanos::from_millis(300);
 
 impl Recording {
     /// The observations of the log.
-    pub(crate) fn instants(&self, robot: &Robot) -> Vec<Observation> {
+    pub(crate) fn observations(&self, robot: &Robot) -> Vec<Observation> {
         let period = Nanos::from_seconds(1.0 / RATE);
         let times = self.times(robot, period);
         let joints = self.joint_columns(&times, period);

@@ -233,10 +233,10 @@ impl<const D: usize> SampleStream<D> {
         let (Some(a), Some(b)) = (self.t.get(i), self.t.get(i + 1)) else {
             return self.value[i];
         };
-        let own = (*b - *a).seconds();
+        let spacing = (*b - *a).seconds();
         let even = |from: Nanos, to: Nanos| {
             to - from <= self.max_gap
-                && (own / UNEVEN..=own * UNEVEN).contains(&(to - from).seconds())
+                && (spacing / UNEVEN..=spacing * UNEVEN).contains(&(to - from).seconds())
         };
         let around = i
             .checked_sub(1)

@@ -117,24 +117,24 @@ pub(crate) fn check(
         }
         alone.push((evidence.change(), evidence.wrong_frames(robot)));
     }
-    let wrong = all.wrong_frames(robot);
-    if !wrong.is_empty() {
-        let names: Vec<&str> = wrong.iter().map(|f| f.subject.as_str()).collect();
+    let wrong_frames = all.wrong_frames(robot);
+    if !wrong_frames.is_empty() {
+        let names: Vec<&str> = wrong_frames.iter().map(|f| f.subject.as_str()).collect();
         let reason = format!(
             "{}: wrong measurement frame or direction; nothing was identified",
             names.join(", ")
         );
-        return Ok(ControlFlow::Break((reason, wrong)));
+        return Ok(ControlFlow::Break((reason, wrong_frames)));
     }
     let with_torques = inputs.contains(&IdentificationInput::Torque);
     if let Some(wrong) = all.wrong_gravity(robot, with_torques) {
         return Ok(ControlFlow::Break((wrong.text.clone(), vec![wrong])));
     }
     // A sensor that was mounted differently in a minority of the logs.
-    for (log, (change, wrong)) in logs.iter_mut().zip(alone) {
+    for (log, (change, wrong_frames)) in logs.iter_mut().zip(alone) {
         let is_all = log.role == LogRole::Train && trained == 1;
         if !log.refused && !is_all && change >= ENOUGH_ALONE * all.change() {
-            log.add_findings(wrong);
+            log.add_findings(wrong_frames);
         }
     }
     Ok(ControlFlow::Continue(()))
@@ -244,12 +244,12 @@ impl ConfigurationEvidence {
             stretches.len(),
             || measurement.clone(),
             |measurement, number| {
-                let mut own = Self {
+                let mut part = Self {
                     base: self.base,
                     ..Self::new(robot)
                 };
-                own.add_stretch(measurement, stretches[number]);
-                own
+                part.add_stretch(measurement, stretches[number]);
+                part
             },
         );
         parts.iter().for_each(|part| self.add(part));
@@ -267,7 +267,7 @@ impl ConfigurationEvidence {
         let mut of_sensors = nuisance.clone();
         let ones = vec![1.0; unknowns.channels()];
         let mut variances = ones.clone();
-        for torque in (0..unknowns.sensors.len()).flat_map(|place| 6 * place..6 * place + 3) {
+        for torque in (0..unknowns.sensors.len()).flat_map(|index| 6 * index..6 * index + 3) {
             variances[torque] = Structure::LENGTH_SCALE.powi(2);
         }
         let [mut rows, mut moved] = [
@@ -275,7 +275,7 @@ impl ConfigurationEvidence {
             MeasurementRows::new(&unknowns),
         ];
         for instant in stretch {
-            if measurement.make(instant, &mut rows).is_err() {
+            if measurement.compute_rows(instant, &mut rows).is_err() {
                 continue;
             }
             self.instants += 1;
@@ -293,8 +293,8 @@ impl ConfigurationEvidence {
                 })
             };
             let all = g(&rows);
-            for (place, &sensor) in unknowns.sensors.iter().enumerate() {
-                let channels = 6 * place..6 * place + 6;
+            for (index, &sensor) in unknowns.sensors.iter().enumerate() {
+                let channels = 6 * index..6 * index + 6;
                 let Some(map) = attribute_to(&rows, &ones, channels.clone()) else {
                     continue;
                 };
@@ -321,14 +321,14 @@ impl ConfigurationEvidence {
 
     /// Coefficients of the columns of readings: these multiples of the readings of each sensor.
     fn readings(&self, of: impl Fn(usize) -> Matrix6<f64>) -> DVector<f64> {
-        let mut own = DVector::zeros(self.width());
+        let mut vector = DVector::zeros(self.width());
         for sensor in 0..self.sensors {
-            let of = of(sensor);
+            let matrix = of(sensor);
             for (i, j) in (0..6).flat_map(|i| (0..6).map(move |j| (i, j))) {
-                own[entry(sensor, i, j)] = of[(i, j)];
+                vector[entry(sensor, i, j)] = matrix[(i, j)];
             }
         }
-        own
+        vector
     }
 
     /// Mean square of the sensors' readings per instant.
@@ -366,8 +366,8 @@ impl ConfigurationEvidence {
                 [(0, torque, LEVER * weight), (1, force, weight)].map(|(kind, noise, most)| {
                     let reading = self.readings(|other| {
                         let is_own = |i: usize| other == sensor && i / 3 == kind;
-                        let own = |i: usize, _| if is_own(i) { 1.0 } else { 0.0 };
-                        Matrix6::from_diagonal(&Vector6::from_fn(own))
+                        let weight = |i: usize, _| if is_own(i) { 1.0 } else { 0.0 };
+                        Matrix6::from_diagonal(&Vector6::from_fn(weight))
                     });
                     let group = &self.groups[1 + 2 * sensor + kind];
                     let compared = TorqueComparison::new(&group.gram, group.rows, &reading)?;
@@ -398,8 +398,8 @@ impl ConfigurationEvidence {
         let without = squares(gram, &self.readings(|_| Matrix6::identity()));
         let remains = |chosen: &[(usize, Mounting)]| {
             let mut changed = self.readings(|sensor| {
-                let own = chosen.iter().find(|(own, _)| *own == sensor);
-                own.map_or_else(Matrix6::zeros, |(_, own)| own.change - Matrix6::identity())
+                let correction = chosen.iter().find(|(own, _)| *own == sensor);
+                correction.map_or_else(Matrix6::zeros, |(_, own)| own.change - Matrix6::identity())
             });
             changed[self.width() - 1] = 1.0;
             squares(gram, &changed)
@@ -501,7 +501,7 @@ fn gravity_columns(
     let mut right = |axis: Vec3| {
         let upright = MotionReading::Upright(axis);
         let other = instant.clone().map(|own| own.seen(upright));
-        let is_made = measurement.make(&other, rows).is_ok() && rows.count == lines.nrows();
+        let is_made = measurement.compute_rows(&other, rows).is_ok() && rows.count == lines.nrows();
         is_made.then(|| DVector::from_column_slice(&rows.r))
     };
     let without = right(Vec3::zeros());
@@ -522,9 +522,9 @@ fn reading_columns(
 ) {
     let last = lines.ncols() - 1;
     for row in 0..rows.count {
-        for (place, &sensor) in unknowns.sensors.iter().enumerate() {
+        for (index, &sensor) in unknowns.sensors.iter().enumerate() {
             let reading = instant.readings[sensor].torque_first();
-            for (i, g) in rows.g(row)[6 * place..][..6].iter().enumerate() {
+            for (i, g) in rows.g(row)[6 * index..][..6].iter().enumerate() {
                 for (j, y) in reading.iter().enumerate().filter(|_| *g != 0.0) {
                     lines[(row, entry(sensor, i, j))] = g * y;
                 }

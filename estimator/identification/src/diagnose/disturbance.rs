@@ -5,8 +5,8 @@
 //! vibration are present all the time and grow with motion; a contact is a temporary, large
 //! residual.
 //!
-//! Per part of the robot (*unit*: a sub-tree between F/T sensors, or all measured joint torques)
-//! and block of 0.1 s, the whitened square of the mean residual is compared with that of blocks in
+//! Per part of the robot (a sub-tree between F/T sensors, or all measured joint torques) and block
+//! of 0.1 s, the whitened square of the mean residual is compared with that of blocks in
 //! which the robot moves as much. Outlying blocks are excluded with a margin, and the fit is
 //! repeated ([`crate::batch`]) until the excluded set does not change.
 //!
@@ -15,7 +15,7 @@
 //! instead predicted another log with an error of .32, against .06, where a jump of 10 N was
 //! simulated.
 
-use crate::dataset::observation::{Annotated, Observation, UnitSet};
+use crate::dataset::observation::{Annotated, Observation, SubtreeSet};
 use crate::diagnose::load::LoadChange;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
@@ -59,15 +59,15 @@ const MAX_OUTLYING_FRACTION: f64 = 0.7;
 /// slowly, a contact is shorter.
 const WINDOW: usize = 150;
 
-/// Per log and instant, the units on which an undeclared contact acts. The spans of `loads` are not
-/// tested.
+/// Per log and instant, the sub-trees on which an undeclared contact acts. The spans of `loads` are
+/// not tested.
 pub(crate) fn contacts(
     measurement: &MeasurementModel<'_>,
     all: &[&PreparedLog],
     loads: &[LoadChange],
     noise: &NoiseModel,
     d: &DVector<f64>,
-) -> Vec<Vec<UnitSet>> {
+) -> Vec<Vec<SubtreeSet>> {
     // Long logs in parts, so that all cores have work; of at least a minute, so that a contact does
     // not last for most of it.
     let (mut segments, mut logs) = (Vec::new(), Vec::new());
@@ -83,11 +83,11 @@ pub(crate) fn contacts(
         }
     }
     let found = map_segments(measurement, &segments, |measurement, number, segment| {
-        let own: Vec<&LoadChange> = loads
+        let log_loads: Vec<&LoadChange> = loads
             .iter()
             .filter(|load| load.log == logs[number])
             .collect();
-        of_segment(measurement, segment, &own, noise, d)
+        of_segment(measurement, segment, &log_loads, noise, d)
     });
     let mut out = vec![Vec::new(); all.len()];
     for (log, found) in logs.into_iter().zip(found) {
@@ -102,12 +102,12 @@ fn of_segment(
     loads: &[&LoadChange],
     noise: &NoiseModel,
     d: &DVector<f64>,
-) -> Vec<UnitSet> {
+) -> Vec<SubtreeSet> {
     let unknowns = measurement.unknowns();
     let residuals = residuals(measurement, segment, noise, std::slice::from_ref(d));
     let subtrees = 0..measurement.robot().structure.subtrees().len();
-    let pass = UnitPass {
-        units: subtrees.chain([Observation::TORQUES]).collect(),
+    let pass = SubtreePass {
+        subtrees: subtrees.chain([Observation::TORQUES]).collect(),
         loads,
         variances: noise.offset_tracking_variances(),
         d,
@@ -128,13 +128,13 @@ fn of_segment(
         means.push(pass.means(measurement, instants));
     }
     measurement.include_disturbed(false);
-    let mut out = vec![UnitSet::default(); segment.instants.len()];
-    for (number, &unit) in pass.units.iter().enumerate() {
+    let mut out = vec![SubtreeSet::default(); segment.instants.len()];
+    for (number, &subtree) in pass.subtrees.iter().enumerate() {
         let (mut series, mut least) = (Vec::new(), Vec::new());
         for (channel, channel_least) in noise.least.iter().enumerate() {
-            let own: Vec<f64> = means.iter().map(|units| units[number][channel]).collect();
-            if own.iter().any(|x| x.is_finite()) {
-                series.push(own);
+            let channel_means: Vec<f64> = means.iter().map(|mean| mean[number][channel]).collect();
+            if channel_means.iter().any(|x| x.is_finite()) {
+                series.push(channel_means);
                 least.push(*channel_least);
             }
         }
@@ -145,24 +145,24 @@ fn of_segment(
         }
         let blocks = residuals.ranges.iter().zip(&outlier);
         for (range, _) in blocks.filter(|(_, outlier)| **outlier) {
-            (out[range.clone()].iter_mut()).for_each(|set| set.insert(unit));
+            (out[range.clone()].iter_mut()).for_each(|set| set.insert(subtree));
         }
     }
     out
 }
 
-/// The pass over a segment for the residuals of each unit.
-struct UnitPass<'a> {
-    units: Vec<usize>,
+/// The pass over a segment for the residuals of each sub-tree.
+struct SubtreePass<'a> {
+    subtrees: Vec<usize>,
     loads: &'a [&'a LoadChange],
     variances: Vec<f64>,
     d: &'a DVector<f64>,
     nuisance: DVector<f64>,
 }
 
-impl UnitPass<'_> {
-    /// Per unit and channel, the mean over a block of the channel's most likely noise, offset drift
-    /// included, from the unit's rows alone; NaN where it has none.
+impl SubtreePass<'_> {
+    /// Per sub-tree and channel, the mean over a block of the channel's most likely noise, offset
+    /// drift included, from the sub-tree's rows alone; NaN where it has none.
     fn means(
         &self,
         measurement: &mut MeasurementModel<'_>,
@@ -170,28 +170,29 @@ impl UnitPass<'_> {
     ) -> Vec<Vec<f64>> {
         let channels = self.variances.len();
         let mut rows = MeasurementRows::new(measurement.unknowns());
-        let mut own = rows.clone();
+        let mut own_rows = rows.clone();
         let (mut white, mut noise) = (Vec::new(), vec![0.0; channels]);
-        let mut sums = vec![vec![(0.0, 0.0); channels]; self.units.len()];
+        let mut sums = vec![vec![(0.0, 0.0); channels]; self.subtrees.len()];
         for instant in instants {
-            if measurement.make(instant, &mut rows).is_err() {
+            if measurement.compute_rows(instant, &mut rows).is_err() {
                 continue;
             }
-            for (&unit, sums) in self.units.iter().zip(&mut sums) {
-                let carries = |load: &&LoadChange| load.units.contains(unit) && load.has(instant.t);
+            for (&subtree, sums) in self.subtrees.iter().zip(&mut sums) {
+                let carries =
+                    |load: &&LoadChange| load.subtrees.contains(subtree) && load.has(instant.t);
                 if self.loads.iter().any(carries) {
                     continue;
                 }
-                rows.copy_unit(unit, &mut own);
-                if own.count == 0 {
+                rows.copy_unit(subtree, &mut own_rows);
+                if own_rows.count == 0 {
                     continue;
                 }
                 let (d, nuisance) = (self.d.as_slice(), self.nuisance.as_slice());
                 white.clear();
-                white.extend((0..own.count).map(|row| own.residual(row, d, nuisance)));
-                own.whiten_with(&self.variances, &mut white, 1);
-                own.channel_noise(&self.variances, &mut white, &mut noise);
-                for channel in (0..channels).filter(|&channel| own.has(channel)) {
+                white.extend((0..own_rows.count).map(|row| own_rows.residual(row, d, nuisance)));
+                own_rows.whiten_with(&self.variances, &mut white, 1);
+                own_rows.channel_noise(&self.variances, &mut white, &mut noise);
+                for channel in (0..channels).filter(|&channel| own_rows.has(channel)) {
                     sums[channel].0 += noise[channel];
                     sums[channel].1 += 1.0;
                 }
@@ -284,9 +285,9 @@ fn usual(squares: &[f64], seen: &[bool], motion: &[f64]) -> Vec<f64> {
     let stride = order.len().div_ceil(STATIONS).max(1);
     let last = order.len() - width;
     for start in (0..last).step_by(stride).chain([last]) {
-        let own = &order[start..start + width];
-        let near = usual(own);
-        own.iter().for_each(|&k| out[k] = out[k].max(near));
+        let window = &order[start..start + width];
+        let near = usual(window);
+        window.iter().for_each(|&k| out[k] = out[k].max(near));
     }
     out
 }
@@ -298,8 +299,8 @@ fn medians(series: &[f64]) -> Vec<f64> {
     for start in (0..series.len()).step_by(STRIDE) {
         let end = (start + STRIDE).min(series.len());
         let around = &series[start.saturating_sub(WINDOW)..(end + WINDOW).min(series.len())];
-        let own = around.iter().copied().filter(|x| x.is_finite()).collect();
-        out.resize(end, quantile(own, 0.5));
+        let values = around.iter().copied().filter(|x| x.is_finite()).collect();
+        out.resize(end, quantile(values, 0.5));
     }
     out
 }

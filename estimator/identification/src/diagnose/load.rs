@@ -3,7 +3,7 @@
 //! Without it, .8 kg on the forearm in one of two logs raise the error on held-out torques from
 //! .7 % to several times that, and nothing names the cause.
 
-use crate::dataset::observation::{Annotated, Observation, UnitSet};
+use crate::dataset::observation::{Annotated, Observation, SubtreeSet};
 use crate::fit::NoiseAndMap;
 use crate::hypothesis::needed;
 use crate::linear::information::Information;
@@ -39,7 +39,7 @@ pub(crate) struct LoadChange {
     /// Number of the training log.
     pub log: usize,
     /// Place of its link in the layout.
-    pub place: usize,
+    pub index: usize,
     /// The side of the change that is excluded, first and last stamp.
     pub span: (Nanos, Nanos),
     /// The part of it that is not close to the change: there the load is constant.
@@ -48,8 +48,8 @@ pub(crate) struct LoadChange {
     pub within: f64,
     /// Whether the excluded side is that after the change.
     pub is_after: bool,
-    /// The units whose equations contain it.
-    pub units: UnitSet,
+    /// The sub-trees whose equations contain it.
+    pub subtrees: SubtreeSet,
 }
 
 impl LoadChange {
@@ -104,14 +104,14 @@ impl Normal {
         is_known: &dyn Fn(usize) -> bool,
     ) {
         let unknown = unknowns.links.iter().copied().enumerate();
-        for (place, link) in unknown.filter(|(_, link)| !is_known(*link)) {
-            let mut own = self
+        for (index, link) in unknown.filter(|(_, link)| !is_known(*link)) {
+            let mut block = self
                 .matrix
                 .fixed_view_mut::<LINK_PARAMETERS, LINK_PARAMETERS>(
-                    LINK_PARAMETERS * place,
-                    LINK_PARAMETERS * place,
+                    LINK_PARAMETERS * index,
+                    LINK_PARAMETERS * index,
                 );
-            own += prior.metric(link) / (2.0 * tau * tau);
+            block += prior.metric(link) / (2.0 * tau * tau);
         }
         for (precision, column) in unknowns.precision.iter().zip(unknowns.inertial()..) {
             self.matrix[(column, column)] += precision;
@@ -125,27 +125,27 @@ fn weak(prior: &Prior, link: usize) -> SMatrix<f64, LINK_PARAMETERS, LINK_PARAME
     prior.metric(link) / 18.0
 }
 
-/// The parameters of a body that is on the link at `place` in `some` of the data only, and by how
+/// The parameters of a body that is on the link at `index` in `some` of the data only, and by how
 /// much it reduces the squared residuals. `weak`: the precision of its prior; `factor`: of all data
 /// and the prior; `x`: their solution.
 pub(crate) fn body(
     weak: &SMatrix<f64, LINK_PARAMETERS, LINK_PARAMETERS>,
-    place: usize,
+    index: usize,
     some: &Normal,
     factor: &Cholesky<f64, Dyn>,
     x: &DVector<f64>,
 ) -> Option<(AddedBody, f64)> {
     let cross = some
         .matrix
-        .fixed_columns::<LINK_PARAMETERS>(LINK_PARAMETERS * place)
+        .fixed_columns::<LINK_PARAMETERS>(LINK_PARAMETERS * index)
         .into_owned();
-    let own = cross
-        .fixed_rows::<LINK_PARAMETERS>(LINK_PARAMETERS * place)
+    let block = cross
+        .fixed_rows::<LINK_PARAMETERS>(LINK_PARAMETERS * index)
         .into_owned();
-    let rest = own + weak - cross.transpose() * factor.solve(&cross);
+    let rest = block + weak - cross.transpose() * factor.solve(&cross);
     let misfit = some
         .right
-        .fixed_rows::<LINK_PARAMETERS>(LINK_PARAMETERS * place)
+        .fixed_rows::<LINK_PARAMETERS>(LINK_PARAMETERS * index)
         .into_owned()
         - cross.transpose() * x;
     let covariance = rest.cholesky()?.inverse();
@@ -176,7 +176,7 @@ struct LoadCandidate {
     /// The number of the segment before which the load changes.
     at: usize,
     /// Place of the link in the layout.
-    place: usize,
+    index: usize,
     /// Reduction of the squared residuals by a body on the link after the change, and before it.
     later: f64,
     earlier: f64,
@@ -214,7 +214,7 @@ pub(crate) fn find(
     let LoadCandidate {
         log,
         at,
-        place,
+        index,
         later,
         earlier,
     } = best?;
@@ -243,12 +243,12 @@ pub(crate) fn find(
     };
     Some(LoadChange {
         log,
-        place,
+        index,
         span: stamps(excluded)?,
         clear: stamps(clear)?,
         within: segment_seconds(training[log]),
         is_after,
-        units: linked_units(measurement, place),
+        subtrees: linked_subtrees(measurement, index),
     })
 }
 
@@ -257,20 +257,20 @@ fn segment_seconds(log: &PreparedLog) -> f64 {
     ((log.span.1 - log.span.0).seconds() / SEGMENTS as f64).max(SEGMENT_SECONDS)
 }
 
-/// All units whose rows share links or channels with those of the link at this place.
-fn linked_units(measurement: &MeasurementModel<'_>, place: usize) -> UnitSet {
+/// All sub-trees whose rows share links or channels with those of the link at this index.
+fn linked_subtrees(measurement: &MeasurementModel<'_>, index: usize) -> SubtreeSet {
     let structure = &measurement.robot().structure;
     let (unknowns, groups) = (measurement.unknowns(), &measurement.groups().links);
-    let mut units = UnitSet::default();
+    let mut subtrees = SubtreeSet::default();
     for (other, group) in unknowns.links.iter().zip(groups) {
-        if *group == groups[place] {
-            units.insert(structure.subtree_of(*other).unwrap_or(0));
+        if *group == groups[index] {
+            subtrees.insert(structure.subtree_of(*other).unwrap_or(0));
             if !unknowns.joints.is_empty() {
-                units.insert(Observation::TORQUES);
+                subtrees.insert(Observation::TORQUES);
             }
         }
     }
-    units
+    subtrees
 }
 
 /// The search for a load that changes: what each segment tells, and all of them together.
@@ -346,22 +346,22 @@ impl<'a> LoadSearch<'a> {
         // What one log has throughout more than the others is a load in it, not one that is
         // missing.
         let may_be = |added: &AddedBody| !is_throughout || added.parameters[0] > 0.0;
-        let gains = parallel::map(self.links.len(), |place| {
-            let weak = weak(self.prior, self.links[place]);
+        let gains = parallel::map(self.links.len(), |index| {
+            let weak = weak(self.prior, self.links[index]);
             [after, before].map(|some| {
-                body(&weak, place, some, &self.factor, &self.x)
+                body(&weak, index, some, &self.factor, &self.x)
                     .filter(|(added, _)| added.is_a_body() && may_be(added))
                     .map_or(0.0, |(_, gain)| gain)
             })
         });
-        for (place, [later, earlier]) in gains.into_iter().enumerate() {
+        for (index, [later, earlier]) in gains.into_iter().enumerate() {
             let gain = later.max(earlier);
             let is_better = |best: &LoadCandidate| gain > best.later.max(best.earlier);
             if gain > least && best.as_ref().is_none_or(is_better) {
                 *best = Some(LoadCandidate {
                     log,
                     at,
-                    place,
+                    index,
                     later,
                     earlier,
                 });
@@ -371,7 +371,7 @@ impl<'a> LoadSearch<'a> {
 }
 
 /// The inertial parameters of a load, from the part of the log that was excluded for it and from
-/// all used data; and the place of the link that it is on, which shows better than when it was
+/// all used data; and the index of the link that it is on, which shows better than when it was
 /// found, since the noise no longer contains it.
 pub(crate) fn added_body(
     measurement: &MeasurementModel<'_>,
@@ -398,10 +398,10 @@ pub(crate) fn added_body(
     let factor = all.matrix.cholesky()?;
     let x = factor.solve(&all.right);
     let each = unknowns.links.iter().enumerate();
-    let each = each.filter_map(|(place, &link)| {
-        let (added, gain) = body(&weak(prior, link), place, &some, &factor, &x)?;
-        added.is_a_body().then_some((gain, place, added))
+    let each = each.filter_map(|(index, &link)| {
+        let (added, gain) = body(&weak(prior, link), index, &some, &factor, &x)?;
+        added.is_a_body().then_some((gain, index, added))
     });
-    let (_, place, added) = each.max_by(|a, b| a.0.total_cmp(&b.0))?;
-    Some((place, added))
+    let (_, index, added) = each.max_by(|a, b| a.0.total_cmp(&b.0))?;
+    Some((index, added))
 }

@@ -190,7 +190,7 @@ pub(crate) fn wrong_signs(
 /// An error that is estimated.
 #[derive(Clone, Debug, PartialEq)]
 enum SetupError {
-    /// The zero of a joint's encoder (its place among the tested ones), in all logs or in one.
+    /// The zero of a joint's encoder (its index among the tested ones), in all logs or in one.
     Zero { joint: usize, log: Option<usize> },
     /// The common delay of these streams: F/T sensors, then joint torques.
     Delay(Range<usize>),
@@ -243,7 +243,7 @@ impl SegmentColumns<'_> {
             // change of the offset terms is ignored.
             let step = MotionReading::Encoder(dof, [STEP, 0.0]);
             let instant = instants[number].clone().map(|own| own.seen(step));
-            if measurement.make(&instant, moved).is_ok() && moved.count == rows.count {
+            if measurement.compute_rows(&instant, moved).is_ok() && moved.count == rows.count {
                 for row in 0..rows.count {
                     let change = moved.without_bodies(row, d) - rows.without_bodies(row, d);
                     out[row * width + joint] = change / STEP;
@@ -324,10 +324,10 @@ impl<'a> Search<'a> {
         }
         let (r, z) = sum.to_triangle();
         let each = (0..logs).filter(|_| logs > 1).map(Some);
-        let zeros = [None].into_iter().chain(each).flat_map(|log| {
-            let of = move |joint| SetupError::Zero { joint, log };
-            (0..joints).map(of)
-        });
+        let zeros = [None]
+            .into_iter()
+            .chain(each)
+            .flat_map(|log| (0..joints).map(move |joint| SetupError::Zero { joint, log }));
         let mut search = Self {
             measurement,
             training,
@@ -354,26 +354,27 @@ impl<'a> Search<'a> {
 
     fn column(&self, error: &SetupError) -> DVector<f64> {
         let (joints, logs) = (self.dofs.len(), self.training.len());
-        let own: Vec<usize> = match error {
+        let columns: Vec<usize> = match error {
             SetupError::Zero { joint, log } => {
                 let logs = log.map_or(0..logs, |log| log..log + 1);
                 logs.map(|log| joints * log + joint).collect()
             }
             SetupError::Delay(streams) => streams.clone().map(|own| joints * logs + own).collect(),
         };
-        self.r.select_columns(&own).column_sum()
+        self.r.select_columns(&columns).column_sum()
     }
 
     /// The parameters' columns, then those of these errors. (Other errors are zero: their columns
     /// are omitted.)
     fn columns(&self, errors: &[SetupError]) -> DMatrix<f64> {
         let parameters = self.identified.unknowns.parameters();
-        let own = self.r.columns(self.r.ncols() - parameters, parameters);
-        let mut own = (own.into_owned()).resize_horizontally(parameters + errors.len(), 0.0);
-        for (place, error) in errors.iter().enumerate() {
-            own.set_column(parameters + place, &self.column(error));
+        let columns = self.r.columns(self.r.ncols() - parameters, parameters);
+        let mut columns =
+            (columns.into_owned()).resize_horizontally(parameters + errors.len(), 0.0);
+        for (index, error) in errors.iter().enumerate() {
+            columns.set_column(parameters + index, &self.column(error));
         }
-        own
+        columns
     }
 
     /// The MAP parameters and these errors, and their cost.
@@ -391,8 +392,8 @@ impl<'a> Search<'a> {
     fn estimates(&self, errors: &[SetupError]) -> Option<Vec<Estimate>> {
         let (_, fit) = self.fit(errors)?;
         let (root, first) = (fit.covariance_root(), self.identified.unknowns.parameters());
-        let own = (first..first + errors.len()).map(|k| (fit.x[k], root.row(k).norm()));
-        Some(own.collect())
+        let estimates = (first..first + errors.len()).map(|k| (fit.x[k], root.row(k).norm()));
+        Some(estimates.collect())
     }
 
     /// The most likely candidates beside these errors: those with the largest gain if the prior
@@ -401,11 +402,11 @@ impl<'a> Search<'a> {
         let Some((_, fit)) = self.fit(errors) else {
             return Vec::new();
         };
-        let own = self.columns(errors);
-        let (residuals, root) = (&self.z - &own * &fit.x, fit.covariance_root());
+        let columns = self.columns(errors);
+        let (residuals, root) = (&self.z - &columns * &fit.x, fit.covariance_root());
         let gain = |error: &SetupError| {
             let column = self.column(error);
-            let known = root.tr_mul(&own.tr_mul(&column)).norm_squared();
+            let known = root.tr_mul(&columns.tr_mul(&column)).norm_squared();
             let precision = error.precision();
             column.dot(&residuals).powi(2)
                 / (column.norm_squared() - known + precision).max(precision)
@@ -418,8 +419,8 @@ impl<'a> Search<'a> {
             .take(TRIED)
             .map(|(_, own)| own.clone())
             .collect();
-        for place in 0..likely.len() {
-            if let SetupError::Zero { joint, .. } = likely[place] {
+        for index in 0..likely.len() {
+            if let SetupError::Zero { joint, .. } = likely[index] {
                 let in_all = SetupError::Zero { joint, log: None };
                 if !likely.contains(&in_all) && !errors.contains(&in_all) {
                     likely.push(in_all);
@@ -441,21 +442,21 @@ impl<'a> Search<'a> {
         accepted(|errors| self.likely(errors), cost, |_| self.gain, 1.0)
     }
 
-    /// Whether the zero at `place` may as well be in another log, with the opposite sign.
-    fn is_exchangeable(&self, errors: &[SetupError], place: usize) -> bool {
+    /// Whether the zero at `index` may as well be in another log, with the opposite sign.
+    fn is_exchangeable(&self, errors: &[SetupError], index: usize) -> bool {
         let cost_in = |log: Option<usize>| {
             let mut errors = errors.to_vec();
-            if let SetupError::Zero { log: own, .. } = &mut errors[place] {
+            if let SetupError::Zero { log: own, .. } = &mut errors[index] {
                 *own = log.or(*own);
             }
             self.fit(&errors).map_or(f64::INFINITY, |(cost, _)| cost)
         };
-        let SetupError::Zero { log, .. } = &errors[place] else {
+        let SetupError::Zero { log, .. } = &errors[index] else {
             return false;
         };
-        let own = cost_in(None);
+        let cost = cost_in(None);
         let mut others = (0..self.training.len()).filter(|other| Some(*other) != *log);
-        others.any(|other| cost_in(Some(other)) < own + self.gain)
+        others.any(|other| cost_in(Some(other)) < cost + self.gain)
     }
 
     /// Findings about zeros and delays, and the delays of all streams.
@@ -500,8 +501,8 @@ impl<'a> Search<'a> {
             let own = each
                 .get(count + sensors..)
                 .and_then(|each| alone(each, is_long));
-            findings.extend(own.map(|(place, delay)| {
-                let joint = robot.model.dof_name(unknowns.joints[place]);
+            findings.extend(own.map(|(index, delay)| {
+                let joint = robot.model.dof_name(unknowns.joints[index]);
                 let joint = format!("joint/{joint}/torque");
                 late(
                     &joint,
@@ -518,10 +519,10 @@ impl<'a> Search<'a> {
         let file = |log: usize| self.training[log].file.as_str();
         let mut findings = Vec::new();
         for (number, &dof) in self.dofs.iter().enumerate() {
-            let own: Vec<(usize, Option<usize>, f64)> = (zeros.iter().zip(estimates).enumerate())
-                .filter_map(|(place, (error, (angle, _)))| match error {
+            let found: Vec<(usize, Option<usize>, f64)> = (zeros.iter().zip(estimates).enumerate())
+                .filter_map(|(index, (error, (angle, _)))| match error {
                     SetupError::Zero { joint, log } if *joint == number => {
-                        Some((place, *log, *angle))
+                        Some((index, *log, *angle))
                     }
                     _ => None,
                 })
@@ -539,16 +540,16 @@ impl<'a> Search<'a> {
             } else {
                 MIN_ZERO_BEFORE_SENSORS
             };
-            if own.iter().all(|(_, _, angle)| angle.abs() <= least) {
+            if found.iter().all(|(_, _, angle)| angle.abs() <= least) {
                 continue;
             }
-            let each = own.iter().map(|(_, log, angle)| {
+            let each = found.iter().map(|(_, log, angle)| {
                 format!("{angle:.4} rad in {}", log.map_or("all logs", file))
             });
             let mut what = format!("encoder offset of {}", each.collect::<Vec<_>>().join(", "));
-            let rest = match *own {
+            let rest = match *found {
                 [(_, None, _)] => "",
-                [(place, Some(_), _)] if self.is_exchangeable(zeros, place) => {
+                [(index, Some(_), _)] if self.is_exchangeable(zeros, index) => {
                     what += ", or the opposite in all other logs";
                     " and use logs of one calibration"
                 }
@@ -638,16 +639,16 @@ fn late(subject: &str, seem: &str, (seconds, deviation): Estimate) -> Finding {
 /// The single torque that has a delay while all others have none.
 fn alone(each: &[Estimate], is_long: impl Fn(Estimate) -> bool) -> Option<(usize, Estimate)> {
     let known: Vec<usize> = (0..each.len()).filter(|&k| is_known(&each[k])).collect();
-    known.iter().filter(|_| known.len() > 2).find_map(|&place| {
-        let others = || known.iter().filter(|&&k| k != place).map(|&k| each[k]);
+    known.iter().filter(|_| known.len() > 2).find_map(|&index| {
+        let others = || known.iter().filter(|&&k| k != index).map(|&k| each[k]);
         let weight: f64 = others().map(|(_, deviation)| deviation.powi(-2)).sum();
         let weighted = others().map(|(own, deviation)| own * deviation.powi(-2));
         let common = (weighted.sum::<f64>() / weight, weight.sqrt().recip());
         let off = others().map(|(seconds, _)| (seconds - common.0).abs());
         let farthest = off.fold(0.0, f64::max);
-        let own = each[place];
+        let own = each[index];
         let apart = (own.0 - common.0, own.1.hypot(common.1));
         let is_alone = is_long(apart) && apart.0.abs() > SINGLE * farthest;
-        (is_alone && is_long(own) && !is_long(common)).then_some((place, own))
+        (is_alone && is_long(own) && !is_long(common)).then_some((index, own))
     })
 }

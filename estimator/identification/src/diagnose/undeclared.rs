@@ -3,7 +3,7 @@
 //! so that the next fit excludes them, and reported at the end.
 
 use crate::dataset::LogRole;
-use crate::dataset::observation::UnitSet;
+use crate::dataset::observation::SubtreeSet;
 use crate::diagnose::load::LoadChange;
 use crate::diagnose::{disturbance, load};
 use crate::finding::{Finding, FindingCode};
@@ -31,13 +31,13 @@ const ROUNDS: usize = 4;
 pub(crate) struct Undeclared {
     pub loads: Vec<LoadChange>,
     /// Per log and instant.
-    contacts: Vec<Vec<UnitSet>>,
+    contacts: Vec<Vec<SubtreeSet>>,
 }
 
 impl Undeclared {
     /// No disturbances, yet, of these logs.
     pub(crate) fn none<'a>(logs: impl Iterator<Item = &'a mut PreparedLog>) -> Self {
-        let contacts = logs.map(|log| vec![UnitSet::default(); log.instants.len()]);
+        let contacts = logs.map(|log| vec![SubtreeSet::default(); log.instants.len()]);
         Self {
             loads: Vec::new(),
             contacts: contacts.collect(),
@@ -53,7 +53,7 @@ impl Undeclared {
         };
         let is_same = |other: &&mut LoadChange| {
             let apart = (edge(other) - edge(&load)).seconds().abs();
-            (other.log, other.place, other.is_after) == (load.log, load.place, load.is_after)
+            (other.log, other.index, other.is_after) == (load.log, load.index, load.is_after)
                 && apart <= LONGEST_HANDOVER.max(1.5 * load.within)
         };
         match self.loads.iter_mut().find(is_same) {
@@ -94,7 +94,7 @@ impl Undeclared {
             for (instant, contact) in log.instants.iter_mut().zip(contacts) {
                 let carries = |load: &&LoadChange| load.log == number && load.has(instant.t);
                 let loads = self.loads.iter().filter(carries);
-                instant.disturbed = loads.fold(*contact, |set, load| set.union(&load.units));
+                instant.disturbed = loads.fold(*contact, |set, load| set.union(&load.subtrees));
             }
         }
     }
@@ -113,9 +113,9 @@ impl Undeclared {
         let bodies: Vec<Option<(usize, load::AddedBody)>> = loads.iter().map(body).collect();
         let training = training_logs_mut(logs);
         for (number, (log, contacts)) in training.zip(contacts).enumerate() {
-            let own = loads.iter().zip(&bodies);
-            let own = own.filter(|(load, _)| load.log == number);
-            let loads: Vec<&LoadChange> = own.clone().map(|(load, _)| load).collect();
+            let log_loads = loads.iter().zip(&bodies);
+            let log_loads = log_loads.filter(|(load, _)| load.log == number);
+            let loads: Vec<&LoadChange> = log_loads.clone().map(|(load, _)| load).collect();
             let apparent = apparent_contacts(log, contacts, &loads);
             for (part, excluded, when) in suspected(robot, log, &apparent) {
                 log.excluded.push(excluded);
@@ -126,8 +126,8 @@ impl Undeclared {
                 log.findings
                     .push(Finding::warning(FindingCode::Disturbance, part, text));
             }
-            for (place, (load, body)) in own.enumerate() {
-                let handovers = apparent.iter().filter(|own| own.load == Some(place));
+            for (index, (load, body)) in log_loads.enumerate() {
+                let handovers = apparent.iter().filter(|own| own.load == Some(index));
                 report_load(measurement, log, load, body.as_ref(), handovers);
             }
         }
@@ -145,8 +145,8 @@ fn report_load<'a>(
     handovers: impl Iterator<Item = &'a ApparentContact>,
 ) {
     let (robot, unknowns) = (measurement.robot(), measurement.unknowns());
-    let place = body.map_or(load.place, |(place, _)| *place);
-    let link = robot.model.link_name(unknowns.links[place]);
+    let index = body.map_or(load.index, |(index, _)| *index);
+    let link = robot.model.link_name(unknowns.links[index]);
     let since = |t: Nanos| (t - log.span.0).seconds();
     let stamps = log.instants.iter().map(|instant| instant.t);
     let mut out: Vec<bool> = stamps.map(|t| load.has(t)).collect();
@@ -209,9 +209,9 @@ pub(crate) fn not_converged(fits: usize) -> Finding {
     )
 }
 
-/// Description of the links of a unit.
-fn part(robot: &Robot, unit: usize) -> String {
-    match robot.structure.subtrees().get(unit) {
+/// Description of the links of a sub-tree.
+fn part(robot: &Robot, subtree: usize) -> String {
+    match robot.structure.subtrees().get(subtree) {
         Some(subtree) => {
             let sensors: Vec<String> = subtree
                 .sensors
@@ -224,34 +224,34 @@ fn part(robot: &Robot, unit: usize) -> String {
     }
 }
 
-/// Consecutive disturbed instants of a unit.
+/// Consecutive disturbed instants of a sub-tree.
 struct ApparentContact {
-    unit: usize,
+    subtree: usize,
     instants: Range<usize>,
     /// The load that a hand gives or takes there; none if it is a contact.
     load: Option<usize>,
 }
 
 /// The union of these sets.
-fn units(contacts: &[UnitSet]) -> UnitSet {
+fn subtrees(contacts: &[SubtreeSet]) -> SubtreeSet {
     contacts
         .iter()
-        .fold(UnitSet::default(), |units, set| units.union(set))
+        .fold(SubtreeSet::default(), |union, set| union.union(set))
 }
 
 /// The apparent contacts of a log with their causes; `loads`: loads whose hands may be one.
 fn apparent_contacts(
     log: &PreparedLog,
-    contacts: &[UnitSet],
+    contacts: &[SubtreeSet],
     loads: &[&LoadChange],
 ) -> Vec<ApparentContact> {
     let mut apparent_contacts = Vec::new();
-    for unit in units(contacts).iter() {
+    for subtree in subtrees(contacts).iter() {
         let mut begin = 0;
-        for instants in contacts.chunk_by(|a, b| a.contains(unit) == b.contains(unit)) {
+        for instants in contacts.chunk_by(|a, b| a.contains(subtree) == b.contains(subtree)) {
             let range = begin..begin + instants.len();
             begin = range.end;
-            if !instants[0].contains(unit) {
+            if !instants[0].contains(subtree) {
                 continue;
             }
             let (first, last) = (log.instants[range.start].t, log.instants[range.end - 1].t);
@@ -260,12 +260,12 @@ fn apparent_contacts(
                 (from - last).seconds() <= seconds && (first - to).seconds() <= seconds
             };
             let is_handed = |load: &&LoadChange| {
-                load.units.contains(unit) && is_near(load.span, NEAR_LOAD_CHANGE)
+                load.subtrees.contains(subtree) && is_near(load.span, NEAR_LOAD_CHANGE)
             };
             let load = loads.iter().position(is_handed);
             let load = load.filter(|&load| lasts <= LONGEST_HANDOVER.max(loads[load].within));
             apparent_contacts.push(ApparentContact {
-                unit,
+                subtree,
                 instants: range,
                 load,
             });
@@ -274,7 +274,8 @@ fn apparent_contacts(
     apparent_contacts
 }
 
-/// Each unit with contacts: its links, what is excluded, and in words how often, when and how long.
+/// Each sub-tree with contacts: its links, what is excluded, and in words how often, when and how
+/// long.
 fn suspected(
     robot: &Robot,
     log: &PreparedLog,
@@ -282,8 +283,8 @@ fn suspected(
 ) -> Vec<(String, Excluded, String)> {
     let contacts = contacts.iter().filter(|own| own.load.is_none());
     let contacts: Vec<&ApparentContact> = contacts.collect();
-    let of_unit = |own: &[&ApparentContact]| {
-        let part = part(robot, own[0].unit);
+    let of_subtree = |own: &[&ApparentContact]| {
+        let part = part(robot, own[0].subtree);
         let instants: usize = own.iter().map(|own| own.instants.len()).sum();
         let first = log.instants[own[0].instants.start].t;
         let last = log.instants[own[own.len() - 1].instants.end - 1].t;
@@ -304,9 +305,9 @@ fn suspected(
         };
         (part, excluded, when)
     };
-    // They are in the order of the units.
-    let units = contacts.chunk_by(|a, b| a.unit == b.unit);
-    units.map(of_unit).collect()
+    // They are in the order of the sub-trees.
+    let subtrees = contacts.chunk_by(|a, b| a.subtree == b.subtree);
+    subtrees.map(of_subtree).collect()
 }
 
 /// Reports undeclared disturbances of the validation logs, stores them in
@@ -346,7 +347,7 @@ pub(crate) fn report_validation(
             ));
         }
         for instant in &mut log.instants {
-            instant.disturbed = UnitSet::default();
+            instant.disturbed = SubtreeSet::default();
         }
         log.disturbed = contacts;
     }
@@ -357,22 +358,22 @@ mod tests {
     use super::*;
 
     /// A load that comes at `from` \[s\], known to `within`, of a log of 100 s.
-    fn load(log: usize, place: usize, from: i64, within: f64) -> LoadChange {
+    fn load(log: usize, index: usize, from: i64, within: f64) -> LoadChange {
         let at = |seconds: i64| Nanos::from_millis(1000 * seconds);
         LoadChange {
             log,
-            place,
+            index,
             span: (at(from), at(100)),
             clear: (at(from + 1), at(100)),
             within,
             is_after: true,
-            units: UnitSet::default(),
+            subtrees: SubtreeSet::default(),
         }
     }
 
     #[test]
     fn two_findings_of_one_load_change_are_merged() {
-        let of = |loads: &[LoadChange]| {
+        let merged = |loads: &[LoadChange]| {
             let mut undeclared = Undeclared::none(std::iter::empty());
             loads
                 .iter()
@@ -382,7 +383,7 @@ mod tests {
         };
         let first = load(0, 3, 23, 1.0);
         for sooner in [22, 24] {
-            let [one] = of(&[first.clone(), load(0, 3, sooner, 1.0)])
+            let [one] = merged(&[first.clone(), load(0, 3, sooner, 1.0)])
                 .try_into()
                 .unwrap();
             // All instants that may have the load are excluded; those that surely have it give its
@@ -391,13 +392,16 @@ mod tests {
             assert_eq!(one.clear, load(0, 3, sooner.max(23), 1.0).clear);
         }
         // In a long log the time of a change is known to a longer segment.
-        assert_eq!(of(&[load(0, 3, 40, 9.4), load(0, 3, 31, 9.4)]).len(), 1);
+        assert_eq!(merged(&[load(0, 3, 40, 9.4), load(0, 3, 31, 9.4)]).len(), 1);
         for other in [
             load(1, 3, 22, 1.0),
             load(0, 4, 22, 1.0),
             load(0, 3, 18, 1.0),
         ] {
-            assert_eq!(of(&[first.clone(), other.clone()]), [first.clone(), other]);
+            assert_eq!(
+                merged(&[first.clone(), other.clone()]),
+                [first.clone(), other]
+            );
         }
     }
 }

@@ -59,13 +59,13 @@ pub(crate) fn gram(a: &DMatrix<f64>) -> DMatrix<f64> {
 pub(crate) fn cholesky(mut matrix: DMatrix<f64>) -> Option<Cholesky<f64, Dyn>> {
     let count = matrix.nrows();
     for (first, length) in blocks(count) {
-        let own = Cholesky::new(copied(&matrix, (first, first), (length, length)))?.unpack();
-        put(&mut matrix, (first, first), &own);
+        let diagonal = Cholesky::new(copied(&matrix, (first, first), (length, length)))?.unpack();
+        put(&mut matrix, (first, first), &diagonal);
         let (next, below) = (first + length, count - first - length);
         if below == 0 {
             break;
         }
-        let inverse = own.solve_lower_triangular(&DMatrix::identity(length, length))?;
+        let inverse = diagonal.solve_lower_triangular(&DMatrix::identity(length, length))?;
         let panel = copied(&matrix, (next, first), (below, length)) * inverse.transpose();
         put(&mut matrix, (next, first), &panel);
         let transposed = panel.transpose();
@@ -86,16 +86,16 @@ pub(crate) fn inverse(l: &DMatrix<f64>) -> DMatrix<f64> {
     let count = l.nrows();
     let mut inverse = DMatrix::zeros(count, count);
     for (first, length) in blocks(count) {
-        let own = copied(l, (first, first), (length, length))
+        let diagonal = copied(l, (first, first), (length, length))
             .solve_lower_triangular(&DMatrix::identity(length, length))
             .unwrap_or_else(|| DMatrix::zeros(length, length));
         if first > 0 {
             // [L11 0; L21 L22]^-1 = [L11^-1 0; -L22^-1 L21 L11^-1  L22^-1]
             let left = copied(l, (first, 0), (length, first));
-            let product = -(&own * (left * copied(&inverse, (0, 0), (first, first))));
+            let product = -(&diagonal * (left * copied(&inverse, (0, 0), (first, first))));
             put(&mut inverse, (first, 0), &product);
         }
-        put(&mut inverse, (first, first), &own);
+        put(&mut inverse, (first, first), &diagonal);
     }
     inverse
 }

@@ -231,8 +231,8 @@ impl Information {
         let what = "standard deviations of a drift";
         check_size(what, deviation.len(), columns.len())?;
         check_columns(columns, self.unknowns())?;
-        let wrong = |value: &&f64| value.is_nan() || **value < 0.0;
-        if let Some(&value) = deviation.iter().find(wrong) {
+        let is_invalid = |value: &&f64| value.is_nan() || **value < 0.0;
+        if let Some(&value) = deviation.iter().find(is_invalid) {
             let what = "a drift's standard deviation";
             return Err(InformationError::Range { what, value });
         }

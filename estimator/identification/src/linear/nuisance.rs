@@ -66,17 +66,17 @@ impl NuisanceFilter {
     fn add(&mut self, mut weight: f64, last: usize) {
         let n = self.count;
         for j in (0..=last).rev() {
-            let own = self.work[j];
-            if own == 0.0 {
+            let value = self.work[j];
+            if value == 0.0 {
                 continue;
             }
             let before = self.d[j];
-            let after = before + weight * own * own;
-            let share = weight * own / after;
+            let after = before + weight * value * value;
+            let share = weight * value / after;
             self.d[j] = after;
             weight *= before / after;
             for (u, w) in self.u[j * n..][..j].iter_mut().zip(&mut self.work) {
-                *w -= own * *u;
+                *w -= value * *u;
                 *u += share * *w;
             }
         }
@@ -248,8 +248,8 @@ mod tests {
         assert!((&d - all.rows(0, p)).amax() < 1e-6, "{d} {all}");
         let last = nuisance.estimates();
         for i in 0..s {
-            let own = last[(i, p)] - last.row(i).columns(0, p).transpose().dot(&d);
-            assert!((own - all[p + s * (count - 1) + i]).abs() < 1e-6);
+            let value = last[(i, p)] - last.row(i).columns(0, p).transpose().dot(&d);
+            assert!((value - all[p + s * (count - 1) + i]).abs() < 1e-6);
         }
 
         // With d known, all offsets.
@@ -307,12 +307,12 @@ mod tests {
             .collect();
 
         // [d | s of each block]. A step of zero variance means the same unknown.
-        let mut place = vec![[0; 6]; count];
+        let mut index = vec![[0; 6]; count];
         let mut unknowns = p;
         for block in 0..count {
             for i in 0..s {
-                place[block][i] = if block > 0 && steps[i] == 0.0 {
-                    place[block - 1][i]
+                index[block][i] = if block > 0 && steps[i] == 0.0 {
+                    index[block - 1][i]
                 } else {
                     unknowns += 1;
                     unknowns - 1
@@ -326,12 +326,12 @@ mod tests {
             a
         };
         for i in 0..s {
-            lines.push((line(&[(place[0][i], 1.0 / f64::sqrt(prior[i]))]), 0.0));
+            lines.push((line(&[(index[0][i], 1.0 / f64::sqrt(prior[i]))]), 0.0));
             for block in 1..count {
                 if steps[i] > 0.0 {
                     let weight = 1.0 / f64::sqrt(steps[i]);
                     lines.push((
-                        line(&[(place[block][i], weight), (place[block - 1][i], -weight)]),
+                        line(&[(index[block][i], weight), (index[block - 1][i], -weight)]),
                         0.0,
                     ));
                 }
@@ -342,7 +342,7 @@ mod tests {
             let of_s = g
                 .iter()
                 .enumerate()
-                .map(|(i, g)| (place[k / per_block][i], *g));
+                .map(|(i, g)| (index[k / per_block][i], *g));
             lines.push((line(&of_d.chain(of_s).collect::<Vec<_>>()), *y));
         }
         // Exact rows first, so that Householder's triangle keeps the digits of all (Higham 2002,
@@ -377,8 +377,8 @@ mod tests {
         assert!(off < 1e-10, "{off:e}");
         let last = nuisance.estimates();
         for i in 0..s {
-            let own = last[(i, p)] - last.row(i).columns(0, p).transpose().dot(&d);
-            let off = (own - all[place[count - 1][i]]).abs() / all.amax();
+            let value = last[(i, p)] - last.row(i).columns(0, p).transpose().dot(&d);
+            let off = (value - all[index[count - 1][i]]).abs() / all.amax();
             assert!(off < 1e-10, "offset {i}: {off:e}");
         }
     }

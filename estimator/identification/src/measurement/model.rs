@@ -28,7 +28,7 @@
 //! speak against this solution, and the noise, which grows with the length of the log, for it.
 
 use crate::arithmetic::{dot, mean};
-use crate::dataset::observation::{Annotated, Observation, UnitSet};
+use crate::dataset::observation::{Annotated, Observation, SubtreeSet};
 use crate::dataset::stream::range;
 use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::{ExtraParameter, FRICTION, Unknowns, friction_row};
@@ -121,7 +121,7 @@ pub(crate) struct MeasurementModel<'a> {
     references: Vec<f64>,
     wrench: bool,
     torque: bool,
-    /// Whether rows are also made of units on which an undeclared disturbance acts.
+    /// Whether rows are also made of sub-trees on which an undeclared disturbance acts.
     includes_disturbed: bool,
     groups: Groups,
 }
@@ -174,7 +174,7 @@ impl<'a> MeasurementModel<'a> {
         let mut nodes = AppearingNodes::new(first_channel + channels);
         let mut rows = MeasurementRows::new(&measurement.unknowns);
         for observation in observations {
-            measurement.make(observation, &mut rows)?;
+            measurement.compute_rows(observation, &mut rows)?;
             for row in 0..rows.count {
                 nodes.add(links, rows.a(row), rows.n(row));
             }
@@ -292,7 +292,7 @@ impl<'a> MeasurementModel<'a> {
         &self.groups
     }
 
-    /// Whether rows are also made of [`Annotated::disturbed`] units from now on.
+    /// Whether rows are also made of [`Annotated::disturbed`] sub-trees from now on.
     pub(crate) fn include_disturbed(&mut self, includes_disturbed: bool) {
         self.includes_disturbed = includes_disturbed;
     }
@@ -311,14 +311,14 @@ impl<'a> MeasurementModel<'a> {
     /// joint.
     ///
     /// # Errors
-    /// As for [`MeasurementModel::make`].
+    /// As for [`MeasurementModel::compute_rows`].
     pub(crate) fn torque_errors(
         &mut self,
         observation: &Annotated,
         d: &[f64],
     ) -> Result<Vec<f64>, DynamicsError> {
         let mut rows = MeasurementRows::new(&self.unknowns);
-        self.make(observation, &mut rows)?;
+        self.compute_rows(observation, &mut rows)?;
         self.tree.update(&self.robot.model, &self.kinematics)?;
         let blocked = self.blocked(observation);
         let error = |dof: usize| {
@@ -338,11 +338,11 @@ impl<'a> MeasurementModel<'a> {
     }
 
     /// Computes the rows of an observation. Sub-trees with a missing reading, missing torques, and
-    /// units under an undeclared disturbance ([`Annotated::disturbed`]) have no rows.
+    /// sub-trees under an undeclared disturbance ([`Annotated::disturbed`]) have no rows.
     ///
     /// # Errors
     /// The observation is of another robot, or a position, velocity or acceleration is not finite.
-    pub(crate) fn make(
+    pub(crate) fn compute_rows(
         &mut self,
         observation: &Annotated,
         rows: &mut MeasurementRows,
@@ -404,21 +404,21 @@ impl<'a> MeasurementModel<'a> {
         routes
     }
 
-    /// The channels (places in the layout) that appear in rows of these units.
-    pub(crate) fn channels_of(&self, units: &UnitSet) -> Vec<usize> {
+    /// The channels (places in the layout) that appear in rows of these sub-trees.
+    pub(crate) fn channels_of(&self, set: &SubtreeSet) -> Vec<usize> {
         let (unknowns, subtrees) = (self.unknowns(), self.stacked.subtrees());
         let is_read = |sensor: usize| {
             let mut own = subtrees
                 .iter()
                 .enumerate()
-                .filter(|(number, _)| units.contains(*number));
+                .filter(|(number, _)| set.contains(*number));
             own.any(|(_, subtree)| subtree.sensors().any(|other| other == sensor))
         };
         let sensors = (0..unknowns.sensors.len()).filter(|&place| is_read(unknowns.sensors[place]));
         let of_sensors = sensors.flat_map(|place| 6 * place..6 * place + 6);
         let of_joints = 6 * unknowns.sensors.len()..unknowns.channels();
         of_sensors
-            .chain(of_joints.filter(|_| units.contains(Observation::TORQUES)))
+            .chain(of_joints.filter(|_| set.contains(Observation::TORQUES)))
             .collect()
     }
 

@@ -119,7 +119,7 @@ pub(crate) fn reduce_with(
         for number in range {
             if excluded.get(number) == Some(&true)
                 || measurement
-                    .make(&segment.instants[number], &mut rows)
+                    .compute_rows(&segment.instants[number], &mut rows)
                     .is_err()
             {
                 continue;
@@ -226,7 +226,7 @@ pub(crate) fn filter_nuisance(
                 let of_block = |range: &Range<usize>| {
                     let mut lines = Vec::new();
                     for observation in &segment.instants[range.clone()] {
-                        if measurement.make(observation, rows).is_err() {
+                        if measurement.compute_rows(observation, rows).is_err() {
                             continue;
                         }
                         noise.at(
@@ -297,7 +297,7 @@ pub(crate) fn residuals(
             let mut sums = ResidualSums::new(channels);
             for block in at * BLOCKS_PER_TASK..ranges.len().min((at + 1) * BLOCKS_PER_TASK) {
                 for observation in &segment.instants[ranges[block].clone()] {
-                    if measurement.make(observation, rows).is_err() {
+                    if measurement.compute_rows(observation, rows).is_err() {
                         rows.clear();
                     }
                     pass.add(rows, &states[block], &mut sums);
@@ -433,7 +433,7 @@ pub(crate) mod tests {
             seconds: Seconds::default(),
         };
         let far = [[9.0, 9.0], [5.0, 7.0]].map(noise);
-        let of = |rounds: &[[f64; 2]]| {
+        let cycle_end = |rounds: &[[f64; 2]]| {
             let rounds: Vec<NoiseModel> = far
                 .iter()
                 .cloned()
@@ -441,12 +441,12 @@ pub(crate) mod tests {
                 .collect();
             NoiseModel::end_limit_cycle(&rounds, 0.03)
         };
-        assert_eq!(of(&[[1.0, 2.0], [1.2, 2.0], [1.5, 2.0]]), None);
+        assert_eq!(cycle_end(&[[1.0, 2.0], [1.2, 2.0], [1.5, 2.0]]), None);
         assert_eq!(
-            of(&[[1.0, 2.0], [1.2, 2.0], [1.201, 2.0]]),
+            cycle_end(&[[1.0, 2.0], [1.2, 2.0], [1.201, 2.0]]),
             Some(noise([1.201, 2.0]))
         );
-        let found = of(&[
+        let found = cycle_end(&[
             [3.0, 3.0],
             [1.0, 2.2],
             [1.3, 2.0],
@@ -564,7 +564,9 @@ pub(crate) mod tests {
         let mut offset = [0.0; 12];
         for observation in &mut instants {
             // r = 0 for G m + r(0) = 0: the foot's reading is chosen, the hip's follows.
-            measurement.make(observation, &mut rows).expect("rows");
+            measurement
+                .compute_rows(observation, &mut rows)
+                .expect("rows");
             assert_eq!(rows.count, 6);
             let g = |first: usize| Matrix6::from_fn(|i, j| rows.g(i)[first + j]);
             let foot = Vector6::new(0.5, -0.3, 0.2, 3.0, -2.0, 20.0);
@@ -645,7 +647,9 @@ pub(crate) mod tests {
             disturbed
                 .into_iter()
                 .for_each(|unit| observation.disturbed.insert(unit));
-            measurement.make(&observation, &mut rows).expect("rows");
+            measurement
+                .compute_rows(&observation, &mut rows)
+                .expect("rows");
             let mut own = MeasurementRows::new(measurement.unknowns());
             rows.copy_unit(Observation::TORQUES, &mut own);
             assert_eq!(own.count, expected, "rows with {disturbed:?}");

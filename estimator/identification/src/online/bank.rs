@@ -291,11 +291,11 @@ impl Bank {
             unit.decide(|view, sight| {
                 let others = evidence.iter().enumerate();
                 let others = others.filter(|(other, _)| *other != number);
-                let own = |(_, of_unit): (usize, &Vec<(MotionReading, WrenchReading, f64)>)| {
+                let weight = |(_, of_unit): (usize, &Vec<(MotionReading, WrenchReading, f64)>)| {
                     let same = of_unit.iter().find(|own| (own.0, own.1) == (view, sight));
                     same.map(|own| own.2)
                 };
-                others.filter_map(own).sum()
+                others.filter_map(weight).sum()
             });
         }
     }

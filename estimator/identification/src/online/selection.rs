@@ -295,11 +295,11 @@ mod tests {
             let t = selection.times.last().copied().unwrap_or(0.0) + BLOCK;
             let residuals: Vec<[f64; 2]> = (selection.all())
                 .map(|wrong| {
-                    let of = |channel: usize| {
+                    let reading = |channel: usize| {
                         let motion = (1.7 * t + channel as f64).sin();
                         wrong * motion + noise[2 * block + channel] + 40.0 + 3.0 * t
                     };
-                    [of(0), of(1)]
+                    [reading(0), reading(1)]
                 })
                 .collect();
             selection.take(t, residuals.iter().map(<[f64; 2]>::as_slice));

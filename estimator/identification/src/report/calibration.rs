@@ -30,9 +30,9 @@ pub(crate) fn calibrations(
         return (outcomes, findings);
     }
     for &sensor in &identified.unknowns.sensors {
-        let own = SensorErrors::new(robot, identified, root, sensor);
-        if robot.calibrated.temperature && !own.kind.temperature {
-            let name = &own.name;
+        let errors = SensorErrors::new(robot, identified, root, sensor);
+        if robot.calibrated.temperature && !errors.kind.temperature {
+            let name = &errors.name;
             findings.push(Finding::warning(
                 FindingCode::NoTemperature,
                 name,
@@ -42,14 +42,14 @@ pub(crate) fn calibrations(
                 ),
             ));
         }
-        if own.kind.is_empty() {
+        if errors.kind.is_empty() {
             continue;
         }
-        findings.extend(own.not_excited());
-        findings.extend(own.not_separable(robot, root));
+        findings.extend(errors.not_excited());
+        findings.extend(errors.not_separable(robot, root));
         let reference = measurement.reference(sensor);
         let configured = robot.calibrations[sensor];
-        outcomes.push(own.outcome(configured, reference));
+        outcomes.push(errors.outcome(configured, reference));
     }
     (outcomes, findings)
 }

@@ -103,7 +103,7 @@ pub(crate) struct SensorComparison {
     /// The same less the prediction: by CAD with the configured offsets, by CAD with fitted ones,
     /// by the identified parameters with fitted ones.
     pub errors: [Vec<Vec<f64>>; 3],
-    /// Per sensor (place in the layout) and instant, the number of rows with its reading: six of
+    /// Per sensor (index in the layout) and instant, the number of rows with its reading: six of
     /// each sub-tree that it bounds, unless the sub-tree is disturbed.
     pub rows: Vec<Vec<usize>>,
 }
@@ -149,7 +149,7 @@ impl SensorComparison {
                     for instant in &instants[ranges[block].clone()] {
                         let start = out.len();
                         out.resize(start + 6 * sensors, ComparedReading::NONE);
-                        if sensors > 0 && measurement.make(instant, rows).is_ok() {
+                        if sensors > 0 && measurement.compute_rows(instant, rows).is_ok() {
                             let sensors = &unknowns.sensors;
                             compare(
                                 instant,
@@ -201,8 +201,8 @@ fn compare(
     let residuals = cases
         .map(|(d, s)| DVector::from_fn(rows.count, |row, _| rows.residual(row, d.as_slice(), s)));
     let (_, offsets) = cases[2];
-    for (place, &sensor) in sensors.iter().enumerate() {
-        let channels = 6 * place..6 * place + 6;
+    for (index, &sensor) in sensors.iter().enumerate() {
+        let channels = 6 * index..6 * index + 6;
         let Some(map) = attribute_to(rows, variances, channels.clone()) else {
             continue;
         };
@@ -225,10 +225,10 @@ fn compare(
 /// The configured offsets, in the columns of the nuisance parameters.
 pub(crate) fn configured_nuisance(robot: &Robot, unknowns: &Unknowns) -> Vec<f64> {
     let mut configured = vec![0.0; unknowns.nuisance()];
-    for (place, &sensor) in unknowns.sensors.iter().enumerate() {
+    for (index, &sensor) in unknowns.sensors.iter().enumerate() {
         let (offset, _) = robot.offsets[sensor];
         for (axis, value) in offset.force_first().into_iter().enumerate() {
-            configured[channel_of(place, axis)] = value;
+            configured[channel_of(index, axis)] = value;
         }
     }
     configured
@@ -245,7 +245,7 @@ pub(crate) fn predicted_deviations(
     let unknowns = measurement.unknowns().clone();
     let mut rows = MeasurementRows::new(&unknowns);
     let mut out = vec![f64::NAN; unknowns.channels()];
-    if measurement.make(instant, &mut rows).is_err() {
+    if measurement.compute_rows(instant, &mut rows).is_err() {
         return out;
     }
     let a = DMatrix::from_fn(rows.count, unknowns.parameters(), |i, j| rows.a(i)[j]) * root;
@@ -253,7 +253,7 @@ pub(crate) fn predicted_deviations(
         rows.n(i)[c] * identified.noise.square[c].sqrt()
     });
     let wrenches = 6 * unknowns.sensors.len();
-    let sensors = (0..unknowns.sensors.len()).map(|place| 6 * place..6 * place + 6);
+    let sensors = (0..unknowns.sensors.len()).map(|index| 6 * index..6 * index + 6);
     for channels in sensors.chain((wrenches..unknowns.channels()).map(|c| c..c + 1)) {
         let Some(map) = attribute_to(
             &rows,

@@ -53,7 +53,7 @@ pub(crate) fn curves(
         measured,
     } in torques
     {
-        let place = unknowns.joints.binary_search(dof).ok();
+        let index = unknowns.joints.binary_search(dof).ok();
         out.push(Curve {
             name: robot.model.dof_name(*dof).to_owned(),
             unit: "Nm",
@@ -61,15 +61,15 @@ pub(crate) fn curves(
             measured: pick(&|i| measured[i]),
             cad_fitted: pick(&|i| measured[i] - errors[1][i]),
             identified: pick(&|i| measured[i] - errors[2][i]),
-            sigma: place.map_or_else(
+            sigma: index.map_or_else(
                 || vec![f64::NAN; points.len()],
-                |place| sigma(wrenches + place),
+                |index| sigma(wrenches + index),
             ),
         });
     }
-    for (place, &sensor) in unknowns.sensors.iter().enumerate() {
+    for (index, &sensor) in unknowns.sensors.iter().enumerate() {
         for (axis, word) in AXES.into_iter().enumerate() {
-            let channel = channel_of(place, axis);
+            let channel = channel_of(index, axis);
             let load = &compared.load[channel];
             out.push(Curve {
                 name: format!("{} {word}", sensor_name(robot, sensor)),

@@ -1,7 +1,7 @@
 //! The figures of one log: residuals, prediction errors, coverage, offsets, friction, findings.
 
 use crate::arithmetic::{dot, mean, rms};
-use crate::dataset::observation::{Annotated, UnitSet};
+use crate::dataset::observation::{Annotated, SubtreeSet};
 use crate::finding::{Finding, FindingCode};
 use crate::fit::Identified;
 use crate::measurement::channels::{channel_of, sensor_name};
@@ -52,18 +52,18 @@ pub(crate) fn with_friction_of_training(
     instants: &[Annotated],
     residuals: &Residuals,
     (set, friction): (usize, &[[f64; FRICTION]]),
-    place: usize,
+    index: usize,
 ) -> Vec<f64> {
     let wrenches = 6 * unknowns.sensors.len();
-    let mut errors = residuals.noise[set][wrenches + place].clone();
+    let mut errors = residuals.noise[set][wrenches + index].clone();
     for (range, block) in residuals.ranges.iter().zip(&residuals.nuisance) {
         for i in range.clone() {
-            for (k, share) in friction_row(instants[i].velocity[unknowns.joints[place]])
+            for (k, share) in friction_row(instants[i].velocity[unknowns.joints[index]])
                 .into_iter()
                 .enumerate()
             {
-                let fitted = block.x[(wrenches + FRICTION * place + k, set)];
-                errors[i] += share * (fitted - friction[place][k]);
+                let fitted = block.x[(wrenches + FRICTION * index + k, set)];
+                errors[i] += share * (fitted - friction[index][k]);
             }
         }
     }
@@ -103,7 +103,7 @@ pub(crate) fn log_outcome(
     let undisturbed = undisturbed(measurement, log, identified, sets);
     let tested = undisturbed.as_ref().unwrap_or(&compared);
     let sensors = unknowns.sensors.iter().enumerate();
-    let findings = sensors.filter_map(|(place, &sensor)| unexplained(robot, sensor, tested, place));
+    let findings = sensors.filter_map(|(index, &sensor)| unexplained(robot, sensor, tested, index));
     let deviations = nuisance_deviations(measurement, instants, identified, root);
     LogOutcome {
         file: log.file.clone(),
@@ -162,8 +162,8 @@ fn input_torques(
     judged: &Judged<'_>,
 ) -> Vec<TorqueSeries> {
     let unknowns = &judged.identified.unknowns;
-    let series = |(place, &dof): (usize, &usize)| {
-        let channel = 6 * unknowns.sensors.len() + place;
+    let series = |(index, &dof): (usize, &usize)| {
+        let channel = 6 * unknowns.sensors.len() + index;
         let raw = residuals.measured[channel]
             .iter()
             .zip(&residuals.predicted[channel])
@@ -171,7 +171,7 @@ fn input_torques(
             .collect();
         let [cad, own] = [0, 1].map(|set| {
             let friction = (set, judged.candidates[set].friction.as_slice());
-            with_friction_of_training(unknowns, instants, residuals, friction, place)
+            with_friction_of_training(unknowns, instants, residuals, friction, index)
         });
         let [cad_fitted, own_fitted] = [0, 1].map(|set| residuals.noise[set][channel].clone());
         TorqueSeries {
@@ -236,8 +236,8 @@ fn joint_outcomes(
     coverage: &[f64],
 ) -> Vec<JointOutcome> {
     let outcome = |own: &TorqueSeries| {
-        let place = unknowns.joints.binary_search(&own.dof).ok();
-        let channel = place.map(|place| 6 * unknowns.sensors.len() + place);
+        let index = unknowns.joints.binary_search(&own.dof).ok();
+        let channel = index.map(|index| 6 * unknowns.sensors.len() + index);
         JointOutcome {
             name: robot.model.dof_name(own.dof).to_owned(),
             rms_nm: three([0, 1, 2].map(|set| rms(own.errors[set].iter().copied()))),
@@ -254,12 +254,12 @@ fn sensor_outcomes(
     compared: &SensorComparison,
     coverage: &[f64],
 ) -> Vec<SensorOutcome> {
-    let outcome = |(place, &sensor): (usize, &usize)| SensorOutcome {
+    let outcome = |(index, &sensor): (usize, &usize)| SensorOutcome {
         name: sensor_name(robot, sensor),
         rms: three(compared.errors.each_ref().map(|errors| {
-            std::array::from_fn(|axis| rms(errors[channel_of(place, axis)].iter().copied()))
+            std::array::from_fn(|axis| rms(errors[channel_of(index, axis)].iter().copied()))
         })),
-        coverage: std::array::from_fn(|axis| coverage[channel_of(place, axis)]),
+        coverage: std::array::from_fn(|axis| coverage[channel_of(index, axis)]),
     };
     unknowns.sensors.iter().enumerate().map(outcome).collect()
 }
@@ -272,12 +272,12 @@ pub(crate) fn undisturbed(
     identified: &Identified,
     sets: &[DVector<f64>; 2],
 ) -> Option<SensorComparison> {
-    if log.disturbed.iter().all(UnitSet::is_empty) {
+    if log.disturbed.iter().all(SubtreeSet::is_empty) {
         return None;
     }
     let mut instants = log.instants.clone();
-    for (instant, units) in instants.iter_mut().zip(&log.disturbed) {
-        instant.disturbed = *units;
+    for (instant, subtrees) in instants.iter_mut().zip(&log.disturbed) {
+        instant.disturbed = *subtrees;
     }
     let segment = LogSegment::alone(&instants);
     let residuals = residuals(measurement, segment, &identified.noise, sets);
@@ -300,7 +300,7 @@ pub(crate) fn unexplained(
     robot: &Robot,
     sensor: usize,
     compared: &SensorComparison,
-    place: usize,
+    index: usize,
 ) -> Option<Finding> {
     /// Residuals above this multiple of the stated noise are reported ...
     const TIMES: f64 = 10.0;
@@ -312,14 +312,14 @@ pub(crate) fn unexplained(
     let noise = [noise.force, noise.torque].concat();
     // Only instants with the rows of all sub-trees of the sensor: if one of them is disturbed, the
     // errors of the others would be attributed to this sensor alone.
-    let all_rows = compared.rows[place].iter().copied().max().unwrap_or(0);
+    let all_rows = compared.rows[index].iter().copied().max().unwrap_or(0);
     let (mut residual, mut all) = (0.0, 0.0);
     let (mut axes, mut opposite) = (Vec::new(), Vec::new());
     for (axis, word) in AXES.into_iter().enumerate() {
-        let channel = channel_of(place, axis);
+        let channel = channel_of(index, axis);
         let (load, error) = (&compared.load[channel], &compared.errors[2][channel]);
         let is_compared = |&i: &usize| {
-            load[i].is_finite() && error[i].is_finite() && compared.rows[place][i] == all_rows
+            load[i].is_finite() && error[i].is_finite() && compared.rows[index][i] == all_rows
         };
         let (load, error): (Vec<f64>, Vec<f64>) = (0..load.len())
             .filter(is_compared)
@@ -402,7 +402,7 @@ pub(crate) fn two_route(
     for (range, block) in residuals.ranges.iter().zip(&residuals.nuisance) {
         let cases = cases(sets, &configured, block);
         for instant in &instants[range.clone()] {
-            if unknowns.sensors.len() < 2 || measurement.make(instant, &mut rows).is_err() {
+            if unknowns.sensors.len() < 2 || measurement.compute_rows(instant, &mut rows).is_err() {
                 continue;
             }
             for (dof, along) in measurement.two_routes(&rows) {
@@ -458,19 +458,19 @@ pub(crate) fn offsets(
     let (Some(first), Some(last)) = (residuals.nuisance.first(), residuals.nuisance.last()) else {
         return Vec::new();
     };
-    let axes = |place: usize, value: &dyn Fn(usize) -> f64| {
-        std::array::from_fn(|axis| value(channel_of(place, axis)))
+    let axes = |index: usize, value: &dyn Fn(usize) -> f64| {
+        std::array::from_fn(|axis| value(channel_of(index, axis)))
     };
-    let is_read = |place: usize| (0..6).any(|axis| residuals.has_channel(6 * place + axis));
+    let is_read = |index: usize| (0..6).any(|axis| residuals.has_channel(6 * index + axis));
     let sensors = unknowns.sensors.iter().enumerate();
-    let offsets = sensors.filter(|(place, _)| is_read(*place));
+    let offsets = sensors.filter(|(index, _)| is_read(*index));
     offsets
-        .map(|(place, &sensor)| OffsetOutcome {
+        .map(|(index, &sensor)| OffsetOutcome {
             sensor: sensor_name(robot, sensor),
-            start: axes(place, &|channel| first.x[(channel, 1)]),
-            end: axes(place, &|channel| last.x[(channel, 1)]),
-            deviation: axes(place, &|channel| deviations[channel]),
-            rate: axes(place, &|channel| identified.noise.drift[channel].sqrt()),
+            start: axes(index, &|channel| first.x[(channel, 1)]),
+            end: axes(index, &|channel| last.x[(channel, 1)]),
+            deviation: axes(index, &|channel| deviations[channel]),
+            rate: axes(index, &|channel| identified.noise.drift[channel].sqrt()),
         })
         .collect()
 }
@@ -486,18 +486,18 @@ pub(crate) fn friction(
         return Vec::new();
     };
     let first = 6 * unknowns.sensors.len();
-    let value = |place: usize, k: usize| last.x[(first + FRICTION * place + k, 1)];
+    let value = |index: usize, k: usize| last.x[(first + FRICTION * index + k, 1)];
     unknowns
         .joints
         .iter()
         .enumerate()
-        .filter(|(place, _)| residuals.has_channel(first + place))
-        .map(|(place, &dof)| FrictionOutcome {
+        .filter(|(index, _)| residuals.has_channel(first + index))
+        .map(|(index, &dof)| FrictionOutcome {
             joint: robot.model.dof_name(dof).to_owned(),
-            coulomb_nm: value(place, 0),
-            viscous: value(place, 1),
-            offset_nm: value(place, 2),
-            deviation: [0, 1, 2].map(|k| deviations[first + FRICTION * place + k]),
+            coulomb_nm: value(index, 0),
+            viscous: value(index, 1),
+            offset_nm: value(index, 2),
+            deviation: [0, 1, 2].map(|k| deviations[first + FRICTION * index + k]),
         })
         .collect()
 }

@@ -149,11 +149,11 @@ pub fn predicted(
 /// Parameters less CAD's, in the columns of a layout.
 fn beside(cad: &Robot, unknowns: &Unknowns, in_force: &InForce) -> DVector<f64> {
     let mut d = DVector::zeros(unknowns.parameters());
-    for (place, &link) in unknowns.links.iter().enumerate() {
+    for (index, &link) in unknowns.links.iter().enumerate() {
         let parameters =
             [&in_force.bodies[link], &cad.model.inertias()[link]].map(RigidInertia::parameters);
         for k in 0..10 {
-            d[10 * place + k] = parameters[0][k] - parameters[1][k];
+            d[10 * index + k] = parameters[0][k] - parameters[1][k];
         }
     }
     let changes: Vec<(Matrix6<f64>, [f64; 6])> = in_force
@@ -251,9 +251,9 @@ impl<'a> PredictionError<'a> {
         let series = |of: &dyn Fn(&PredictionErrors) -> f64| both([of(&errors[0]), of(&errors[1])]);
         let of_channel =
             |channel: usize| series(&|errors| rms(errors.channels[channel].iter().copied()));
-        let of_sensor = |place: usize| {
+        let of_sensor = |index: usize| {
             let axes: [Both<f64>; 6] =
-                std::array::from_fn(|axis| of_channel(channel_of(place, axis)));
+                std::array::from_fn(|axis| of_channel(channel_of(index, axis)));
             both([axes.map(|axis| axis.cad), axes.map(|axis| axis.identified)])
         };
         let routes = (0..robot.model.dof_count()).map(|dof| {
@@ -265,7 +265,7 @@ impl<'a> PredictionError<'a> {
             relative_error_with_drift: relative(1),
             joints: Vec::new(),
             sensors: (unknowns.sensors.iter().enumerate())
-                .map(|(place, sensor)| (sensor_name(robot, *sensor), of_sensor(place)))
+                .map(|(index, sensor)| (sensor_name(robot, *sensor), of_sensor(index)))
                 .collect(),
             two_route: routes.filter(|(_, rms)| rms.cad.is_finite()).collect(),
         }
@@ -332,11 +332,11 @@ impl<'a> PredictionError<'a> {
         });
         let values: Vec<f64> = values.concat();
         let column = |at: usize| -> Vec<f64> {
-            let own = values.iter().skip(at).step_by(candidates.len() * width);
-            own.copied().collect()
+            let series = values.iter().skip(at).step_by(candidates.len() * width);
+            series.copied().collect()
         };
         let columns = |which: usize, places: Range<usize>| -> Vec<Vec<f64>> {
-            places.map(|place| column(which * width + place)).collect()
+            places.map(|index| column(which * width + index)).collect()
         };
         (0..candidates.len())
             .map(|which| PredictionErrors {
@@ -409,10 +409,10 @@ impl<'a> PredictionError<'a> {
                 )
             },
             |(measurement, rows), part| {
-                let mut own = make();
+                let mut state = make();
                 let end = self.instants.len().min(BATCH * (part + 1));
                 for instant in &self.instants[BATCH * part..end] {
-                    if measurement.make(instant, rows).is_err() {
+                    if measurement.compute_rows(instant, rows).is_err() {
                         rows.clear();
                     }
                     let made = InstantRows {
@@ -422,9 +422,9 @@ impl<'a> PredictionError<'a> {
                         rows,
                         trusted: &trusted,
                     };
-                    each(&mut own, &made);
+                    each(&mut state, &made);
                 }
-                own
+                state
             },
         )
     }
@@ -451,20 +451,20 @@ fn comparisons(made: &InstantRows<'_, '_>, plan: &JudgedSets, sets: &[usize]) ->
         .collect();
     let g = DMatrix::from_fn(rows.count, offsets, |row, column| rows.g(row)[column]);
     let mut compared = Vec::new();
-    for place in 0..unknowns.sensors.len() {
-        let Some(map) = attribute_to(rows, made.trusted, 6 * place..6 * place + 6) else {
+    for index in 0..unknowns.sensors.len() {
+        let Some(map) = attribute_to(rows, made.trusted, 6 * index..6 * index + 6) else {
             continue;
         };
         let maps: Vec<Matrix6xX<f64>> =
-            plan.gains.iter().map(|gains| gains[place] * &map).collect();
+            plan.gains.iter().map(|gains| gains[index] * &map).collect();
         let h: Vec<Matrix6xX<f64>> = maps.iter().map(|map| map * &g).collect();
         let each = residuals.iter().zip(sets);
         let errors: Vec<Vector6<f64>> = each
             .map(|(residuals, &set)| &maps[plan.sets[set].gains] * residuals)
             .collect();
-        for k in (0..6).filter(|k| rows.has(6 * place + k)) {
+        for k in (0..6).filter(|k| rows.has(6 * index + k)) {
             compared.push(ComparedRow {
-                of: ComparedQuantity::Channel(6 * place + k),
+                of: ComparedQuantity::Channel(6 * index + k),
                 residuals: errors.iter().map(|error| error[k]).collect(),
                 h: h.iter()
                     .map(|h| h.row(k).iter().copied().collect())
@@ -506,8 +506,8 @@ impl JudgedSets {
                 plan.sets.push(ParameterSet { d, gains: number });
             }
             let of_joint = |dof: &usize| {
-                let place = from.joints.binary_search(dof).ok();
-                place.map_or([0.0; FRICTION], |place| friction[place])
+                let index = from.joints.binary_search(dof).ok();
+                index.map_or([0.0; FRICTION], |index| friction[index])
             };
             plan.courses.push(ParameterCourse {
                 sets: own,
@@ -535,12 +535,12 @@ fn line(h: &[f64], late: f64, drifts: usize) -> Vec<f64> {
 
 /// Least-squares solution for the first `count` offsets. Unobserved ones are zero.
 fn solved(normal: &DMatrix<f64>, right: &DVector<f64>, count: usize) -> DVector<f64> {
-    let mut own = normal.view((0, 0), (count, count)).into_owned();
+    let mut matrix = normal.view((0, 0), (count, count)).into_owned();
     for i in 0..count {
-        own[(i, i)] += 1.0 / OFFSET_VARIANCE;
+        matrix[(i, i)] += 1.0 / OFFSET_VARIANCE;
     }
     let right = right.rows(0, count).into_owned();
-    let solution = own.cholesky().map(|factor| factor.solve(&right));
+    let solution = matrix.cholesky().map(|factor| factor.solve(&right));
     solution.unwrap_or_else(|| DVector::zeros(count))
 }
 
@@ -555,15 +555,15 @@ fn stated_variances(robot: &Robot, unknowns: &Unknowns) -> Vec<f64> {
 /// Parameters in the columns of another layout; CAD's where `from` has none.
 fn in_columns_of(from: &Unknowns, d: &DVector<f64>, to: &Unknowns) -> DVector<f64> {
     let mut out = DVector::zeros(to.parameters());
-    for (place, link) in to.links.iter().enumerate() {
+    for (index, link) in to.links.iter().enumerate() {
         if let Ok(other) = from.links.binary_search(link) {
-            out.rows_mut(10 * place, 10)
+            out.rows_mut(10 * index, 10)
                 .copy_from(&d.rows(10 * other, 10));
         }
     }
-    for (place, extra) in to.extra.iter().enumerate() {
+    for (index, extra) in to.extra.iter().enumerate() {
         if let Some(column) = from.column(*extra) {
-            out[to.inertial() + place] = d[column];
+            out[to.inertial() + index] = d[column];
         }
     }
     out
@@ -607,7 +607,7 @@ pub(crate) fn friction<'b>(
             let mut sums = zero();
             let end = instants.len().min(BATCH * (part + 1));
             for instant in &instants[BATCH * part..end] {
-                if measurement.make(instant, rows).is_err() {
+                if measurement.compute_rows(instant, rows).is_err() {
                     continue;
                 }
                 for row in 0..rows.count {

@@ -83,8 +83,8 @@ pub(crate) fn combinations(matrix: &DMatrix<f64>, columns: &[usize]) -> Vec<usiz
     // pseudo-inverse.
     let svd = remainder.svd(false, true);
     let directions = svd.v_t.unwrap_or_else(|| DMatrix::zeros(0, columns.len()));
-    let far = |place: usize| {
-        let row = directions.column(place);
+    let far = |index: usize| {
+        let row = directions.column(index);
         let squares = row
             .iter()
             .zip(&svd.singular_values)
@@ -92,7 +92,7 @@ pub(crate) fn combinations(matrix: &DMatrix<f64>, columns: &[usize]) -> Vec<usiz
         squares.sum::<f64>().sqrt().recip()
     };
     let each = columns.iter().enumerate();
-    each.filter(|(place, _)| far(*place) < MAX_DISTANCE)
+    each.filter(|(index, _)| far(*index) < MAX_DISTANCE)
         .map(|(_, column)| *column)
         .collect()
 }
@@ -137,8 +137,8 @@ pub(crate) fn scaled_information(identified: &Identified) -> (DMatrix<f64>, Vec<
 
 /// Multiplies the columns of each link by one of these matrices.
 fn scale_links(r: &mut DMatrix<f64>, spreads: &[DMatrix<f64>]) {
-    for (place, spread) in spreads.iter().enumerate() {
-        let mut columns = r.columns_mut(LINK_PARAMETERS * place, LINK_PARAMETERS);
+    for (index, spread) in spreads.iter().enumerate() {
+        let mut columns = r.columns_mut(LINK_PARAMETERS * index, LINK_PARAMETERS);
         let scaled = columns.clone_owned() * spread;
         columns.copy_from(&scaled);
     }
@@ -159,9 +159,9 @@ pub(crate) fn of_links(identified: &Identified) -> DMatrix<f64> {
     let mut all = r
         .select_columns(&order)
         .resize_vertically(rows + extra, 0.0);
-    for (place, (precision, own)) in unknowns.precision.iter().zip(&unknowns.extra).enumerate() {
+    for (index, (precision, own)) in unknowns.precision.iter().zip(&unknowns.extra).enumerate() {
         if !own.lacks_cad() {
-            all[(rows + place, place)] = precision.sqrt();
+            all[(rows + index, index)] = precision.sqrt();
         }
     }
     let r = all.qr().r();
@@ -183,9 +183,9 @@ pub(crate) fn cad_root(
     let given: Vec<usize> = given.collect();
     let precision = &unknowns.precision;
     let mut root = DMatrix::zeros(count, count);
-    for (place, spread) in spread.iter().enumerate() {
+    for (index, spread) in spread.iter().enumerate() {
         root.view_mut(
-            (LINK_PARAMETERS * place, LINK_PARAMETERS * place),
+            (LINK_PARAMETERS * index, LINK_PARAMETERS * index),
             (LINK_PARAMETERS, LINK_PARAMETERS),
         )
         .copy_from(spread);
@@ -196,10 +196,10 @@ pub(crate) fn cad_root(
     if fitted.is_empty() {
         return root;
     }
-    let own = r.select_columns(&fitted);
-    let mut square = own.tr_mul(&own);
-    for (place, &column) in fitted.iter().enumerate() {
-        square[(place, place)] += precision[column - unknowns.inertial()];
+    let columns = r.select_columns(&fitted);
+    let mut square = columns.tr_mul(&columns);
+    for (index, &column) in fitted.iter().enumerate() {
+        square[(index, index)] += precision[column - unknowns.inertial()];
         root[(column, column)] = 0.0;
     }
     let Some(factor) = square.cholesky() else {
@@ -207,12 +207,13 @@ pub(crate) fn cad_root(
     };
     // (R_f^T R_f + prior)^-1 [-R_f^T R_c (error of c) + noise], the noise of covariance R_f^T R_f +
     // prior.
-    let moved = factor.solve(&own.tr_mul(&(r.select_columns(&given) * root.select_rows(&given))));
+    let moved =
+        factor.solve(&columns.tr_mul(&(r.select_columns(&given) * root.select_rows(&given))));
     let noise = factor.l().transpose().try_inverse();
-    for (place, &column) in fitted.iter().enumerate() {
-        root.row_mut(column).copy_from(&-moved.row(place));
+    for (index, &column) in fitted.iter().enumerate() {
+        root.row_mut(column).copy_from(&-moved.row(index));
         for (other, &at) in fitted.iter().enumerate() {
-            root[(column, at)] += noise.as_ref().map_or(0.0, |noise| noise[(place, other)]);
+            root[(column, at)] += noise.as_ref().map_or(0.0, |noise| noise[(index, other)]);
         }
     }
     root
@@ -255,16 +256,16 @@ pub(crate) fn links(
     };
     let inverses: Vec<DMatrix<f64>> = spread.iter().map(inverse).collect();
     // Of the rows of a link, in units of the prior's spread.
-    let scaled = |matrix: &DMatrix<f64>, place: usize| {
-        let own = matrix.rows(LINK_PARAMETERS * place, LINK_PARAMETERS);
-        &inverses[place] * own.into_owned()
+    let scaled = |matrix: &DMatrix<f64>, index: usize| {
+        let block = matrix.rows(LINK_PARAMETERS * index, LINK_PARAMETERS);
+        &inverses[index] * block.into_owned()
     };
     // Covariance of the estimate if CAD were right: P - P (prior's precision) P.
     let mut weighted = root.clone();
-    for place in 0..inverses.len() {
+    for index in 0..inverses.len() {
         weighted
-            .rows_mut(LINK_PARAMETERS * place, LINK_PARAMETERS)
-            .copy_from(&scaled(root, place));
+            .rows_mut(LINK_PARAMETERS * index, LINK_PARAMETERS)
+            .copy_from(&scaled(root, index));
     }
     for (precision, row) in unknowns.precision.iter().zip(unknowns.inertial()..) {
         weighted.row_mut(row).scale_mut(precision.sqrt());
@@ -277,7 +278,7 @@ pub(crate) fn links(
             floored: floored.then(|| *identified.prior.reference(link)),
             ..unseen(robot, link, cad)
         };
-        let Ok(place) = unknowns.links.binary_search(&link) else {
+        let Ok(index) = unknowns.links.binary_search(&link) else {
             let metric = identified.prior.metric(link);
             let metric = metric.try_inverse().unwrap_or_default();
             return LinkOutcome {
@@ -287,15 +288,15 @@ pub(crate) fn links(
                 ..outcome
             };
         };
-        let change = identified.d.rows(LINK_PARAMETERS * place, LINK_PARAMETERS);
+        let change = identified.d.rows(LINK_PARAMETERS * index, LINK_PARAMETERS);
         LinkOutcome {
             identified: moved[link],
-            deviation: std::array::from_fn(|k| wide.row(LINK_PARAMETERS * place + k).norm()),
-            retained_fraction: identified.retained[place],
+            deviation: std::array::from_fn(|k| wide.row(LINK_PARAMETERS * index + k).norm()),
+            retained_fraction: identified.retained[index],
             significance: significance(
-                &scaled(root, place),
-                &scaled(&shrinking, place),
-                &(&inverses[place] * change),
+                &scaled(root, index),
+                &scaled(&shrinking, index),
+                &(&inverses[index] * change),
             ),
             seen: true,
             ..outcome
@@ -363,27 +364,27 @@ pub(crate) fn covariance(
     let mut joint = DMatrix::zeros(p + s, wide + s);
     joint.view_mut((0, 0), (p, wide)).copy_from(root);
     // Given the parameters, offsets in different segments are independent.
-    let source = |place: usize| {
+    let source = |index: usize| {
         let read = |reduced: &ReducedLog| {
-            (0..6).any(|axis| reduced.covariance[(6 * place + axis, 6 * place + axis)] < UNREAD)
+            (0..6).any(|axis| reduced.covariance[(6 * index + axis, 6 * index + axis)] < UNREAD)
         };
         let last = logs.len().saturating_sub(1);
         logs.iter().rposition(read).unwrap_or(last)
     };
     let sources: Vec<usize> = (0..unknowns.sensors.len()).map(source).collect();
     for (number, reduced) in logs.iter().enumerate() {
-        let own = (0..s).filter(|unknown| sources[unknown / 6] == number);
-        let own: Vec<usize> = own.collect();
-        if own.is_empty() {
+        let rows = (0..s).filter(|unknown| sources[unknown / 6] == number);
+        let rows: Vec<usize> = rows.collect();
+        if rows.is_empty() {
             continue;
         }
-        let moved = reduced.slope.select_rows(&own) * root;
-        let covariance = reduced.covariance.select_rows(&own).select_columns(&own);
+        let moved = reduced.slope.select_rows(&rows) * root;
+        let covariance = reduced.covariance.select_rows(&rows).select_columns(&rows);
         let factor = covariance.cholesky();
-        for (i, unknown) in own.iter().enumerate() {
+        for (i, unknown) in rows.iter().enumerate() {
             let mut row = joint.view_mut((p + unknown, 0), (1, wide));
             row.copy_from(&-moved.row(i));
-            for (j, column) in own[..=i].iter().enumerate() {
+            for (j, column) in rows[..=i].iter().enumerate() {
                 let entry = factor.as_ref().map_or(0.0, |f| f.l_dirty()[(i, j)]);
                 joint[(p + unknown, wide + column)] = entry;
             }
@@ -430,15 +431,15 @@ pub(crate) fn expression(
     direction: &DVector<f64>,
 ) -> (String, Vec<usize>) {
     let mut parts: Vec<(usize, f64, f64)> = Vec::new();
-    for (place, spread) in spread.iter().enumerate() {
+    for (index, spread) in spread.iter().enumerate() {
         let Some(inverse) = spread.clone().try_inverse() else {
             continue;
         };
-        let own = direction.rows(LINK_PARAMETERS * place, LINK_PARAMETERS);
-        let factors = inverse.tr_mul(&own.into_owned());
+        let rows = direction.rows(LINK_PARAMETERS * index, LINK_PARAMETERS);
+        let factors = inverse.tr_mul(&rows.into_owned());
         for (k, factor) in factors.iter().enumerate() {
             let size = (factor * spread.row(k).norm()).abs();
-            parts.push((LINK_PARAMETERS * place + k, *factor, size));
+            parts.push((LINK_PARAMETERS * index + k, *factor, size));
         }
     }
     parts.sort_by(|a, b| b.2.total_cmp(&a.2).then(a.0.cmp(&b.0)));
@@ -547,7 +548,7 @@ pub(crate) fn base_parameters(
         for term in all() {
             if let ParameterColumn::Inertial { link, parameter } = subspace.columns()[term.column] {
                 match unknowns.links.binary_search(&link) {
-                    Ok(place) => row[LINK_PARAMETERS * place + parameter] += term.coefficient,
+                    Ok(index) => row[LINK_PARAMETERS * index + parameter] += term.coefficient,
                     Err(_) => seen = false,
                 }
             }
@@ -606,8 +607,8 @@ mod tests {
                     .scale_mut(10.0_f64.powi(column as i32 % 5 - 4));
             }
             for (sum, a, b) in [(3, 0, 7), (9, 1, 3), (12, 4, 9)] {
-                let own = 2.0 * matrix.column(a) - matrix.column(b);
-                matrix.set_column(sum, &own);
+                let combined = 2.0 * matrix.column(a) - matrix.column(b);
+                matrix.set_column(sum, &combined);
             }
             [5, 17]
                 .into_iter()
@@ -691,20 +692,20 @@ mod tests {
         };
         // Two links without common rows.
         let mut narrow = DMatrix::zeros(20, 20);
-        for place in [0, 10] {
-            let own = DMatrix::from_fn(10, 10, |_, _| 0.01 * next());
-            narrow.view_mut((place, place), (10, 10)).copy_from(&own);
+        for index in [0, 10] {
+            let block = DMatrix::from_fn(10, 10, |_, _| 0.01 * next());
+            narrow.view_mut((index, index), (10, 10)).copy_from(&block);
         }
         let spread: Vec<DMatrix<f64>> = (0..2)
             .map(|_| DMatrix::from_fn(10, 10, |_, _| next()))
             .collect();
         let mut cad = DMatrix::zeros(20, 20);
-        for (place, spread) in spread.iter().enumerate() {
-            cad.view_mut((10 * place, 10 * place), (10, 10))
+        for (index, spread) in spread.iter().enumerate() {
+            cad.view_mut((10 * index, 10 * index), (10, 10))
                 .copy_from(spread);
         }
-        let block = |m: &DMatrix<f64>, place: usize| {
-            m.view((10 * place, 10 * place), (10, 10)).into_owned()
+        let block = |m: &DMatrix<f64>, index: usize| {
+            m.view((10 * index, 10 * index), (10, 10)).into_owned()
         };
         let all = squared(&narrow);
         for (kept, back) in [(1.0, 0.0), (0.0, 1.0), (0.7, 0.3)] {
@@ -742,8 +743,8 @@ mod tests {
         let found = squared(&cad_root(&unknowns, &r, std::slice::from_ref(&spread)));
         let (links, rotors) = (r.columns(0, 10).into_owned(), r.columns(10, 2).into_owned());
         let mut precision = rotors.transpose() * &rotors;
-        for (place, own) in unknowns.precision.iter().copied().enumerate() {
-            precision[(place, place)] += own;
+        for (index, own) in unknowns.precision.iter().copied().enumerate() {
+            precision[(index, index)] += own;
         }
         let inverse = precision.try_inverse().expect("known");
         let slope = &inverse * rotors.transpose() * links;
@@ -764,8 +765,12 @@ mod tests {
             found.view((10, 0), (2, 10)).into_owned(),
             -(&slope * &bodies),
         );
-        let own = &slope * &bodies * slope.transpose() + inverse;
-        close("rotors", found.view((10, 10), (2, 2)).into_owned(), own);
+        let expected = &slope * &bodies * slope.transpose() + inverse;
+        close(
+            "rotors",
+            found.view((10, 10), (2, 2)).into_owned(),
+            expected,
+        );
     }
 
     #[test]

@@ -208,12 +208,12 @@ impl Centred {
                 }
                 count += 1.0;
             }
-            let of = 1.0 / count;
-            let time = time * of / DELAY.seconds();
+            let share = 1.0 / count;
+            let time = time * share / DELAY.seconds();
             is_same &= self.times[points] == time;
             self.times[points] = time;
             for (signal, sum) in self.signals.iter_mut().zip(sums) {
-                signal[points] = sum * of;
+                signal[points] = sum * share;
             }
             points += 1;
         }

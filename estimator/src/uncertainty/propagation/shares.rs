@@ -30,8 +30,8 @@ impl Propagation {
         let whole = self.torque.get(dof).copied().unwrap_or(0.0);
         let (readings, sum) = (&self.readings, &mut self.sum);
         for part in &self.subtrees {
-            for place in 1..part.links.len() {
-                let link = part.links[place].link;
+            for index in 1..part.links.len() {
+                let link = part.links[index].link;
                 if structure.dof_of(link) != Some(dof) {
                     continue;
                 }
@@ -58,7 +58,7 @@ impl Propagation {
 }
 
 impl SubtreeRoot {
-    /// The shares of a result that has this motion at the link with each place; `sum` is memory.
+    /// The shares of a result that has this motion at the link with each index; `sum` is memory.
     fn shares(
         &self,
         (solver, kinematics): (&Solver, &Kinematics),
@@ -66,17 +66,17 @@ impl SubtreeRoot {
         (readings, sum): (&[[f64; 6]], &mut [f32]),
         share: &mut dyn FnMut(Source, usize, f64),
     ) {
-        let of_link = |link: usize, place: usize| {
+        let of_link = |link: usize, index: usize| {
             let rows = link_rows(kinematics.pose(link), kinematics.motion(link));
-            let motion = numbers(&motion(place));
+            let motion = numbers(&motion(index));
             let coefficient = |i: usize| (0..6).map(|axis| rows[axis][i] * motion[axis]).sum();
             std::array::from_fn::<f64, LINK_PARAMETERS, _>(coefficient)
         };
         let each = || self.column_blocks.iter();
         let coefficients = |block: &ColumnBlock| match block.what {
-            Member::Link(link) => of_link(link, block.place),
+            Member::Link(link) => of_link(link, block.link_index),
             Member::Sensor(sensor, is_positive) => {
-                let motion = motion(block.place);
+                let motion = motion(block.link_index);
                 let motion = if is_positive { motion } else { -motion };
                 let [own @ .., _, _] = in_sensor(solver.sensor_pose(sensor), &motion);
                 std::array::from_fn(|i| own.get(i).copied().unwrap_or(0.0))
@@ -107,20 +107,20 @@ impl SubtreeRoot {
                     .map(|(column, factor)| factor * with_rows(column.as_flattened()))
                     .sum::<f64>()
             };
-            let own = product(&block.columns);
+            let variance = product(&block.columns);
             match (block.what, &block.calibration) {
-                (Member::Link(link), _) => share(Source::Link, link, own),
-                (Member::Sensor(sensor, _), None) => share(Source::Offset, sensor, own),
+                (Member::Link(link), _) => share(Source::Link, link, variance),
+                (Member::Sensor(sensor, _), None) => share(Source::Offset, sensor, variance),
                 (Member::Sensor(sensor, _), Some(calibration)) => {
                     let offset = product(&calibration.offset);
                     share(Source::Offset, sensor, offset);
-                    share(Source::Gain, sensor, own - offset);
+                    share(Source::Gain, sensor, variance - offset);
                 }
                 (Member::Calibration, _) => {}
             }
         }
-        for (link, place, root) in &self.independent {
-            let factors = of_link(*link, *place);
+        for (link, index, root) in &self.independent {
+            let factors = of_link(*link, *index);
             let row = |row: &[f64; LINK_PARAMETERS]| {
                 let sum: f64 = row.iter().zip(factors).map(|(u, factor)| u * factor).sum();
                 sum * sum
@@ -130,7 +130,7 @@ impl SubtreeRoot {
         for end in &self.ends {
             let (mut covariance, pose) = (Covariance6::default(), solver.sensor_pose(end.sensor));
             add_reading(&mut covariance, pose, &readings[end.sensor]);
-            let motion = numbers(&motion(end.place));
+            let motion = numbers(&motion(end.link_index));
             let variance = dot(&motion, &times(&covariance, &motion));
             share(Source::Drift, end.sensor, variance);
         }

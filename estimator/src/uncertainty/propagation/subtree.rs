@@ -22,7 +22,7 @@ pub(super) struct SubtreeRoot {
     pub(super) links: Vec<Link>,
     /// The columns of correlated links and sensors.
     pub(super) column_blocks: Vec<ColumnBlock>,
-    /// Links that are correlated with nothing else in this sub-tree: number, place in the sub-tree,
+    /// Links that are correlated with nothing else in this sub-tree: number, index in the sub-tree,
     /// and root (upper triangular).
     pub(super) independent: Vec<(usize, usize, Box<Root>)>,
     /// Per link, the covariance of the wrenches below it from the links in `independent`; then with
@@ -49,9 +49,9 @@ pub(super) struct Link {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct End {
     pub(super) sensor: usize,
-    /// The link that its wrench acts on, and the place of that in the sub-tree.
+    /// The link that its wrench acts on, and the index of that in the sub-tree.
     pub(super) link: usize,
-    pub(super) place: usize,
+    pub(super) link_index: usize,
     /// Whether its offset enters the balance with a positive sign.
     pub(super) is_positive: bool,
 }
@@ -59,13 +59,13 @@ pub(super) struct End {
 impl SubtreeRoot {
     pub(super) fn new(structure: &Structure, number: usize, covariance: &Covariance) -> Self {
         let numbers: Vec<usize> = structure.links_of(number).collect();
-        let place_of = |link: usize| {
-            let place = numbers.iter().position(|&other| other == link);
-            place.unwrap_or(0)
+        let index_of = |link: usize| {
+            let index = numbers.iter().position(|&other| other == link);
+            index.unwrap_or(0)
         };
         let sensors = structure.subtrees()[number].sensors.iter();
         let ends: Vec<End> = sensors
-            .map(|sensor| End::new(structure, number, sensor, place_of))
+            .map(|sensor| End::new(structure, number, sensor, index_of))
             .collect();
         let (mut column_blocks, mut independent, mut rows) = (Vec::new(), Vec::new(), 0);
         for block in &covariance.blocks {
@@ -91,14 +91,14 @@ impl SubtreeRoot {
                         0.0
                     }
                 };
-                let own = std::array::from_fn(|i| std::array::from_fn(|j| at(i, j)));
-                independent.push((*number, place_of(*link), Box::new(own)));
+                let matrix = std::array::from_fn(|i| std::array::from_fn(|j| at(i, j)));
+                independent.push((*number, index_of(*link), Box::new(matrix)));
                 continue;
             }
-            column_blocks.extend(blocks_of(block, members, &root, rows, place_of));
+            column_blocks.extend(blocks_of(block, members, &root, rows, index_of));
             rows += root.nrows().div_ceil(LANES);
         }
-        let links = links(structure, &numbers, &column_blocks, place_of);
+        let links = links(structure, &numbers, &column_blocks, index_of);
         let below = match independent.is_empty() && ends.is_empty() {
             true => Vec::new(),
             false => vec![Covariance6::default(); links.len()],
@@ -126,13 +126,13 @@ impl SubtreeRoot {
             }
             let mut covariance = Covariance6::default();
             add_reading(&mut covariance, solver.sensor_pose(end.sensor), &variances);
-            let mut place = end.place;
+            let mut index = end.link_index;
             loop {
-                add_covariance(&mut self.below[place], &covariance);
-                if place == 0 {
+                add_covariance(&mut self.below[index], &covariance);
+                if index == 0 {
                     break;
                 }
-                place = self.links[place].parent;
+                index = self.links[index].parent;
             }
         }
     }
@@ -151,7 +151,7 @@ impl SubtreeRoot {
             }
         }
         for column_block in &self.column_blocks {
-            let out = &mut self.wrenches[6 * rows * column_block.place..][..6 * rows];
+            let out = &mut self.wrenches[6 * rows * column_block.link_index..][..6 * rows];
             match column_block.what {
                 Member::Link(link) => {
                     let coefficients = link_rows(kinematics.pose(link), kinematics.motion(link));
@@ -172,24 +172,24 @@ impl SubtreeRoot {
             }
         }
         self.below_alone.fill(Covariance6::default());
-        for (link, place, root) in &self.independent {
+        for (link, index, root) in &self.independent {
             let coefficients = link_rows(kinematics.pose(*link), kinematics.motion(*link));
-            add_independent(&mut self.below_alone[*place], root, &coefficients);
+            add_independent(&mut self.below_alone[*index], root, &coefficients);
         }
-        for place in (1..self.below_alone.len()).rev() {
-            let below = self.below_alone[place];
-            add_covariance(&mut self.below_alone[self.links[place].parent], &below);
+        for index in (1..self.below_alone.len()).rev() {
+            let below = self.below_alone[index];
+            add_covariance(&mut self.below_alone[self.links[index].parent], &below);
         }
-        for place in (1..self.links.len()).rev() {
+        for index in (1..self.links.len()).rev() {
             let Link {
                 parent,
                 rows: range,
                 ..
-            } = self.links[place].clone();
+            } = self.links[index].clone();
             if range.is_empty() {
                 continue;
             }
-            let (before, after) = self.wrenches.split_at_mut(6 * rows * place);
+            let (before, after) = self.wrenches.split_at_mut(6 * rows * index);
             for axis in 0..6 {
                 let below = &after[axis * rows..][range.clone()];
                 let above = &mut before[6 * rows * parent + axis * rows..][range.clone()];
@@ -201,41 +201,41 @@ impl SubtreeRoot {
         }
     }
 
-    /// `|W_l s - W_b h|^2`, `l` being the link at `place`.
+    /// `|W_l s - W_b h|^2`, `l` being the link at `index`.
     #[inline(always)]
     pub(super) fn variance<S: Simd>(
         &self,
         simd: S,
-        place: usize,
+        index: usize,
         axis: &Motion,
         response: &Motion,
     ) -> f64 {
-        self.correlated(simd, place, axis, response) + self.independent(place, axis, response)
+        self.correlated(simd, index, axis, response) + self.independent(index, axis, response)
     }
 
     /// The part of [`Self::variance`] from independent links, and from readings.
     #[inline(always)]
-    fn independent(&self, place: usize, axis: &Motion, response: &Motion) -> f64 {
-        let (Some(below), Some(all)) = (self.below.get(place), self.below.first()) else {
+    fn independent(&self, index: usize, axis: &Motion, response: &Motion) -> f64 {
+        let (Some(below), Some(all)) = (self.below.get(index), self.below.first()) else {
             return 0.0;
         };
         let (s, h) = (numbers(axis), numbers(response));
-        let own = times(below, &s);
+        let product = times(below, &s);
         if *response == Motion::zero() {
-            return dot(&s, &own);
+            return dot(&s, &product);
         }
         // If one side has no links, rounding errors of either sign remain.
-        (dot(&s, &own) - 2.0 * dot(&h, &own) + dot(&h, &times(all, &h))).max(0.0)
+        (dot(&s, &product) - 2.0 * dot(&h, &product) + dot(&h, &times(all, &h))).max(0.0)
     }
 
     /// The part of [`Self::variance`] from correlated links and sensors.
     #[inline(always)]
-    fn correlated<S: Simd>(&self, simd: S, place: usize, axis: &Motion, response: &Motion) -> f64 {
-        let own = self.links[place].rows.clone();
+    fn correlated<S: Simd>(&self, simd: S, index: usize, axis: &Motion, response: &Motion) -> f64 {
+        let own = self.links[index].rows.clone();
         let mut sum = simd.splat_f32s(0.0);
         if *response == Motion::zero() {
             let s = splat(simd, axis);
-            let below = self.axes::<S>(place, &own);
+            let below = self.axes::<S>(index, &own);
             for i in 0..below[0].len() {
                 let y = project(simd, &below, i, &s);
                 sum = simd.mul_add_e_f32s(y, y, sum);
@@ -249,7 +249,7 @@ impl SubtreeRoot {
                 (own.clone(), true),
                 (own.end..rows.end, false),
             ] {
-                let (all, below) = (self.axes::<S>(0, &part), self.axes::<S>(place, &part));
+                let (all, below) = (self.axes::<S>(0, &part), self.axes::<S>(index, &part));
                 for i in 0..all[0].len() {
                     let mut y = project(simd, &all, i, &minus_h);
                     if is_own {
@@ -295,8 +295,8 @@ impl SubtreeRoot {
 
     /// Some rows of the six columns of a link's `W`.
     #[inline(always)]
-    fn axes<S: Simd>(&self, place: usize, rows: &Range<usize>) -> [&[S::f32s]; 6] {
-        let all = &self.wrenches[6 * self.rows * place..][..6 * self.rows];
+    fn axes<S: Simd>(&self, index: usize, rows: &Range<usize>) -> [&[S::f32s]; 6] {
+        let all = &self.wrenches[6 * self.rows * index..][..6 * self.rows];
         let mut axes: [&[S::f32s]; 6] = [&[]; 6];
         if !rows.is_empty() {
             for (axis, column) in axes.iter_mut().zip(all.chunks_exact(self.rows)) {
@@ -312,7 +312,7 @@ impl End {
         structure: &Structure,
         subtree: usize,
         sensor: usize,
-        place_of: impl Fn(usize) -> usize,
+        index_of: impl Fn(usize) -> usize,
     ) -> Self {
         let cut = &structure.sensors()[sensor];
         let child = cut.joint() + 1;
@@ -324,7 +324,7 @@ impl End {
         Self {
             sensor,
             link,
-            place: place_of(link),
+            link_index: index_of(link),
             is_positive: is_above == (cut.sign() > 0.0),
         }
     }
@@ -385,7 +385,7 @@ fn blocks_of(
     members: Vec<BlockMember>,
     root: &DMatrix<f64>,
     rows: usize,
-    place_of: impl Fn(usize) -> usize,
+    index_of: impl Fn(usize) -> usize,
 ) -> Vec<ColumnBlock> {
     let (mut blocks, mut first) = (Vec::new(), 0);
     let mut calibration: Vec<Vec<Lanes>> = Vec::new();
@@ -422,7 +422,7 @@ fn blocks_of(
             kinds.find(|(sensor, _)| matches!(what, Member::Sensor(own, _) if own == *sensor));
         blocks.push(ColumnBlock {
             what,
-            place: place_of(link),
+            link_index: index_of(link),
             rows: rows..rows + count,
             calibration: kind.map(|(_, kind)| {
                 Box::new(Calibrated {
@@ -441,26 +441,26 @@ fn links(
     structure: &Structure,
     numbers: &[usize],
     column_blocks: &[ColumnBlock],
-    place_of: impl Fn(usize) -> usize,
+    index_of: impl Fn(usize) -> usize,
 ) -> Vec<Link> {
     let mut links: Vec<Link> = numbers
         .iter()
         .enumerate()
-        .map(|(place, &link)| Link {
+        .map(|(index, &link)| Link {
             link,
-            parent: match place {
+            parent: match index {
                 0 => 0,
-                _ => place_of(structure.parent_of(link)),
+                _ => index_of(structure.parent_of(link)),
             },
             rows: 0..0,
         })
         .collect();
     for column_block in column_blocks {
-        let link = &mut links[column_block.place];
+        let link = &mut links[column_block.link_index];
         link.rows = hull(&link.rows, &column_block.rows);
     }
-    for place in (1..links.len()).rev() {
-        let (parent, below) = (links[place].parent, links[place].rows.clone());
+    for index in (1..links.len()).rev() {
+        let (parent, below) = (links[index].parent, links[index].rows.clone());
         links[parent].rows = hull(&links[parent].rows, &below);
     }
     links

@@ -237,8 +237,8 @@ pub(crate) fn add_offset<S: Simd>(
 #[derive(Clone, Debug)]
 pub(crate) struct ColumnBlock {
     pub(crate) what: Member,
-    /// Place in the sub-tree of the link that it acts on.
-    pub(crate) place: usize,
+    /// Index in the sub-tree of the link that it acts on.
+    pub(crate) link_index: usize,
     pub(crate) rows: Range<usize>,
     pub(crate) columns: Vec<Lanes>,
     /// For a sensor whose calibration is uncertain, too: its parts. `columns` is then their

@@ -265,14 +265,14 @@ mod tests {
             what: What::Channel(Kind::Joint),
             name: "elbow".into(),
         };
-        let told = |values: [f64; 4]| {
+        let read = |values: [f64; 4]| {
             let mut cells = Cells::EMPTY;
             cells.values[Kind::Actuator as usize][..4].copy_from_slice(&values);
             let mut readings = Vec::new();
             let result = items_of(&series, &cells, |value| readings.push(value));
             (result.is_ok(), readings)
         };
-        let (good, readings) = told([f64::NAN, 3.0, 0.0, 7.0]);
+        let (good, readings) = read([f64::NAN, 3.0, 0.0, 7.0]);
         let [
             Value::Reading(
                 Reading::Actuator(Actuator {
@@ -285,7 +285,7 @@ mod tests {
             panic!("{readings:?}")
         };
         assert!(good && duty.is_nan() && (*mode, *faults) == (3, 7));
-        assert!(!told([0.5, 3.0, f64::NAN, 7.0]).0);
+        assert!(!read([0.5, 3.0, f64::NAN, 7.0]).0);
     }
 
     #[test]
@@ -398,13 +398,13 @@ mod tests {
     #[test]
     fn a_place_is_whole_and_belongs_to_a_declaration() {
         let nan = f64::NAN;
-        let of = |cells: [f64; 8]| contact_of(&cells);
-        assert_eq!(of([nan; 8]), Ok(None));
-        let state = of([1.0, nan, nan, nan, nan, nan, nan, nan])
+        let contact = |cells: [f64; 8]| contact_of(&cells);
+        assert_eq!(contact([nan; 8]), Ok(None));
+        let state = contact([1.0, nan, nan, nan, nan, nan, nan, nan])
             .unwrap()
             .unwrap();
         assert!(state.active && state.position[0].is_nan() && state.direction[2].is_nan());
-        let state = of([0.0, 1.0, 2.0, 3.0, nan, 4.0, 5.0, 6.0])
+        let state = contact([0.0, 1.0, 2.0, 3.0, nan, 4.0, 5.0, 6.0])
             .unwrap()
             .unwrap();
         assert_eq!(
@@ -420,7 +420,7 @@ mod tests {
                 "but not whether it is present",
             ),
         ] {
-            assert!(of(cells).unwrap_err().contains(told), "{told}");
+            assert!(contact(cells).unwrap_err().contains(told), "{told}");
         }
     }
 

@@ -76,7 +76,7 @@ impl DomainConfig {
         Self { base, name }
     }
 
-    fn place(&self) -> Result<DomainPaths, DomainError> {
+    fn paths(&self) -> Result<DomainPaths, DomainError> {
         let legal = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
         if self.name.is_empty() || self.name.len() > 32 || !self.name.chars().all(legal) {
             return Err(DomainError::Name {
@@ -165,7 +165,7 @@ impl<S: Service> Clone for Domain<S> {
 #[derive(Debug)]
 struct Inner<S: Service> {
     config: DomainConfig,
-    place: DomainPaths,
+    paths: DomainPaths,
     iceoryx: Config,
     epoch: u64,
     id: u128,
@@ -212,9 +212,9 @@ impl Domain {
     /// # Errors
     /// As [`Domain::open`].
     pub fn remove_if_unused(config: &DomainConfig) -> Result<bool, DomainError> {
-        let place = config.place()?;
-        let lock = Lock::take(&place.lock)?;
-        let swept = sweep::sweep(&place, &iceoryx(&place)?)?;
+        let paths = config.paths()?;
+        let lock = Lock::take(&paths.lock)?;
+        let swept = sweep::sweep(&paths, &iceoryx(&paths)?)?;
         if swept.alive == 0 {
             lock.remove();
         }
@@ -237,18 +237,18 @@ impl<S: Service> Domain<S> {
         static QUIET: Once = Once::new();
         QUIET.call_once(|| set_log_level_from_env_or(LogLevel::Fatal));
 
-        let place = config.place()?;
-        let iceoryx = iceoryx(&place)?;
-        let _lock = Lock::take_within(&place.lock, steps)?;
-        sweep::sweep(&place, &iceoryx)?;
+        let paths = config.paths()?;
+        let iceoryx = iceoryx(&paths)?;
+        let _lock = Lock::take_within(&paths.lock, steps)?;
+        sweep::sweep(&paths, &iceoryx)?;
         let failed = |problem: String| DomainError::Transport {
-            root: place.root.clone(),
+            root: paths.root.clone(),
             doing: "cannot create a node",
             problem,
         };
         memory::require(memory::BESIDE)?;
         let guard = Guard::new();
-        let before = memory::files(&place)?;
+        let before = memory::files(&paths)?;
         let create = || {
             NodeBuilder::new()
                 .config(&iceoryx)
@@ -257,23 +257,23 @@ impl<S: Service> Domain<S> {
         };
         // What all nodes share is one counter, which need not go on: if the file cannot be used,
         // there will be a new one.
-        let created = create().or_else(|error| match remove_counter(&place) {
+        let created = create().or_else(|error| match remove_counter(&paths) {
             true => create(),
             false => Err(error),
         });
         let node = created.map_err(|e| failed(transport(e)))?;
-        protect_counter(&place);
-        let made = memory::commit(&place, &before)?;
+        protect_counter(&paths);
+        let made = memory::commit(&paths, &before)?;
         let id = node.id().value();
-        sweep::register(&place, id);
-        let folder = File::open(&place.root).map_err(|cause| DomainError::Io {
+        sweep::register(&paths, id);
+        let folder = File::open(&paths.root).map_err(|cause| DomainError::Io {
             doing: "cannot open directory",
-            path: place.root.clone(),
+            path: paths.root.clone(),
             cause,
         })?;
         let inner = Inner {
             config: config.clone(),
-            place,
+            paths,
             iceoryx,
             epoch: fnv1a(&[&id.to_le_bytes()]).max(1),
             id,
@@ -307,8 +307,8 @@ impl<S: Service> Domain<S> {
     /// # Errors
     /// As [`Domain::open`].
     pub fn sweep(&self) -> Result<SweepCounts, DomainError> {
-        let _lock = Lock::take(&self.inner.place.lock)?;
-        sweep::sweep(&self.inner.place, &self.inner.iceoryx)
+        let _lock = Lock::take(&self.inner.paths.lock)?;
+        sweep::sweep(&self.inner.paths, &self.inner.iceoryx)
     }
 
     /// Runs `create` under the domain's lock, after a sweep. It may make files of `needed` bytes in
@@ -318,17 +318,17 @@ impl<S: Service> Domain<S> {
         needed: u64,
         create: impl FnOnce(&Node<S>) -> Result<R, PortError>,
     ) -> Result<R, PortError> {
-        let place = &self.inner.place;
-        let _lock = Lock::take_within(&place.lock, self.inner.steps)?;
+        let paths = &self.inner.paths;
+        let _lock = Lock::take_within(&paths.lock, self.inner.steps)?;
         let damaged = || DomainError::Damaged {
-            root: place.root.clone(),
+            root: paths.root.clone(),
         };
         if !self.is_usable() {
             return Err(damaged().into());
         }
-        sweep::sweep(place, &self.inner.iceoryx)?;
+        sweep::sweep(paths, &self.inner.iceoryx)?;
         memory::require(needed)?;
-        let before = memory::files(place)?;
+        let before = memory::files(paths)?;
         let node = self.inner.node.lock();
         let created = match &*node.unwrap_or_else(PoisonError::into_inner) {
             Some(node) => {
@@ -337,23 +337,23 @@ impl<S: Service> Domain<S> {
             }
             None => return Err(self.gone().into()),
         };
-        self.inner.keep(memory::commit(place, &before)?);
+        self.inner.keep(memory::commit(paths, &before)?);
         Ok(created)
     }
 
     /// Runs `change` under the domain's lock, after a sweep; `None` if another process holds it, if
     /// the domain's directory has gone, or without memory. Never waits.
     pub(super) fn try_locked<R>(&self, change: impl FnOnce() -> R) -> Option<R> {
-        let place = &self.inner.place;
-        let _lock = Lock::try_take(&place.lock).ok()?;
+        let paths = &self.inner.paths;
+        let _lock = Lock::try_take(&paths.lock).ok()?;
         if !self.is_usable() {
             return None;
         }
-        sweep::sweep(place, &self.inner.iceoryx).ok()?;
+        sweep::sweep(paths, &self.inner.iceoryx).ok()?;
         memory::require(memory::BESIDE).ok()?;
-        let before = memory::files(place).ok()?;
+        let before = memory::files(paths).ok()?;
         let changed = change();
-        self.inner.keep(memory::commit(place, &before).ok()?);
+        self.inner.keep(memory::commit(paths, &before).ok()?);
         Some(changed)
     }
 
@@ -363,7 +363,7 @@ impl<S: Service> Domain<S> {
             return std::mem::forget(port);
         }
         // If a stopped process holds the lock, drop without it: a program must be able to end.
-        let _lock = Lock::take(&self.inner.place.lock);
+        let _lock = Lock::take(&self.inner.paths.lock);
         self.inner.drop_unless_replaced(port);
         self.inner.made().retain(MadeFile::exists);
     }
@@ -393,18 +393,18 @@ impl<S: Service> Domain<S> {
             "files of the shared-memory domain {:?} ({}, /dev/shm/{}*) were deleted, replaced or \
              shortened by another program; they are made again",
             self.inner.config.name,
-            self.inner.place.root.display(),
-            self.inner.place.prefix
+            self.inner.paths.root.display(),
+            self.inner.paths.prefix
         )
     }
 
     /// Gives up a domain that is not intact: removes its directory, by which all its processes see
     /// that they must open a new one.
     pub(super) fn abandon(&self) {
-        let place = &self.inner.place;
-        let _lock = Lock::take_within(&place.lock, FEW_STEPS);
+        let paths = &self.inner.paths;
+        let _lock = Lock::take_within(&paths.lock, FEW_STEPS);
         if self.is_there() {
-            let _ = fs::remove_dir_all(&place.root);
+            let _ = fs::remove_dir_all(&paths.root);
         }
         // Whoever opens one of these waits for its content, with the lock.
         self.inner
@@ -423,12 +423,12 @@ impl<S: Service> Domain<S> {
 
     /// The bell of `service`.
     pub(super) fn bell(&self, service: &ServiceName) -> Result<Bell, PortError> {
-        Bell::open(&self.inner.place.root, service.as_str())
+        Bell::open(&self.inner.paths.root, service.as_str())
     }
 
     /// Whether `service` has a bell: a writer has created it.
     pub(super) fn has_bell(&self, service: &ServiceName) -> bool {
-        Bell::exists(&self.inner.place.root, service.as_str())
+        Bell::exists(&self.inner.paths.root, service.as_str())
     }
 
     /// Whether the domain's directory is still the one that was opened.
@@ -438,7 +438,7 @@ impl<S: Service> Domain<S> {
 
     #[cfg(test)]
     pub(super) fn prefix(&self) -> &str {
-        &self.inner.place.prefix
+        &self.inner.paths.prefix
     }
 
     pub(super) fn iceoryx(&self) -> &Config {
@@ -447,12 +447,12 @@ impl<S: Service> Domain<S> {
 
     /// The process that runs a node, 0 if it is not known; `None` if the node is dead.
     pub(super) fn process_of(&self, node: u128) -> Option<i32> {
-        sweep::holder_of(&self.inner.place, node)
+        sweep::holder_of(&self.inner.paths, node)
     }
 
     fn gone(&self) -> DomainError {
         DomainError::Transport {
-            root: self.inner.place.root.clone(),
+            root: self.inner.paths.root.clone(),
             doing: "cannot create a port",
             problem: "the domain is being closed".to_owned(),
         }
@@ -460,23 +460,23 @@ impl<S: Service> Domain<S> {
 }
 
 /// The segment that counts a domain's nodes. iceoryx2 makes it writable for everybody.
-fn counters(place: &DomainPaths) -> impl Iterator<Item = PathBuf> {
-    let segments = place.segments().into_iter().flatten();
+fn counters(paths: &DomainPaths) -> impl Iterator<Item = PathBuf> {
+    let segments = paths.segments().into_iter().flatten();
     let is_counter = |path: &PathBuf| path.extension().is_some_and(|end| end == "global_mgmt");
     segments.map(|(path, _)| path).filter(is_counter)
 }
 
 /// Removes the counter; returns whether there was one.
-fn remove_counter(place: &DomainPaths) -> bool {
-    counters(place)
+fn remove_counter(paths: &DomainPaths) -> bool {
+    counters(paths)
         .filter(|path| fs::remove_file(path).is_ok())
         .count()
         > 0
 }
 
 /// Leaves the counter to its owner.
-fn protect_counter(place: &DomainPaths) {
-    for path in counters(place) {
+fn protect_counter(paths: &DomainPaths) {
+    for path in counters(paths) {
         let _ = fs::set_permissions(path, Permissions::from_mode(0o600));
     }
 }
@@ -492,7 +492,7 @@ impl<S: Service> Inner<S> {
 
     /// The segments that another program has emptied.
     fn emptied(&self) -> impl Iterator<Item = PathBuf> {
-        let segments = self.place.segments().into_iter().flatten();
+        let segments = self.paths.segments().into_iter().flatten();
         let emptied = segments.filter(|(_, meta)| memory::is_emptied(meta));
         emptied.map(|(path, _)| path)
     }
@@ -500,8 +500,8 @@ impl<S: Service> Inner<S> {
     /// Notes what this process holds of a domain that is given up. If it has opened the domain
     /// twice, nobody knows what is whose: then that stays until the process ends.
     fn hold(&self) {
-        if sweep::is_only(&self.place, self.id) {
-            let held = OpenMappings::of(&self.place.prefix);
+        if sweep::is_only(&self.paths, self.id) {
+            let held = OpenMappings::of(&self.paths.prefix);
             *self.held.lock().unwrap_or_else(PoisonError::into_inner) = held;
         }
     }
@@ -512,7 +512,7 @@ impl<S: Service> Inner<S> {
 
     fn is_there(&self) -> bool {
         let inode = |meta: Metadata| (meta.dev(), meta.ino());
-        let now = fs::metadata(&self.place.root).map(inode);
+        let now = fs::metadata(&self.paths.root).map(inode);
         let opened = self.folder.metadata().map(inode);
         now.is_ok_and(|now| opened.is_ok_and(|opened| now == opened))
     }
@@ -531,7 +531,7 @@ impl<S: Service> Inner<S> {
 
 impl<S: Service> Drop for Inner<S> {
     fn drop(&mut self) {
-        let lock = Lock::take(&self.place.lock);
+        let lock = Lock::take(&self.paths.lock);
         let node = self
             .node
             .lock()
@@ -543,9 +543,9 @@ impl<S: Service> Drop for Inner<S> {
         self.drop_unless_replaced(node);
         let held = std::mem::take(self.held.get_mut().unwrap_or_else(PoisonError::into_inner));
         held.release();
-        sweep::deregister(&self.place, self.id);
+        sweep::deregister(&self.paths, self.id);
         if let Ok(lock) = lock
-            && sweep::sweep(&self.place, &self.iceoryx).is_ok_and(|s| s.alive == 0)
+            && sweep::sweep(&self.paths, &self.iceoryx).is_ok_and(|s| s.alive == 0)
         {
             lock.remove();
         }
@@ -568,16 +568,16 @@ pub(super) fn service_name(robot: &str, suffix: &str) -> Result<ServiceName, Por
 
 /// All settings are explicit, because iceoryx2's default reads `config/iceoryx2.toml` of the
 /// consumer's working directory.
-fn iceoryx(place: &DomainPaths) -> Result<Config, DomainError> {
+fn iceoryx(paths: &DomainPaths) -> Result<Config, DomainError> {
     let failed = |problem: String| DomainError::Transport {
-        root: place.root.clone(),
+        root: paths.root.clone(),
         doing: "cannot name the domain's files",
         problem,
     };
     let mut config = Config::default();
-    let root = place.root.as_os_str().as_encoded_bytes();
+    let root = paths.root.as_os_str().as_encoded_bytes();
     config.global.prefix =
-        FileName::new(place.prefix.as_bytes()).map_err(|e| failed(transport(e)))?;
+        FileName::new(paths.prefix.as_bytes()).map_err(|e| failed(transport(e)))?;
     config
         .global
         .set_root_path(&IoxPath::new(root).map_err(|e| failed(transport(e)))?);

@@ -110,15 +110,15 @@ impl MadeFile {
 
 /// The files of the domain at this moment. A connection's file is left out: the reader at its other
 /// end may remove it.
-pub(super) fn files(place: &DomainPaths) -> Result<BTreeSet<PathBuf>, DomainError> {
-    let mut files: BTreeSet<PathBuf> = place
+pub(super) fn files(paths: &DomainPaths) -> Result<BTreeSet<PathBuf>, DomainError> {
+    let mut files: BTreeSet<PathBuf> = paths
         .segments()?
         .into_iter()
         .map(|(path, _)| path)
         .filter(|path| path.extension().is_none_or(|end| end != "connection"))
         .collect();
     for folder in ["services", "nodes", "bells"] {
-        files.extend(entries(&place.root.join(folder)));
+        files.extend(entries(&paths.root.join(folder)));
     }
     Ok(files)
 }
@@ -130,16 +130,16 @@ fn entries(folder: &Path) -> impl Iterator<Item = PathBuf> {
 
 /// Allocates all segments of the domain, and returns the files that are not among those `before`.
 pub(super) fn commit(
-    place: &DomainPaths,
+    paths: &DomainPaths,
     before: &BTreeSet<PathBuf>,
 ) -> Result<Vec<MadeFile>, DomainError> {
-    for (path, meta) in place.segments()? {
+    for (path, meta) in paths.segments()? {
         // 512 is the unit of st_blocks on every file system (stat(2)).
         if meta.blocks() * 512 < meta.len() {
             allocate(&path, meta.len() - meta.blocks() * 512)?;
         }
     }
-    let made = files(place)?.into_iter();
+    let made = files(paths)?.into_iter();
     Ok(made
         .filter(|path| !before.contains(path))
         .filter_map(MadeFile::of)

@@ -144,7 +144,7 @@ impl Domain {
             .into_iter()
             .map(|name| (name, Watch::default(), Watch::default()))
             .collect();
-        let mut look = || -> Vec<RobotPresence> {
+        let mut presences = || -> Vec<RobotPresence> {
             let robots = watches.iter_mut().map(|(name, gateway, estimator)| {
                 let now = monotonic();
                 RobotPresence {
@@ -155,9 +155,9 @@ impl Domain {
             });
             robots.collect()
         };
-        look();
+        presences();
         std::thread::sleep(Duration::from_millis(1200));
-        look()
+        presences()
     }
 }
 
@@ -209,22 +209,22 @@ mod tests {
         let domain = Domain::open(&DomainConfig::new(base.path(), "test")).unwrap();
         let start = || Writer::<GatewayHealth>::create(&domain, "icub", 1).unwrap();
         let mut watch = Watch::<GatewayHealth>::default();
-        let mut look = |now| watch.look(&domain, "icub", now);
+        let mut presence_at = |now| watch.look(&domain, "icub", now);
         let (t, tick) = (Nanos::from_millis(5000), Nanos(1));
 
         let mut first = start();
-        assert_eq!(look(t), Presence::Running);
+        assert_eq!(presence_at(t), Presence::Running);
         first.send(&GatewayHealth::new(t), t).unwrap();
-        assert_eq!(look(t + SILENCE), Presence::Running);
+        assert_eq!(presence_at(t + SILENCE), Presence::Running);
         drop(first);
-        assert_eq!(look(t + SILENCE), Presence::Ended);
+        assert_eq!(presence_at(t + SILENCE), Presence::Ended);
 
         let later = t + SILENCE + SILENCE;
         let _second = start();
-        assert_eq!(look(later), Presence::Running);
-        assert_eq!(look(later + SILENCE), Presence::Running);
+        assert_eq!(presence_at(later), Presence::Running);
+        assert_eq!(presence_at(later + SILENCE), Presence::Running);
         assert!(matches!(
-            look(later + SILENCE + tick),
+            presence_at(later + SILENCE + tick),
             Presence::Stuck { .. }
         ));
     }

@@ -698,7 +698,7 @@ impl Drop for Attaching {
 /// this thread went wrong.
 fn leave_signals_to_others() {
     let mut signals = SigSet::all();
-    let own = [
+    let synchronous = [
         Signal::SIGBUS,
         Signal::SIGSEGV,
         Signal::SIGILL,
@@ -706,7 +706,9 @@ fn leave_signals_to_others() {
         Signal::SIGTRAP,
         Signal::SIGABRT,
     ];
-    own.into_iter().for_each(|signal| signals.remove(signal));
+    synchronous
+        .into_iter()
+        .for_each(|signal| signals.remove(signal));
     let _ = signals.thread_block();
 }
 

@@ -60,51 +60,51 @@ pub(super) struct DomainPaths {
 /// processes see that this one is alive.
 static OWN: Mutex<Vec<(String, u128)>> = Mutex::new(Vec::new());
 
-pub(super) fn register(place: &DomainPaths, node: u128) {
+pub(super) fn register(paths: &DomainPaths, node: u128) {
     OWN.lock()
         .unwrap_or_else(PoisonError::into_inner)
-        .push((place.prefix.clone(), node));
+        .push((paths.prefix.clone(), node));
 }
 
-pub(super) fn deregister(place: &DomainPaths, node: u128) {
+pub(super) fn deregister(paths: &DomainPaths, node: u128) {
     OWN.lock()
         .unwrap_or_else(PoisonError::into_inner)
-        .retain(|(p, n)| (p, *n) != (&place.prefix, node));
+        .retain(|(p, n)| (p, *n) != (&paths.prefix, node));
 }
 
 /// Whether `node` is the only one of this process in the domain.
-pub(super) fn is_only(place: &DomainPaths, node: u128) -> bool {
+pub(super) fn is_only(paths: &DomainPaths, node: u128) -> bool {
     OWN.lock()
         .unwrap_or_else(PoisonError::into_inner)
         .iter()
-        .all(|(p, n)| *p != place.prefix || *n == node)
+        .all(|(p, n)| *p != paths.prefix || *n == node)
 }
 
-fn is_own(place: &DomainPaths, node: u128) -> bool {
+fn is_own(paths: &DomainPaths, node: u128) -> bool {
     OWN.lock()
         .unwrap_or_else(PoisonError::into_inner)
         .iter()
-        .any(|(p, n)| (p, *n) == (&place.prefix, node))
+        .any(|(p, n)| (p, *n) == (&paths.prefix, node))
 }
 
 /// Removes the files of dead processes; if no node is alive, all files and the directory itself.
-pub(super) fn sweep(place: &DomainPaths, config: &Config) -> Result<SweepCounts, DomainError> {
+pub(super) fn sweep(paths: &DomainPaths, config: &Config) -> Result<SweepCounts, DomainError> {
     let mut swept = SweepCounts::default();
-    let nodes = place.nodes()?;
+    let nodes = paths.nodes()?;
     let (alive, dead): (Vec<u128>, Vec<u128>) = nodes
         .into_iter()
-        .partition(|&n| is_own(place, n) || monitor_holder(&place.monitor(n)).is_some());
+        .partition(|&n| is_own(paths, n) || monitor_holder(&paths.monitor(n)).is_some());
     swept.alive = alive.len();
     if alive.is_empty() {
         swept.nodes = dead.len();
-        for (path, _) in place.segments()? {
+        for (path, _) in paths.segments()? {
             swept.segments += usize::from(remove(&path));
         }
-        swept.services = list(&place.root.join("services"))?.len();
-        return match fs::remove_dir_all(&place.root) {
+        swept.services = list(&paths.root.join("services"))?.len();
+        return match fs::remove_dir_all(&paths.root) {
             Err(cause) if cause.kind() != io::ErrorKind::NotFound => Err(DomainError::Io {
                 doing: "cannot remove",
-                path: place.root.clone(),
+                path: paths.root.clone(),
                 cause,
             }),
             _ => Ok(swept),
@@ -113,28 +113,28 @@ pub(super) fn sweep(place: &DomainPaths, config: &Config) -> Result<SweepCounts,
 
     // Unfinished files belong to dead processes: a segment is created with mode 0200 and no size, a
     // service file with mode 0600.
-    for (path, meta) in place.segments()? {
+    for (path, meta) in paths.segments()? {
         if meta.len() == 0 || meta.permissions().mode() & 0o400 == 0 {
             swept.segments += usize::from(remove(&path));
         }
     }
-    for (path, meta) in list(&place.root.join("services"))? {
+    for (path, meta) in list(&paths.root.join("services"))? {
         if meta.permissions().mode() & 0o200 != 0 {
             swept.services += usize::from(remove(&path));
         }
     }
 
     if !dead.is_empty() {
-        Bell::change_all(&place.root);
-        clean_dead(place, config, &dead, &mut swept);
+        Bell::change_all(&paths.root);
+        clean_dead(paths, config, &dead, &mut swept);
     }
-    remove_ownerless(place, config, &mut swept)?;
+    remove_ownerless(paths, config, &mut swept)?;
     Ok(swept)
 }
 
-fn clean_dead(place: &DomainPaths, config: &Config, dead: &[u128], swept: &mut SweepCounts) {
+fn clean_dead(paths: &DomainPaths, config: &Config, dead: &[u128], swept: &mut SweepCounts) {
     for &node in dead {
-        keep_tags(place, node);
+        keep_tags(paths, node);
     }
     let mut failed = BTreeSet::new();
     let _ = Node::<ipc::Service>::list(config, |state| {
@@ -160,9 +160,9 @@ fn clean_dead(place: &DomainPaths, config: &Config, dead: &[u128], swept: &mut S
             continue;
         }
         swept.nodes += 1;
-        let _ = fs::remove_dir_all(place.node(node));
+        let _ = fs::remove_dir_all(paths.node(node));
         for suffix in ["", "_owner_lock", "_context"] {
-            let mut name = place.monitor(node).into_os_string();
+            let mut name = paths.monitor(node).into_os_string();
             name.push(suffix);
             remove(Path::new(&name));
         }
@@ -175,13 +175,13 @@ fn clean_dead(place: &DomainPaths, config: &Config, dead: &[u128], swept: &mut S
 /// iceoryx2 frees a port's place in its service only if it finds the port's tag, but removes the
 /// tag first. If the process dies between the two, the place stays taken for ever, and a topic of
 /// one writer can have no writer again.
-fn keep_tags(place: &DomainPaths, node: u128) {
-    let (home, kept) = (place.node(node), place.kept(node));
+fn keep_tags(paths: &DomainPaths, node: u128) {
+    let (home, kept) = (paths.node(node), paths.kept(node));
     // Errors are ignored: the node is cleaned in any case.
     let _ = fs::create_dir_all(&kept);
     for (from, to) in [(&home, &kept), (&kept, &home)] {
         for (tag, _) in list(from).unwrap_or_default() {
-            if let (Some((_, "port_tag")), Some(name)) = (place.strip(&tag), tag.file_name()) {
+            if let (Some((_, "port_tag")), Some(name)) = (paths.strip(&tag), tag.file_name()) {
                 // Fails for tags that exist already, as most do.
                 let _ = fs::hard_link(&tag, to.join(name));
             }
@@ -190,12 +190,12 @@ fn keep_tags(place: &DomainPaths, node: u128) {
 }
 
 fn remove_ownerless(
-    place: &DomainPaths,
+    paths: &DomainPaths,
     config: &Config,
     swept: &mut SweepCounts,
 ) -> Result<(), DomainError> {
-    let nodes = place.nodes()?;
-    for (kept, _) in list(&place.root.join(KEPT))? {
+    let nodes = paths.nodes()?;
+    for (kept, _) in list(&paths.root.join(KEPT))? {
         let node = kept.file_name().and_then(|n| number(&n.to_string_lossy()));
         if node.is_none_or(|n| !nodes.contains(&n)) {
             let _ = fs::remove_dir_all(kept);
@@ -204,8 +204,8 @@ fn remove_ownerless(
     // A service is ownerless without a tag of a live node, a segment without a tag of a live port.
     let (mut services, mut ports) = (BTreeSet::new(), BTreeSet::new());
     for node in nodes {
-        for (path, _) in list(&place.node(node))? {
-            match place.strip(&path) {
+        for (path, _) in list(&paths.node(node))? {
+            match paths.strip(&path) {
                 Some((name, "service_tag")) => drop(services.insert(name.to_owned())),
                 Some((name, "port_tag")) => drop(name.parse::<u128>().map(|p| ports.insert(p))),
                 _ => {}
@@ -213,8 +213,8 @@ fn remove_ownerless(
         }
     }
     let mut files = 0;
-    for (path, _) in list(&place.root.join("services"))? {
-        if let Some((name, "service")) = place.strip(&path) {
+    for (path, _) in list(&paths.root.join("services"))? {
+        if let Some((name, "service")) = paths.strip(&path) {
             if services.contains(name) {
                 files += 1;
             } else {
@@ -222,10 +222,10 @@ fn remove_ownerless(
             }
         }
     }
-    let segments = place.segments()?;
+    let segments = paths.segments()?;
     let dynamic = segments
         .iter()
-        .filter(|(p, _)| matches!(place.strip_segment(p), Some((_, "dynamic"))))
+        .filter(|(p, _)| matches!(paths.strip_segment(p), Some((_, "dynamic"))))
         .count();
     let mut known = BTreeSet::new();
     if dynamic > files {
@@ -235,7 +235,7 @@ fn remove_ownerless(
         });
     }
     for (path, _) in segments {
-        let ownerless = match place.strip_segment(&path) {
+        let ownerless = match paths.strip_segment(&path) {
             Some((name, "data")) => number(name).is_some_and(|p| !ports.contains(&p)),
             Some((name, "connection")) => {
                 match name.split_once('_').map(|(s, r)| (number(s), number(r))) {
@@ -295,11 +295,11 @@ fn monitor_holder(path: &Path) -> Option<i32> {
 }
 
 /// The process id of a node, 0 if it is not known; `None` if the node is dead.
-pub(super) fn holder_of(place: &DomainPaths, node: u128) -> Option<i32> {
-    if is_own(place, node) {
+pub(super) fn holder_of(paths: &DomainPaths, node: u128) -> Option<i32> {
+    if is_own(paths, node) {
         return Some(i32::try_from(std::process::id()).unwrap_or(0));
     }
-    monitor_holder(&place.monitor(node))
+    monitor_holder(&paths.monitor(node))
 }
 
 /// Removes a file; returns whether this call removed it.

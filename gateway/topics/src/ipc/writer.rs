@@ -356,11 +356,12 @@ mod tests {
         let domain = Domain::open(&DomainConfig::new(base.path(), "test")).unwrap();
         let length = || -> u64 {
             let entries = fs::read_dir("/dev/shm").unwrap().flatten();
-            let own = entries.filter(|entry| {
+            let segments = entries.filter(|entry| {
                 let name = entry.file_name();
                 name.to_string_lossy().starts_with(domain.prefix())
             });
-            own.map(|entry| entry.metadata().map_or(0, |meta| meta.len()))
+            segments
+                .map(|entry| entry.metadata().map_or(0, |meta| meta.len()))
                 .sum()
         };
         let before = length();

@@ -8,8 +8,8 @@ use crate::model::Location;
 use crate::spatial::Pose;
 use std::collections::HashSet;
 
-/// The place of an element of a link or joint.
-pub(super) fn place(element: ElementRef<'_>, owner: ElementRef<'_>) -> Location {
+/// The location of an element of a link or joint.
+pub(super) fn location(element: ElementRef<'_>, owner: ElementRef<'_>) -> Location {
     let name = owner.attribute("name").unwrap_or("(without a name)");
     Location {
         line: element.line(),
@@ -31,7 +31,7 @@ pub(super) fn part<'d>(
 ) -> Result<ElementRef<'d>, ModelError> {
     let name = missing.trim_matches(['<', '>']);
     parent.child(name).ok_or_else(|| ModelError::Missing {
-        place: place(parent, owner),
+        location: location(parent, owner),
         what: format!("its {}", tag(parent)),
         missing,
         there: Vec::new(),
@@ -46,18 +46,18 @@ pub(super) fn required<'d>(
     attribute: &'static str,
     remedy: &'static str,
 ) -> Result<&'d str, ModelError> {
-    let place = || place(element, owner);
+    let location = || location(element, owner);
     let what = || format!("its {}", tag(element));
     match element.attribute(attribute) {
         Some(value) => expanded(element, owner, attribute, value),
         None if element.attributes().any(|there| there == attribute) => Err(ModelError::Empty {
-            place: place(),
+            location: location(),
             what: what(),
             attribute,
             remedy,
         }),
         None => Err(ModelError::Missing {
-            place: place(),
+            location: location(),
             what: what(),
             missing: attribute,
             there: element.attributes().map(str::to_owned).collect(),
@@ -77,7 +77,7 @@ fn expanded<'d>(
         return Ok(value);
     }
     Err(ModelError::Unexpanded {
-        place: place(element, owner),
+        location: location(element, owner),
         what: format!("{} {attribute}=\"{value}\"", tag(element)),
     })
 }
@@ -88,7 +88,7 @@ pub(super) fn check_expanded(robot: ElementRef<'_>) -> Result<(), ModelError> {
     match inside.find(|node| node.name().starts_with("xacro:")) {
         None => Ok(()),
         Some(left) => Err(ModelError::Unexpanded {
-            place: place(left, robot),
+            location: location(left, robot),
             what: tag(left),
         }),
     }
@@ -112,13 +112,13 @@ pub(super) fn numbers<const N: usize>(
     match numbers {
         Some(numbers) if !numbers.iter().any(is_wrong) => Ok(Some(numbers)),
         Some(_) => Err(ModelError::NotFinite {
-            place: place(element, owner),
+            location: location(element, owner),
             element: tag(element),
             attribute: attribute.to_owned(),
             value: value.to_owned(),
         }),
         None => Err(ModelError::Number {
-            place: place(element, owner),
+            location: location(element, owner),
             element: tag(element),
             attribute: attribute.to_owned(),
             value: value.to_owned(),
@@ -142,7 +142,7 @@ pub(super) fn once(
     for child in element.children() {
         let name = child.name();
         if names.contains(&name) && !seen.insert(name) {
-            let Location { line, owner } = place(child, owner);
+            let Location { line, owner } = location(child, owner);
             warnings.push(format!(
                 "line {line}: {owner}: <{name}> occurs twice; the first one counts"
             ));

@@ -385,8 +385,8 @@ fn offset_maps(
             );
         }
         let theta = member.hidden.hiding * &sum;
-        let mut own = hiding.rows_mut(10 * member.block, 10);
-        own += &theta;
+        let mut rows = hiding.rows_mut(10 * member.block, 10);
+        rows += &theta;
         if let (Some((inner, pose)), Some(moved)) = (member.inner, &moved[number]) {
             let mut others = hiding.rows_mut(10 * members[inner].block, 10);
             others -= moved * theta;

@@ -302,12 +302,12 @@ impl Reach {
             let gained = omegas
                 .iter()
                 .map(|omega| acceleration(&(embed(omega) * joint.s), 0.0));
-            let own = [
+            let of_joint = [
                 acceleration(&joint.s, 0.0),
                 acceleration(&joint.square, 0.0),
             ];
             self.acceleration
-                .add(gained.chain(own).collect(), tolerance);
+                .add(gained.chain(of_joint).collect(), tolerance);
             self.omega.add(vec![s.angular.into()], tolerance);
             turned.extend(self.rows.basis().iter().map(|row| joint.turned_row(row)));
         }

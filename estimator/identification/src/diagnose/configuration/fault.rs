@@ -261,13 +261,13 @@ mod tests {
     #[test]
     fn torques_are_compared_with_torques() {
         let all = |wrist: f64, idle: f64| {
-            let own = [
+            let joints = [
                 compared(200.0, 1.0, 0.2, 1.0),
                 compared(0.2, wrist, 0.2, 0.01),
                 compared(0.2, 1.0, 0.2, 0.01),
                 compared(1e-3, idle, 0.2, 0.1),
             ];
-            torque_faults(&own.map(Some), &[true, false, false, false])
+            torque_faults(&joints.map(Some), &[true, false, false, false])
         };
         assert_eq!(all(1.0, 1.0), [None; 4]);
         assert_eq!(all(-1.0, 1.0), [None, Some(ReadingFault::Sign), None, None]);

@@ -130,10 +130,10 @@ impl Panel {
             let capacity = self.capacity;
             return Err(InformationError::Full { capacity });
         }
-        let wrong = |value: &f64| value.is_nan() || value.abs() > 1e120;
+        let is_bad = |value: &f64| value.is_nan() || value.abs() > 1e120;
         // One pass without an early exit; the column is searched only if there is an error.
-        if a.iter().fold(wrong(&y), |any, value| any | wrong(value)) {
-            let column = a.iter().position(wrong).unwrap_or(self.unknowns);
+        if a.iter().fold(is_bad(&y), |any, value| any | is_bad(value)) {
+            let column = a.iter().position(is_bad).unwrap_or(self.unknowns);
             let value = a.get(column).copied().unwrap_or(y);
             return Err(InformationError::Value { column, value });
         }

@@ -7,7 +7,8 @@ use crate::joints::{Joints, ShaftState};
 use crate::plan::{BusPlan, DevicePlan, OutputPlan};
 use crate::status::BusStatus;
 use proprio_drivers::{
-    Claim, CommandFailed, Decoded, Device, Frame, Mode, NotSent, Output, SpecError, State, Transmit,
+    Claim, CommandFailed, Decoded, Device, Frame, Mode, NotSent, SpecError, StampedReading, State,
+    Transmit,
 };
 use proprio_topics::sanity::Repeats;
 use proprio_topics::{
@@ -21,7 +22,7 @@ use std::sync::atomic::Ordering::Relaxed;
 const LEAST_RUN: u32 = 16;
 
 /// The devices of one bus, their outputs and counters.
-pub struct Decoder {
+pub struct BusDevices {
     devices: Vec<Running>,
     dispatch: Dispatch,
     channels: Channels,
@@ -104,7 +105,7 @@ impl Channels {
         &mut self,
         number: u16,
         running: &mut Running,
-        reading: &Output,
+        reading: &StampedReading,
         publish: &mut impl FnMut(&mut Sample),
     ) {
         let mut outputs = running.outputs.iter().zip(&mut running.repeats);
@@ -163,7 +164,7 @@ impl Channels {
 
     /// The flags of a reading that is no joint's state; `None`: it is a main reading whose stamp
     /// runs backward.
-    fn quality(&mut self, output: &OutputPlan, reading: &Output) -> Option<Quality> {
+    fn quality(&mut self, output: &OutputPlan, reading: &StampedReading) -> Option<Quality> {
         let mut quality = match &output.input {
             Some(input) => self.joints.flags(input, reading.quality),
             None => reading.quality,
@@ -196,7 +197,7 @@ impl Channels {
     }
 }
 
-impl Decoder {
+impl BusDevices {
     /// Builds the devices of bus number `bus`; `mode`, if given, overrides their mode (with logs,
     /// devices only listen).
     ///
@@ -276,8 +277,8 @@ impl Decoder {
     }
 
     /// Calls `send` for every frame that a device wants to send at `now`, with the device's number
-    /// in the plan. [`Decoder::on_sent`] must follow for each; until then that device sends nothing
-    /// else.
+    /// in the plan. [`BusDevices::on_sent`] must follow for each; until then that device sends
+    /// nothing else.
     pub fn poll_transmit(&mut self, now: Nanos, mut send: impl FnMut(u16, &Transmit)) {
         for (running, number) in self.devices.iter_mut().zip(0_u16..) {
             if running.device.next_wake().is_none_or(|wake| wake > now) {
@@ -334,7 +335,7 @@ impl Decoder {
     }
 
     /// Passes a request to device number `number` at `now`. Returns the reply, unless
-    /// [`Decoder::settle`] gives it later.
+    /// [`BusDevices::settle`] gives it later.
     #[must_use]
     pub fn request(&mut self, number: u16, request: Request, now: Nanos) -> Option<Reply> {
         let running = self.devices.get_mut(usize::from(number))?;
@@ -537,32 +538,32 @@ mod tests {
             request: OpenRequest::None,
             repeats: Vec::new(),
         };
-        let mut decoder = Decoder::of(0, vec![running], Joints::default(), Arc::clone(&status));
-        assert_eq!(decoder.claims(), [Claim::exclusive(answer)]);
+        let mut devices = BusDevices::of(0, vec![running], Joints::default(), Arc::clone(&status));
+        assert_eq!(devices.claims(), [Claim::exclusive(answer)]);
         let count = |counter: Counter| status.devices().next().unwrap().counters[counter as usize];
-        let sent = |decoder: &mut Decoder, now| {
+        let sent = |devices: &mut BusDevices, now| {
             let mut sent = Vec::new();
-            decoder.poll_transmit(now, |device, t| sent.push((device, t.frame)));
+            devices.poll_transmit(now, |device, t| sent.push((device, t.frame)));
             sent
         };
         let sync = Frame::new(Id::standard(0x80), &[]);
-        assert_eq!(sent(&mut decoder, Nanos::ZERO), [(0, sync)]);
-        assert_eq!(sent(&mut decoder, Nanos::ZERO), [], "it is under way");
-        assert_eq!(decoder.next_wake(), None);
-        decoder.on_sent(0, &sync, Err(NotSent::Refused));
+        assert_eq!(sent(&mut devices, Nanos::ZERO), [(0, sync)]);
+        assert_eq!(sent(&mut devices, Nanos::ZERO), [], "it is under way");
+        assert_eq!(devices.next_wake(), None);
+        devices.on_sent(0, &sync, Err(NotSent::Refused));
         assert_eq!(count(Counter::Unsent), 1);
-        assert_eq!(sent(&mut decoder, Nanos::ZERO), [(0, sync)]);
-        decoder.on_sent(0, &sync, Ok(Nanos(5)));
+        assert_eq!(sent(&mut devices, Nanos::ZERO), [(0, sync)]);
+        devices.on_sent(0, &sync, Ok(Nanos(5)));
         assert_eq!(count(Counter::Unsent), 1);
-        assert_eq!(decoder.next_wake(), Some(Nanos(5) + Nanos::from_millis(10)));
+        assert_eq!(devices.next_wake(), Some(Nanos(5) + Nanos::from_millis(10)));
         for _ in 0..2 {
             let heartbeat = Frame::new(answer, &[5]);
-            decoder.on_frame(&heartbeat, |sample| panic!("{sample:?}"));
+            devices.on_frame(&heartbeat, |sample| panic!("{sample:?}"));
         }
         assert_eq!((count(Counter::Frames), count(Counter::Readings)), (2, 0));
         assert_eq!(count(Counter::Unexpected), 1);
-        decoder.stop(Nanos::ZERO);
-        assert!(decoder.stopped());
+        devices.stop(Nanos::ZERO);
+        assert!(devices.stopped());
         // Its plan can be shown, and its health has a name.
         let mut plan = plan;
         plan.channels.clear();

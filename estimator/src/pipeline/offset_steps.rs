@@ -32,7 +32,7 @@ const SETTLED: Nanos = Nanos::from_millis(350);
 
 /// A step of one sensor, as far as it may explain the residual of a sub-tree.
 #[derive(Debug, Clone)]
-pub(super) struct Step {
+pub(super) struct OffsetStep {
     pub(super) sensor: usize,
     /// The change of its reading that makes the residual zero, per unit of the residual in its
     /// axes: 1 or -1.
@@ -56,7 +56,7 @@ enum State {
     Refuted,
 }
 
-impl Step {
+impl OffsetStep {
     /// Those of the sensors of a sub-tree.
     pub(super) fn of_subtree(structure: &Structure, number: usize) -> Vec<Self> {
         let sensors = structure.subtrees()[number].sensors.iter();
@@ -140,7 +140,7 @@ impl Step {
 
 /// How far the torques may be from those that steps of F/T offsets, or contacts that begin, make
 /// likely.
-pub(super) struct StepCover {
+pub(super) struct OffsetStepCover {
     solver: Solver,
     readings: Vec<Wrench>,
     torque: Vec<f64>,
@@ -148,7 +148,7 @@ pub(super) struct StepCover {
     contacts: ContactSet,
 }
 
-impl StepCover {
+impl OffsetStepCover {
     pub(super) fn new(structure: &Structure, dofs: usize) -> Self {
         Self {
             solver: Solver::new(structure),
@@ -183,7 +183,7 @@ impl StepCover {
         solver: &Solver,
         readings: &[Wrench],
         [known, lingering, suspected]: [&ContactSet; 3],
-        steps: impl Iterator<Item = (usize, &'a Step)>,
+        steps: impl Iterator<Item = (usize, &'a OffsetStep)>,
     ) {
         self.torque.fill(0.0);
         self.contacts = ContactSet::EMPTY;
@@ -191,16 +191,16 @@ impl StepCover {
             let Some(change) = step.change() else {
                 continue;
             };
-            let own = structure.subtrees()[number]
+            let lingering_here = structure.subtrees()[number]
                 .contacts
                 .intersection(lingering);
-            self.contacts = self.contacts.union(&own);
+            self.contacts = self.contacts.union(&lingering_here);
             self.readings.copy_from_slice(readings);
             let Some(reading) = self.readings.get_mut(step.sensor) else {
                 continue;
             };
             *reading += change;
-            let active = known.union(&lingering.difference(&own));
+            let active = known.union(&lingering.difference(&lingering_here));
             let solved =
                 self.solver
                     .solve(model, structure, kinematics, &self.readings, &active, &[]);

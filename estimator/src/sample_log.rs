@@ -18,7 +18,7 @@ use std::ops::Range;
 /// Why a log cannot be read at all.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum ReadingError {
+pub enum SampleLogError {
     /// The log cannot be read.
     #[error(transparent)]
     Log(#[from] csv::TableError),
@@ -43,7 +43,7 @@ pub struct MissingChannels {
     hint: String,
 }
 
-impl ReadingError {
+impl SampleLogError {
     /// Whether it is a log without content.
     fn is_empty(&self) -> bool {
         matches!(
@@ -59,14 +59,14 @@ impl ReadingError {
 /// possible. [`Dataset::findings`] lists both.
 ///
 /// # Errors
-/// [`ReadingError`]: it is no log, or lacks a joint that is not locked, or the IMU of the base. A
-/// missing F/T sensor is a finding here; `proprio identify` refuses the log before.
+/// [`SampleLogError`]: it is no log, or lacks a joint that is not locked, or the IMU of the base.
+/// A missing F/T sensor is a finding here; `proprio identify` refuses the log before.
 pub fn dataset(
     robot: &Robot,
     name: &str,
     role: LogRole,
     log: impl Read,
-) -> Result<Dataset, ReadingError> {
+) -> Result<Dataset, SampleLogError> {
     let recording = recording(robot, log)?;
     Ok(Dataset::new(robot, name, role, recording)?)
 }
@@ -75,13 +75,13 @@ pub fn dataset(
 /// unreadable instead of an error.
 ///
 /// # Errors
-/// [`ReadingError`]: it is no log of this robot.
+/// [`SampleLogError`]: it is no log of this robot.
 pub fn dataset_or_unreadable(
     robot: &Robot,
     name: &str,
     role: LogRole,
     log: impl Read,
-) -> Result<Dataset, ReadingError> {
+) -> Result<Dataset, SampleLogError> {
     match dataset(robot, name, role, log) {
         Err(problem) if problem.is_empty() => {
             Ok(Dataset::unreadable(name, role, problem.to_string()))
@@ -93,8 +93,8 @@ pub fn dataset_or_unreadable(
 /// Reads a sample log, channel by channel.
 ///
 /// # Errors
-/// [`ReadingError`]: it is no log, or lacks columns of a channel.
-pub fn recording(robot: &Robot, log: impl Read) -> Result<Recording, ReadingError> {
+/// [`SampleLogError`]: it is no log, or lacks columns of a channel.
+pub fn recording(robot: &Robot, log: impl Read) -> Result<Recording, SampleLogError> {
     read_in_segments(robot, log, BLOCK, SEGMENT)
 }
 
@@ -133,7 +133,7 @@ fn read_in_segments(
     mut log: impl Read,
     block: usize,
     segment: usize,
-) -> Result<Recording, ReadingError> {
+) -> Result<Recording, SampleLogError> {
     let mut text = Vec::new();
     let mut ended = fill(&mut text, &mut log, block)?;
     let Some((header, mut before)) = header(&text) else {
@@ -242,7 +242,7 @@ impl PartialRecording {
     fn new(
         robot: &Robot,
         table: &TableReader<impl Read>,
-    ) -> Result<(Self, Vec<Option<ColumnOwner>>), ReadingError> {
+    ) -> Result<(Self, Vec<Option<ColumnOwner>>), SampleLogError> {
         // A log may lack an F/T sensor, but no joint and no IMU.
         check_columns(robot, table.series(), |c| c.kind != Kind::Wrench)?;
         let targets = targets(robot, table.series());
@@ -377,7 +377,7 @@ mod tests {
     use std::path::Path;
 
     /// The recording of a log that is not cut.
-    fn read_whole(robot: &Robot, log: &str) -> Result<Recording, ReadingError> {
+    fn read_whole(robot: &Robot, log: &str) -> Result<Recording, SampleLogError> {
         let mut rows = TableReader::new(log.as_bytes())?;
         let (mut part, targets) = PartialRecording::new(robot, &rows)?;
         part.take(&mut rows, &targets)?;
@@ -477,16 +477,16 @@ mod tests {
             ("nothing", String::new()),
         ];
         for (what, log) in cases {
-            let told = |read: Result<Recording, ReadingError>| match read {
+            let outcome = |read: Result<Recording, SampleLogError>| match read {
                 Ok(recording) => format!("{recording:?}"),
                 Err(error) => error.to_string(),
             };
-            let expected = told(read_whole(&robot, &log));
+            let expected = outcome(read_whole(&robot, &log));
             for (block, segment) in [(700, 300), (5000, 1), (5000, 900), (BLOCK, SEGMENT)] {
-                let own = told(read_in_segments(&robot, log.as_bytes(), block, segment));
+                let found = outcome(read_in_segments(&robot, log.as_bytes(), block, segment));
                 assert!(
-                    own == expected,
-                    "{what}, {block}, {segment}: {own:.300} instead of {expected:.300}"
+                    found == expected,
+                    "{what}, {block}, {segment}: {found:.300} instead of {expected:.300}"
                 );
             }
         }
