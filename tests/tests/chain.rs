@@ -111,6 +111,8 @@ fn what_the_long_set_has_found_stays_mended() {
         (21, "robotous_rft", Fault::Delayed),
         (44, "moteus", Fault::Slow),
         (44, "canopen_encoder", Fault::None),
+        (14, "canopen_drive at SYNC", Fault::Old),
+        (18, "odrive", Fault::Flipped),
     ] {
         let shown = shown(seed, name, fault);
         assert!(!shown.is_broken(), "{name}, {fault:?}: {shown:#?}");

@@ -285,9 +285,7 @@ impl Online {
             part.is_moving = part.learnt.is_moving() || part.rejected_rows.is_moving();
             part.cosines.copy_from_slice(&component.cosines);
             part.whitened.copy_from_slice(&component.whitened);
-            part.whitened_from = component.whitened_from;
             component.whitened.copy_from_slice(&component.variances);
-            component.whitened_from = self.newest.0.div_euclid(self.period.0.max(1)) + 1;
             part.motion = component.motion;
             part.rows = component.rows;
         }
@@ -391,7 +389,6 @@ mod tests {
     use super::*;
     use crate::arithmetic::normals;
     use crate::linear::information::Information;
-    use crate::online::channel::NoiseTracker;
     use crate::online::parameters::ParameterEstimate;
     use crate::robot::BaseMotion;
     use nalgebra::DMatrix;
@@ -470,16 +467,6 @@ mod tests {
 
     /// Observations every ten milliseconds of a robot in random motion, with random readings.
     fn observe(robot: &Robot, observations: i64, online: &mut [&mut Online]) {
-        observe_with(robot, observations, online, |_| ());
-    }
-
-    /// The same, with what happens after each.
-    fn observe_with(
-        robot: &Robot,
-        observations: i64,
-        online: &mut [&mut Online],
-        mut then: impl FnMut(&mut Online),
-    ) {
         let (model, count) = (&robot.model, robot.structure.sensors().len());
         let mut kinematics = Kinematics::new(model, 0).unwrap();
         let dofs = model.dof_count();
@@ -519,7 +506,6 @@ mod tests {
                     sensors: &fine,
                 };
                 online.observe(&observation).unwrap();
-                then(online);
             }
         }
     }
@@ -573,36 +559,6 @@ mod tests {
                 "{offset} N after {since} s"
             );
         }
-    }
-
-    /// Blocks that are open when a job brings other variances are whitened with the earlier ones:
-    /// they tell nothing of the noise.
-    #[test]
-    fn a_change_of_the_variances_is_no_noise() {
-        let robot = robot();
-        let mut online = online(&robot);
-        let (mut jobs, mut greatest) = (0, 0.0);
-        observe_with(&robot, 1200, &mut [&mut online], |online| {
-            if online.apply() {
-                // As after a second of great noise, and back.
-                for component in &mut online.components {
-                    let factor = if jobs % 2 == 0 { 1e4 } else { 1e-4 };
-                    component
-                        .variances
-                        .iter_mut()
-                        .for_each(|own| *own *= factor);
-                }
-            }
-            if let Some(mut job) = online.take_job() {
-                job.run();
-                let channels = job.components[0].channels.iter();
-                greatest = channels.map(NoiseTracker::reading).fold(0.0, f64::max);
-                jobs += 1;
-                online.give_back(job);
-            }
-        });
-        // The readings have unit variance.
-        assert!(jobs > 10 && greatest < 1.5, "{greatest} after {jobs} jobs");
     }
 
     /// The covariance of a mixture matches its definition.

@@ -92,7 +92,8 @@ fn an_offset_jump_is_found_and_the_new_offset_identified() {
     for (axis, (before, by)) in numbers(there).into_iter().zip(jump).enumerate() {
         let (found, std) = (offset.force[axis], offset.standard_deviation[axis]);
         println!("{axis}: {found:.3} +- {std:.3} N, {:.3} N", before + by);
-        assert!(std < 0.5, "{axis}: {std}");
+        // Of the five seconds that are left after it is taken for a jump.
+        assert!(std < 0.8, "{axis}: {std}");
         assert!((found - before - by).abs() < 4.0 * std.max(NOISE[axis]));
     }
 }

@@ -89,10 +89,8 @@ pub(crate) struct Component {
     pub(crate) drift_time: f64,
     pub(crate) drift_interval: f64,
     pub(crate) variances: Vec<f64>,
-    /// The variances with which the rows for the next job are whitened, from this slot on. Blocks
-    /// that were not full yet when the last job was taken begin with others.
+    /// The variances with which the rows for the next job are whitened.
     pub(crate) whitened: Vec<f64>,
-    pub(crate) whitened_from: i64,
     /// Standard deviations of the offsets' drift in a second.
     pub(crate) drift_rates: Vec<f64>,
     /// Columns of the offsets.
@@ -238,7 +236,6 @@ impl Component {
             information: Information::new(unknowns),
             panel: Panel::new(unknowns, most * per_block),
             whitened: variances.clone(),
-            whitened_from: i64::MIN,
             variances,
             drift_rates: noise.iter().map(|(_, rate)| *rate).collect(),
             offsets: (0..offset_count).collect(),

@@ -20,6 +20,11 @@ use std::sync::Arc;
 /// Duration of rejection, with tilting sensors, after which a change is tested \[s\].
 pub(crate) const PERSISTENT: f64 = 3.0;
 
+/// Duration up to which a disturbance is a push rather than an offset jump \[s\]: a force that is
+/// steady in the sensor's axes looks like one. A jump is a tenth as usual as a push, and of pushes
+/// of some four seconds in the mean a tenth lasts longer.
+pub(crate) const PUSH: f64 = 10.0;
+
 /// Cosine of the least tilt of a sensor for that test, 20 degrees. Without tilt an offset, a weight
 /// and a push are not separable.
 pub(crate) const TILTED_COSINE: f64 = 0.94;
@@ -63,9 +68,8 @@ pub(crate) struct ComponentJob {
     /// The sensitivities of the previous second's means to the bodies, a column per channel, and
     /// the parameters used for them.
     pub(crate) before: Option<(DMatrix<f64>, Vec<f64>)>,
-    /// The variances with which the rows are whitened, from this slot on.
+    /// The variances with which the rows are whitened.
     pub(crate) whitened: Vec<f64>,
-    pub(crate) whitened_from: i64,
     pub(crate) drift_rates: Vec<f64>,
     pub(crate) period: f64,
     pub(crate) tau: f64,
@@ -86,6 +90,8 @@ pub(crate) struct ComponentJob {
     /// The information in the rejected rows, and the time over which they were collected \[s\].
     pub(crate) rejected_information: Information,
     pub(crate) rejected_time: f64,
+    /// How long the disturbance has lasted \[s\].
+    pub(crate) disturbed_time: f64,
     /// Their slots.
     pub(crate) rejected_slots: Vec<i64>,
     pub(crate) change: Option<(DetectedChange, Information)>,
@@ -111,16 +117,6 @@ impl SlotRange {
             });
         let count = usize::try_from(last.checked_sub(first)?).ok()? + 1;
         (count <= LONGEST).then_some(Self { first, count })
-    }
-
-    /// The part of it from this slot on, if there is any.
-    fn from(self, first: i64) -> Option<Self> {
-        let end = self.first + self.count as i64;
-        let first = self.first.max(first);
-        let count = usize::try_from(end - first)
-            .ok()
-            .filter(|count| *count > 0)?;
-        Some(Self { first, count })
     }
 
     pub(crate) fn place(&self, slot: i64) -> Option<usize> {
@@ -151,7 +147,6 @@ impl ComponentJob {
             channels: component.layout.trackers(period.seconds()),
             before: None,
             whitened: component.variances.clone(),
-            whitened_from: i64::MIN,
             drift_rates: component.drift_rates.clone(),
             period: period.seconds(),
             tau: prior.expected_tau(),
@@ -169,6 +164,7 @@ impl ComponentJob {
             last_valid,
             rejected_information: Information::new(component.information.unknowns()),
             rejected_time: 0.0,
+            disturbed_time: 0.0,
             rejected_slots: Vec::new(),
             change: None,
         }
@@ -365,13 +361,12 @@ impl ComponentJob {
         let rows = [&self.learnt, &self.rejected_rows];
         let is_solved =
             self.estimate.len() == unknowns && self.newest.root.ncols() + offset_count == unknowns;
-        let span = SlotRange::of(rows.into_iter()).filter(|_| is_solved);
-        let Some(span) = span.and_then(|span| span.from(self.whitened_from)) else {
+        let Some(span) = SlotRange::of(rows.into_iter()).filter(|_| is_solved) else {
             return self.take_seconds(&seconds);
         };
         let observations = span.count;
         let (series, shown) = self.series(&rows, &span, &self.estimate);
-        let mut sensitivities = self.sensitivities(&rows, &span);
+        let mut sensitivities = self.sensitivities(&rows);
         let counts: Vec<f64> = (series.chunks_exact(observations))
             .map(|own| own.iter().filter(|x| x.is_finite()).count() as f64)
             .collect();
@@ -479,15 +474,13 @@ impl ComponentJob {
 
     /// The sensitivity of each channel's share, summed over observations, to the bodies: its column
     /// of rows^T x weights.
-    pub(crate) fn sensitivities(&self, rows: &[&RowBuffer], span: &SlotRange) -> DMatrix<f64> {
+    pub(crate) fn sensitivities(&self, rows: &[&RowBuffer]) -> DMatrix<f64> {
         let (offset_count, unknowns) = (self.variances.len(), self.information.unknowns());
         let mut sensitivities = DMatrix::zeros(unknowns - offset_count, offset_count);
         for rows in rows {
             for (kind, rows) in self.layout.columns.iter().zip(rows.iter()) {
-                let width = kind.width();
-                let before = rows.slots().partition_point(|slot| *slot < span.first);
-                let count = rows.slots().len() - before;
-                let all = DMatrixView::from_slice(&rows.values()[width * before..], width, count);
+                let (width, count) = (kind.width(), rows.slots().len());
+                let all = DMatrixView::from_slice(rows.values(), width, count);
                 let weights = DMatrix::from_fn(count, kind.offsets, |row, place| {
                     self.whitened[kind.columns[place]] * all[(place, row)]
                 });
@@ -516,8 +509,10 @@ impl ComponentJob {
     ) -> Result<(), PriorError> {
         if !self.is_disturbed {
             self.drop_rejected();
+            self.disturbed_time = 0.0;
             return Ok(());
         }
+        self.disturbed_time += SOLVE.seconds();
         // Nothing is rejected under a declared contact, or without a sensor: that time does not
         // count.
         if self.rejected_rows.is_empty() {
@@ -567,7 +562,8 @@ impl ComponentJob {
         }
         // A load looks like a steady force, so only its inertia tells it from a push.
         if let Some((change, information)) = best
-            && (change == DetectedChange::Load || !is_rather_a_contact(&self.rejected_slots))
+            && (change == DetectedChange::Load
+                || self.disturbed_time > PUSH && !is_rather_a_contact(&self.rejected_slots))
         {
             // The parameters in use do not include the load; an offset jump does not affect them.
             self.is_replaced = change == DetectedChange::Load;
