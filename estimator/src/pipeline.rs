@@ -35,8 +35,8 @@
 //! replay gives the live estimates bit for bit.
 //!
 //! A sample stamped exactly `t` is used as it is, with its velocity and acceleration if it has
-//! them. Otherwise the adaptive window differentiates ([`crate::differentiate`]). Wrenches and
-//! proper accelerations are interpolated linearly. Wrenches are corrected first
+//! credible ones. Otherwise the adaptive window differentiates ([`crate::differentiate`]). Wrenches
+//! and proper accelerations are interpolated linearly. Wrenches are corrected first
 //! ([`proprio_dynamics::calibration`]), by the last temperature of their board stamped before
 //! `t - max_wait / 2`, however old: temperature changes slowly. Before the first temperature, the
 //! board is taken to be at its reference temperature. While there is none, or it is older than a

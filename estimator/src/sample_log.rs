@@ -98,9 +98,9 @@ pub fn recording(robot: &Robot, log: impl Read) -> Result<Recording, SampleLogEr
     read_in_segments(robot, log, BLOCK, SEGMENT)
 }
 
-/// Size of the text that is read at a time [bytes].
+/// Size of the text that is read at a time \[bytes\].
 const BLOCK: usize = 4 << 20;
-/// Approximate size of the text that one thread parses at a time [bytes].
+/// Approximate size of the text that one thread parses at a time \[bytes\].
 const SEGMENT: usize = 256 << 10;
 
 /// The channel or contact that a column belongs to.

@@ -11,9 +11,10 @@
 //! | accelerations, positions, motion of the base | of differentiation, and typical | `motion` |
 //! | places of declared and touched contacts | as declared | [`PlaceErrors`] |
 //!
-//! The variance of a result is the sum of the four ([`Uncertainty::torque`]), and so is the
-//! covariance of the imbalance that residuals are tested against ([`Uncertainty::imbalance`]).
-//! [`Uncertainty::torque_shares`] says which input causes which part.
+//! The variance of a result is the sum of the four ([`Uncertainty::torque_variance`]), and so is
+//! the covariance of the imbalance that residuals are tested against
+//! ([`Uncertainty::imbalance_covariance`]). [`Uncertainty::torque_shares`] says which input causes
+//! which part.
 
 mod motion;
 pub mod propagation;
