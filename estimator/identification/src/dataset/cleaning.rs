@@ -1,6 +1,6 @@
 //! Cleans every channel of a recording: orders the stamps, and removes repeated readings, frozen
-//! stretches, and spikes of encoders, joint torques and gyroscopes. Everything removed is reported
-//! as a finding.
+//! stretches, and spikes of encoders, measured derivatives, joint torques and gyroscopes. Everything
+//! removed is reported as a finding.
 
 use crate::dataset::recording::Recording;
 use crate::dataset::repeats::{ChannelRepeats, RepeatedReadings};
@@ -160,8 +160,8 @@ impl<const D: usize> SampleStream<D> {
     }
 }
 
-/// Cleans every stream: stamps, repeated readings, frozen stretches, and spikes of encoders, joint
-/// torques and gyroscopes.
+/// Cleans every stream: stamps, repeated readings, frozen stretches, and spikes of encoders,
+/// measured derivatives, joint torques and gyroscopes.
 pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
     let channels = recording.channels.clone();
     let mut repeats = std::mem::replace(&mut recording.repeats, RepeatedReadings::new(0));
@@ -213,6 +213,8 @@ pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
             let noise = robot.position_noise;
             for (axis, stream, least) in [
                 ("position", &mut track.position, noise),
+                ("velocity", &mut track.velocity, 1e-9),
+                ("acceleration", &mut track.acceleration, 1e-9),
                 ("torque", &mut track.torque, 1e-9),
             ] {
                 let spikes = stream.despike(0, least);
@@ -241,6 +243,7 @@ fn outliers(channel: &str, axis: &str, (samples, largest, t): (usize, f64, Nanos
     let unit = match axis {
         "torque" => "Nm",
         "position" => "rad (or m)",
+        "acceleration" => "rad/s^2",
         _ => "rad/s",
     };
     let text = format!(
