@@ -299,19 +299,16 @@ fn a_measured_velocity_that_cannot_be_true_is_as_if_not_measured() {
     }
     let (estimates, pipeline) = run(setup(|_| {}), &events);
     assert_eq!(pipeline.counts().not_finite, 0);
-    for (one, other) in true_ones.iter().zip(&estimates) {
-        for (one, other) in one.torques.joints().iter().zip(other.torques.joints()) {
-            assert_eq!(one.valid, other.valid);
-            let apart = (one.torque - other.torque).abs();
-            assert!(!(apart > 0.05), "{apart} Nm at {:?}", one);
-        }
+    let joints = |all: &[Estimate]| -> Vec<JointTorque> {
+        let each = all.iter().flat_map(|one| one.torques.joints());
+        each.copied().collect()
+    };
+    let (true_ones, others) = (joints(&true_ones), joints(&estimates));
+    assert_eq!(true_ones.len(), others.len());
+    for (one, other) in true_ones.iter().zip(&others) {
+        assert_eq!(one.valid, other.valid);
+        let apart = (one.torque - other.torque).abs();
+        assert!(one.valid == 0 || apart < 0.05, "{apart} Nm at {one:?}");
     }
-    // They are of those instants, not of none.
-    assert!(
-        estimates
-            .iter()
-            .filter(|one| one.t > Nanos::from_millis(500))
-            .count()
-            > 400
-    );
+    assert!(true_ones.iter().filter(|one| one.valid == 1).count() > 3000);
 }

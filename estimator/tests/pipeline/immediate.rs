@@ -136,7 +136,7 @@ fn a_changed_zero_is_no_motion() {
             }
             events
         };
-        let valid = |j: &&proprio_topics::JointTorque| j.valid == 1;
+        let valid = |j: &&JointTorque| j.valid == 1;
         let largest = |events: &[Event]| {
             let (estimates, _) = run(setup.clone(), events);
             let after = estimates.iter().filter(|e| e.t > Nanos::from_millis(400));

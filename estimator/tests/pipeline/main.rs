@@ -16,7 +16,9 @@ use proprio_estimator::offline;
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
 use proprio_topics::csv::{Row, TableReader, Value, What};
-use proprio_topics::{ContactState, JointState, Kind, Nanos, Quality, Reading, Reason, Wrench};
+use proprio_topics::{
+    ContactState, JointState, JointTorque, Kind, Nanos, Quality, Reading, Reason, Wrench,
+};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -210,7 +212,7 @@ type Bits = (u64, u64, u32, Reason, u32);
 
 /// Bit for bit: NaN equals NaN.
 fn bits(estimates: &[Estimate]) -> Vec<(Nanos, Vec<Bits>)> {
-    let joint = |j: &proprio_topics::JointTorque| {
+    let joint = |j: &JointTorque| {
         (
             j.torque.to_bits(),
             j.standard_deviation.to_bits(),
