@@ -1,6 +1,6 @@
 //! Cleans every channel of a recording: orders the stamps, and removes repeated readings, frozen
-//! stretches, and spikes of encoders, measured derivatives, joint torques and gyroscopes. Everything
-//! removed is reported as a finding.
+//! stretches, and spikes of encoders, measured derivatives, joint torques and gyroscopes.
+//! Everything removed is reported as a finding.
 
 use crate::dataset::recording::Recording;
 use crate::dataset::repeats::{ChannelRepeats, RepeatedReadings};
