@@ -18,8 +18,8 @@ pub use withheld::{Withheld, significant};
 
 use crate::config::STANDARD_GRAVITY;
 use crate::pipeline::Pipeline;
-use crate::plausible;
 use crate::setup::{Setup, gravity_loads, nearest};
+use crate::units;
 use proprio_dynamics::model::{Limits, Model};
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{
@@ -134,7 +134,7 @@ impl Posture {
             let position = position
                 .filter(|position| position.is_finite())
                 .ok_or_else(|| format!("--at {text}: {number:?} must be a number [rad or m]"))?;
-            plausible::angle(&format!("--at {name}"), position)?;
+            units::angle(&format!("--at {name}"), position)?;
             if let Some(place) = posture.position.get_mut(dof) {
                 *place = position;
             }

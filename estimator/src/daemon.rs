@@ -41,13 +41,13 @@ const HEALTH_PERIOD: Nanos = Nanos::from_millis(100);
 /// How often the budget of a torque is published while somebody reads them, of one joint after
 /// another.
 const BUDGET_PERIOD: Nanos = Nanos::from_millis(10);
-/// A missing temperature is reported after this number of health periods: boards send it every few
-/// seconds at best.
+/// A missing temperature is reported after this number of health periods, 10 s: boards send it every
+/// few seconds at best.
 const MISSING_TEMPERATURE: u32 = 100;
 /// A data plane whose loop has not run for this long is stalled.
 const STALLED: Nanos = Nanos::from_millis(500);
 /// Most samples taken at once: as many as can be queued from all buses (6 MB).
-const INBOX: usize = <Sample as Topic>::QUALITY.buffer * <Sample as Topic>::QUALITY.publishers;
+const MOST_TAKEN: usize = <Sample as Topic>::QUALITY.buffer * <Sample as Topic>::QUALITY.publishers;
 
 /// Checks a configuration, and prints what the estimator would read and estimate (`--check`), in
 /// the `posture` that is returned for its setup.
@@ -274,16 +274,16 @@ struct DataPlane {
     lost: u64,
     epochs: u64,
     /// The samples taken at once, to be sorted by stamp; never grows.
-    inbox: Vec<Sample>,
+    taken: Vec<Sample>,
     unknown_contact_reported: bool,
     refusal_reported: bool,
     /// Consecutive health periods in which a sensor lacked the temperature that its calibration
     /// needs.
     without_temperature: u32,
     /// Per channel number of the gateway, the pipeline's channel.
-    map: Vec<Option<usize>>,
-    /// The gateway's epoch that `map` belongs to.
-    map_epoch: u64,
+    channel_of: Vec<Option<usize>>,
+    /// The gateway's epoch that `channel_of` belongs to.
+    channels_epoch: u64,
     health: EstimatorHealth,
     identification: Option<IdentificationThread>,
     first_look: FirstLook,
@@ -327,12 +327,12 @@ impl DataPlane {
             epochs: 0,
             identification,
             first_look,
-            inbox: Vec::with_capacity(INBOX),
+            taken: Vec::with_capacity(MOST_TAKEN),
             unknown_contact_reported: false,
             refusal_reported: false,
             without_temperature: 0,
-            map: Vec::with_capacity(proprio_topics::MAX_CHANNELS),
-            map_epoch: 0,
+            channel_of: Vec::with_capacity(proprio_topics::MAX_CHANNELS),
+            channels_epoch: 0,
             health: EstimatorHealth {
                 started: monotonic(),
                 ..EstimatorHealth::default()
@@ -429,12 +429,12 @@ impl DataPlane {
         // Shared memory delivers all samples of one bus before those of the next. After a stall the
         // first bus would run ahead by more than an estimate waits, and the samples of the others
         // would be late. So sort by stamp first.
-        self.inbox.clear();
-        while self.inbox.len() < INBOX
+        self.taken.clear();
+        while self.taken.len() < MOST_TAKEN
             && let Some(taken) = self.ports.samples.as_mut().map(Reader::try_take)
         {
             match taken {
-                Ok(Some(sample)) => self.inbox.push(sample),
+                Ok(Some(sample)) => self.taken.push(sample),
                 Ok(None) => break,
                 Err(error) => {
                     // The reader tries again; once is enough in the log.
@@ -445,35 +445,39 @@ impl DataPlane {
                 }
             }
         }
-        self.inbox
+        self.taken
             .sort_unstable_by_key(|s| (s.header.acquired, s.header.bus, s.header.sequence));
-        self.health.samples += self.inbox.len() as u64;
-        for at in 0..self.inbox.len() {
-            let Some(sample) = self.inbox.get(at).copied() else {
+        self.health.samples += self.taken.len() as u64;
+        for at in 0..self.taken.len() {
+            let Some(sample) = self.taken.get(at).copied() else {
                 break;
             };
             self.take_sample(now, &sample);
             // Samples of one stamp arrived together: an immediate estimate uses them all.
-            let next = self.inbox.get(at + 1).map(|next| next.header.acquired);
+            let next = self.taken.get(at + 1).map(|next| next.header.acquired);
             if next != Some(sample.header.acquired) {
                 self.publish_estimates();
             }
         }
-        !self.inbox.is_empty()
+        !self.taken.is_empty()
     }
 
     /// Passes a sample to the pipeline, if its channel is one of the configuration's.
     fn take_sample(&mut self, now: Nanos, sample: &Sample) {
-        if sample.header.epoch != self.map_epoch {
+        if sample.header.epoch != self.channels_epoch {
             self.take_descriptions();
         }
-        if sample.header.epoch != self.map_epoch {
+        if sample.header.epoch != self.channels_epoch {
             self.health.unknown_channel += 1;
             return;
         }
         // A channel that the configuration does not name is ignored: the gateway may serve other
         // programs.
-        let channel = self.map.get(sample.channel as usize).copied().flatten();
+        let channel = self
+            .channel_of
+            .get(sample.channel as usize)
+            .copied()
+            .flatten();
         let (Some(channel), Some(reading)) = (channel, sample.reading()) else {
             return;
         };
@@ -544,18 +548,18 @@ impl DataPlane {
             if description.publisher != Publisher::Gateway {
                 continue;
             }
-            self.map.clear();
+            self.channel_of.clear();
             for number in 0..proprio_topics::MAX_CHANNELS {
                 let entry = u32::try_from(number)
                     .ok()
                     .and_then(|n| description.find(Role::Channel, n));
                 let setup = self.pipeline.setup();
-                self.map
+                self.channel_of
                     .push(entry.and_then(|e| setup.channel(e.kind.get()?, e.name.as_str())));
             }
-            self.map_epoch = description.header.epoch;
+            self.channels_epoch = description.header.epoch;
             for (number, channel) in self.shared.channels.iter().enumerate() {
-                channel.set_described(self.map.contains(&Some(number)));
+                channel.set_described(self.channel_of.contains(&Some(number)));
             }
         }
     }

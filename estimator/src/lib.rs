@@ -17,7 +17,6 @@ pub mod inertial;
 pub mod offline;
 pub mod parameters;
 pub mod pipeline;
-mod plausible;
 pub mod sample_log;
 #[cfg(test)]
 #[path = "../../tests/schema.rs"]
@@ -25,5 +24,6 @@ mod schema;
 pub mod setup;
 pub mod skin;
 mod uncertainty;
+mod units;
 
 pub use uncertainty::propagation;

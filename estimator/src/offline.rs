@@ -123,7 +123,7 @@ pub fn estimate(
 ) -> Result<EstimateReport, EstimationError> {
     let mut table = None;
     let mut out = Some(out);
-    let (mut report, pipeline) = follow(setup, log, |pipeline, is_stamped| {
+    let (mut report, pipeline) = run_on_log(setup, log, |pipeline, is_stamped| {
         if let Some(out) = out.take() {
             table = Some(EstimateTable::new(out, pipeline.setup())?);
         }
@@ -153,7 +153,7 @@ pub fn estimate(
 ///
 /// # Errors
 /// As for [`estimate`]; and those of `each`.
-pub fn follow(
+pub fn run_on_log(
     setup: Setup,
     log: impl Read,
     mut each: impl FnMut(&mut Pipeline, bool) -> Result<ControlFlow<()>, EstimationError>,
@@ -248,7 +248,7 @@ fn push_row(pipeline: &mut Pipeline, owners: &[Option<ColumnOwner>], t: Nanos, r
 /// moves.
 ///
 /// # Errors
-/// As for [`follow`].
+/// As for [`run_on_log`].
 pub fn drive_rows(setup: &Setup, log: impl Read) -> Result<Vec<Vec<DriveRow>>, EstimationError> {
     let mut rows: Vec<Vec<DriveRow>> = vec![Vec::new(); setup.robot.model.dof_count()];
     let mut setup = setup.clone();
@@ -256,7 +256,7 @@ pub fn drive_rows(setup: &Setup, log: impl Read) -> Result<Vec<Vec<DriveRow>>, E
     setup.learns_drives = true;
     // A log has the samples that a running estimator would have to wait for.
     setup.waits = true;
-    follow(setup, log, |pipeline, is_stamped| {
+    run_on_log(setup, log, |pipeline, is_stamped| {
         // Friction needs velocities, and seconds.
         if !is_stamped {
             return Ok(ControlFlow::Break(()));

@@ -2,12 +2,12 @@
 //! each of these stamps gives one estimate.
 //!
 //! # The path of a reading
-//! 1. [`Pipeline::push`] judges a sample by those before it ([`proprio_topics::sanity`]: one that
+//! 1. [`Pipeline::push`] (`arrival`) judges a sample by those before it ([`proprio_topics::sanity`]: one that
 //!    repeats or jumps is flagged) and stores it in its channel's buffer (`buffers`,
 //!    [`crate::history`], [`crate::differentiate`]). A sample of the trigger channel also queues
 //!    its stamp.
 //! 2. [`Pipeline::poll`] releases the oldest queued stamp `t` when all its samples are there.
-//! 3. Every channel is evaluated at `t` (`channels`). F/T readings are corrected for calibration,
+//! 3. Every channel is evaluated at `t` (`inputs`). F/T readings are corrected for calibration,
 //!    temperature and offset.
 //! 4. The contacts that are present are put where declarations or skins say (`contacts`,
 //!    [`crate::skin`]). Kinematics and solver give torques and contact wrenches; standard
@@ -66,14 +66,14 @@
 //! that of the places of declared and touched contacts (`uncertainty`). They do not contain the
 //! errors of velocities.
 
+mod arrival;
 mod budget;
 mod buffers;
-mod channels;
 mod contacts;
 mod drives;
 mod estimate;
 mod identification;
-mod input;
+mod inputs;
 mod offset_steps;
 mod prediction;
 mod residuals;
@@ -90,10 +90,10 @@ use crate::inertial::InertialState;
 use crate::setup::Setup;
 use crate::uncertainty::Uncertainty;
 use buffers::{ChannelBuffer, Sanity};
-use channels::Inputs;
 use contacts::Contacts;
-use drives::{Drives, Instant};
+use drives::{DriveInstant, Drives};
 use identification::OnlineIdentification;
+use inputs::Inputs;
 use offset_steps::OffsetStepCover;
 use prediction::Predictor;
 use proprio_dynamics::spatial::Wrench;
@@ -398,8 +398,8 @@ impl Pipeline {
     }
 
     /// The last estimate, as drives are compared with it.
-    fn instant(&self) -> Instant<'_> {
-        Instant {
+    fn instant(&self) -> DriveInstant<'_> {
+        DriveInstant {
             t: self.estimate.t,
             until: self.until(self.estimate.t),
             robot: &self.setup.robot,

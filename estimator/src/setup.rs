@@ -16,8 +16,8 @@ use crate::differentiate::Settings;
 use crate::drive::DriveModel;
 use crate::inertial::InertialState;
 use crate::parameters::{Parameters, ParametersError};
-use crate::plausible;
 use crate::skin::PatchSetup;
+use crate::units;
 use proprio_dynamics::calibration::{self, Calibration, UNKNOWN_OFFSET};
 use proprio_dynamics::model::{Frame, JointKind, Model, ModelError};
 use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
@@ -289,7 +289,7 @@ fn notes(config: &Config, model: &Model) -> Result<Vec<String>, String> {
     let mut notes: Vec<String> = of_urdf
         .map(|warning| format!("{urdf}: {warning}"))
         .collect();
-    notes.extend(plausible::check(config, model)?);
+    notes.extend(units::check(config, model)?);
     let identification = &config.identification;
     if identification.enabled && identification.inputs.contains(&IdentificationInput::Torque) {
         notes.push(

@@ -19,7 +19,7 @@
 mod motion;
 pub mod propagation;
 
-pub(crate) use motion::OperatingPoint;
+pub(crate) use motion::{JointStd, OperatingPoint};
 
 use crate::inertial::InertialState;
 use motion::{MotionErrors, sum_of_squares};
@@ -53,10 +53,9 @@ impl Uncertainty {
         })
     }
 
-    /// Sets the standard deviations of a joint's acceleration, and of its position beside the
-    /// encoder's offset.
-    pub(crate) fn set_joint(&mut self, dof: usize, acceleration: f64, position: [f64; 2]) {
-        self.motion.set_joint(dof, acceleration, position);
+    /// Sets how uncertain a joint's measured state is.
+    pub(crate) fn set_joint(&mut self, dof: usize, deviations: JointStd) {
+        self.motion.set_joint(dof, deviations);
     }
 
     /// Sets the standard deviations of an IMU's angular acceleration, and what extrapolation adds

@@ -10,16 +10,12 @@ use proprio_drivers::{
     Claim, CommandFailed, Decoded, Device, Frame, Mode, NotSent, SpecError, StampedReading, State,
     Transmit,
 };
-use proprio_topics::sanity::Repeats;
+use proprio_topics::sanity::{LONGEST_COPIES, Repeats};
 use proprio_topics::{
     Counter, Header, MAX_CHANNELS, Nanos, Quality, Reading, Sample, StampKind, Wrench,
 };
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
-
-/// The shortest run of equal wrenches that counts as frozen, however improbable: some boards send
-/// one measurement several times, if they send faster than they measure.
-const LEAST_RUN: u32 = 16;
 
 /// The devices of one bus, their outputs and counters.
 pub struct BusDevices {
@@ -146,7 +142,7 @@ impl Channels {
         };
         if let Reading::Wrench(wrench) = &reading.reading {
             let ([fx, fy, fz], [tx, ty, tz]) = (wrench.force, wrench.torque);
-            let frozen = repeats.look(&[fx, fy, fz, tx, ty, tz], quality, LEAST_RUN);
+            let frozen = repeats.look(&[fx, fy, fz, tx, ty, tz], quality, LONGEST_COPIES);
             let beyond = beyond(wrench, running.device.full_scale());
             if frozen != 0 {
                 quality |= Quality::FROZEN;

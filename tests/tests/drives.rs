@@ -4,7 +4,7 @@
 
 use proprio_estimator::config::Config;
 use proprio_estimator::drive::{self, DriveModel, DriveSignal, Unfit};
-use proprio_estimator::offline::{drive_rows, follow};
+use proprio_estimator::offline::{drive_rows, run_on_log};
 use proprio_estimator::parameters::Parameters;
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
@@ -102,7 +102,7 @@ fn settings(seed: u64, faults: &[&str]) -> SimulationSettings {
 
 /// What the estimator says of a log, in seconds from its beginning.
 fn each(setup: Setup, log: &[u8], mut take: impl FnMut(f64, &Pipeline)) {
-    follow(setup, log, |pipeline, _| {
+    run_on_log(setup, log, |pipeline, _| {
         take((pipeline.last_estimate().t - T0).seconds(), pipeline);
         Ok(ControlFlow::Continue(()))
     })
@@ -422,7 +422,7 @@ fn the_drive_of_a_real_leg_is_found() {
         let mut setup = setup.clone();
         setup.drives = vec![own.clone()];
         let (mut count, mut covered) = (0.0, 0.0);
-        follow(setup, &log[..], |pipeline, _| {
+        run_on_log(setup, &log[..], |pipeline, _| {
             let t = pipeline.last_estimate().t.seconds();
             let said = pipeline.drives().unwrap().drives()[0];
             if other.contains(&t) {

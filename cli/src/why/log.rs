@@ -5,7 +5,7 @@ use crate::convert::{Configured, input, unfit};
 use crate::names::find;
 use crate::samples;
 use anyhow::{Context, anyhow, bail};
-use proprio_estimator::offline::{EstimationError, follow};
+use proprio_estimator::offline::{EstimationError, run_on_log};
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
 use proprio_gateway::plan::Plan;
@@ -71,7 +71,7 @@ impl Log<'_> {
     fn follow(&self, setup: Setup, until: Option<Nanos>) -> anyhow::Result<Followed> {
         let (mut spells, mut t, mut is_stamped) = (Vec::new(), Nanos::MIN, true);
         let table = samples::table(input(self.file)?, self.file)?;
-        let followed = follow(setup, table, |pipeline, has_stamps| {
+        let followed = run_on_log(setup, table, |pipeline, has_stamps| {
             (t, is_stamped) = (pipeline.last_estimate().t, has_stamps);
             tell(pipeline, self.joint, is_stamped, &mut spells);
             Ok(match until.is_some_and(|until| t >= until) {

@@ -8,7 +8,7 @@
 //! [`Uncertainty::torque_shares`]: crate::uncertainty::Uncertainty::torque_shares
 
 use super::Pipeline;
-use super::channels::Inputs;
+use super::inputs::Inputs;
 use crate::setup::Setup;
 use core::fmt::Write as _;
 use proprio_dynamics::model::Model;

@@ -3,7 +3,7 @@
 use super::prediction::Predictor;
 use crate::differentiate::Window;
 use crate::history::{ChannelValue, History};
-use proprio_topics::sanity::{Jumps, Repeats};
+use proprio_topics::sanity::{Jumps, LONGEST_COPIES, Repeats};
 use proprio_topics::{Nanos, Quality, Reason};
 
 /// The last samples of one channel, and a window for the values that are differentiated.
@@ -121,8 +121,8 @@ impl Sanity {
     ) -> Quality {
         let jumps = self.jumps.look(t, values, quality);
         let period = Nanos::from_seconds(self.jumps.period()).0.max(1);
-        let least = u32::try_from(max_silence.0 / period).unwrap_or(LONGEST);
-        let least = least.clamp(2, LONGEST);
+        let least = u32::try_from(max_silence.0 / period).unwrap_or(LONGEST_COPIES);
+        let least = least.clamp(2, LONGEST_COPIES);
         let is_repeated = self.repeats.look(values, quality, least) != 0;
         self.is_still = self.is_encoder && (is_repeated || self.jumps.has_stopped());
         self.is_stuck &= self.jumps.has_stopped();
@@ -134,20 +134,6 @@ impl Sanity {
             flags |= Quality::IMPLAUSIBLE;
         }
         flags
-    }
-}
-
-/// The longest run of equal readings that may be one measurement, sent several times.
-const LONGEST: u32 = 16;
-
-pub(super) trait OrReason {
-    /// This reason, or `other` if there is none.
-    fn or(self, other: Self) -> Self;
-}
-
-impl OrReason for Reason {
-    fn or(self, other: Self) -> Self {
-        if self == Self::None { other } else { self }
     }
 }
 

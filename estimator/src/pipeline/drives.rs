@@ -163,7 +163,7 @@ impl Drives {
 
     /// What joints and drives do, per degree of freedom whose torque is valid and whose drive
     /// reports something.
-    pub(super) fn rows(&self, at: Instant<'_>) -> impl Iterator<Item = (usize, DriveRow)> {
+    pub(super) fn rows(&self, at: DriveInstant<'_>) -> impl Iterator<Item = (usize, DriveRow)> {
         let joints = at.joints().filter(|(_, torque)| torque.valid == 1);
         joints.filter_map(move |(dof, torque)| {
             let watched = self.watched.get(dof)?.as_ref()?;
@@ -181,7 +181,7 @@ impl Drives {
     }
 
     /// Compares the torques of an estimate with what the drives report.
-    pub(super) fn compare(&mut self, at: &Instant<'_>, dependences: &[Dependence]) {
+    pub(super) fn compare(&mut self, at: &DriveInstant<'_>, dependences: &[Dependence]) {
         let out = &mut self.estimate;
         (out.count, out.candidate_count) = (0, 0);
         out.header.acquired = at.t;
@@ -241,7 +241,7 @@ impl Drives {
     /// Names what may have caused the disagreements: for the joints of each sub-tree together, what
     /// the torques of all of them rest on, then their drives. A joint that agrees clears nothing: a
     /// force may pass through its axis.
-    fn name_candidates(&mut self, at: &Instant<'_>, dependences: &[Dependence]) {
+    fn name_candidates(&mut self, at: &DriveInstant<'_>, dependences: &[Dependence]) {
         let (model, structure) = (&at.robot.model, &at.robot.structure);
         let DriveEstimate {
             count,
@@ -308,7 +308,7 @@ fn is_ungrouped(own: &DriveTorque) -> bool {
 
 /// An estimate, and what it was made from.
 #[derive(Clone, Copy)]
-pub(super) struct Instant<'a> {
+pub(super) struct DriveInstant<'a> {
     pub(super) t: Nanos,
     /// Reports up to this stamp count.
     pub(super) until: Nanos,
@@ -320,7 +320,7 @@ pub(super) struct Instant<'a> {
     pub(super) faults: &'a [Reason],
 }
 
-impl<'a> Instant<'a> {
+impl<'a> DriveInstant<'a> {
     /// The degrees of freedom of the joints, and their torques.
     fn joints(self) -> impl Iterator<Item = (usize, &'a JointTorque)> {
         self.robot.published().zip(self.torques)

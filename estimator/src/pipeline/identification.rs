@@ -8,13 +8,19 @@
 //!
 //! Time is divided into slots of one `period`; at most one estimate in each slot triggers an
 //! identification instant. So these instants depend on the stamps alone, as estimates do.
+//!
+//! A solution goes to this pipeline's parameters ([`InertialState`]), to readers
+//! ([`InertiaEstimate`]) and, from time to time, as text to the file `identification.state`
+//! ([`Job::state`]). It never goes to parameters.toml, which `proprio identify` alone writes. At the
+//! start identification begins with parameters.toml if the configuration names one, and the file of
+//! an earlier run replaces that ([`super::Pipeline::resume`]).
 
 mod centred;
 
-use crate::pipeline::identification::centred::{Centred, DELAY, SignalStatistics};
+use crate::pipeline::identification::centred::{Centred, DELAY, Estimated, SignalStatistics};
 use proprio_topics::{InertiaEstimate, LinkInertia, Name, Nanos, Quality, Reason, SensorOffset};
 
-use super::buffers::{ChannelBuffer, OrReason, temperature_at};
+use super::buffers::{ChannelBuffer, temperature_at};
 use crate::differentiate::Window;
 use crate::history::History;
 use crate::inertial::{InertialState, PosteriorBlock, excess};
@@ -367,15 +373,18 @@ impl OnlineIdentification {
             0 => window.noise(to),
             _ => [f64::NAN],
         };
-        let fit = self.differentiator.fit(highest, statistics, (sigma, 2));
+        let fit = self.differentiator.fit(highest, statistics, sigma, 2);
         let measured = (highest > 0).then(|| history.at(t, to)).flatten();
         let mut measured_statistics = self.measured_statistics.iter_mut().skip(2 * dof);
         let mut exact = |order: usize| {
-            let deviation = measured_statistics.next().map_or(0.0, |statistics| {
-                self.differentiator.deviation(order, statistics)
+            let error = measured_statistics.next().map_or(0.0, |statistics| {
+                self.differentiator.sample_std(order, statistics)
             });
             let value = measured.and_then(|measured| measured.value.get(order).copied());
-            (value.unwrap_or(f64::NAN), deviation)
+            Estimated {
+                value: value.unwrap_or(f64::NAN),
+                error,
+            }
         };
         let values = match highest {
             0 => fit,
@@ -447,12 +456,12 @@ impl OnlineIdentification {
             let [of_rate, of_angular, of_linear]: &mut [SignalStatistics; 3] = statistics
                 .and_then(|own| own.try_into().ok())
                 .unwrap_or(&mut none);
-            let gyro = self.differentiator.fit(3 + axis, of_rate, (sigma, 1));
+            let gyro = self.differentiator.fit(3 + axis, of_rate, sigma, 1);
             let alpha = match self.differentiator.is_complete(6 + axis) {
-                true => self.differentiator.fit(6 + axis, of_angular, (f64::NAN, 0))[0],
+                true => self.differentiator.fit(6 + axis, of_angular, f64::NAN, 0)[0],
                 false => gyro[1],
             };
-            let acceleration = self.differentiator.fit(axis, of_linear, (f64::NAN, 0))[0];
+            let acceleration = self.differentiator.fit(axis, of_linear, f64::NAN, 0)[0];
             let errors = self.current.errors.iter_mut().rev().skip(3 * axis);
             let held = [
                 &mut measured.proper_acceleration[axis],
@@ -581,10 +590,10 @@ const SIGNIFICANT_CHANGE: f64 = 6.0;
 fn replace<'a>(
     held: [&mut f64; 3],
     errors: impl Iterator<Item = &'a mut f64>,
-    new: [(f64, f64); 3],
+    new: [Estimated; 3],
 ) -> bool {
     let mut has_moved = false;
-    for ((held, held_error), (value, error)) in held.into_iter().zip(errors).zip(new) {
+    for ((held, held_error), Estimated { value, error }) in held.into_iter().zip(errors).zip(new) {
         let apart = (value - *held).abs();
         has_moved |= apart.is_nan() || apart > SIGNIFICANT_CHANGE * held_error.hypot(error);
         (*held, *held_error) = (value, error);
@@ -677,10 +686,10 @@ mod tests {
             )
             .unwrap();
         assert!(centred.is_complete(0) && !centred.is_complete(1));
-        let found = centred.fit(0, &mut statistics, (f64::NAN, 2));
+        let found = centred.fit(0, &mut statistics, f64::NAN, 2);
         for (found, expected) in found.iter().zip([0.3, -0.5, 4.0]) {
             assert!(
-                (found.0 - expected).abs() < 1e-9,
+                (found.value - expected).abs() < 1e-9,
                 "{found:?}, not {expected}"
             );
         }
@@ -713,8 +722,8 @@ mod tests {
                     Quality::UNTRUSTED_ENCODER,
                 )
                 .unwrap();
-            let [_, _, (acceleration, _)] = centred.fit(0, &mut statistics, (f64::NAN, 2));
-            let error = (acceleration + size * w * w).abs();
+            let [_, _, acceleration] = centred.fit(0, &mut statistics, f64::NAN, 2);
+            let error = (acceleration.value + size * w * w).abs();
             // The peak is 39.5 rad/s^2; a quadratic over the whole window would be off by 7.
             assert!(error < bound, "{error}");
             // At the end of the samples there is no centred window.

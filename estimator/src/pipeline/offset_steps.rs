@@ -8,6 +8,7 @@
 //! same in the axes of the sensor, while a contact rarely does. So it is refuted as soon as the
 //! residual has changed there significantly since it settled.
 
+use super::residuals::{SIGNIFICANT, kept};
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::{Pose, Wrench};
@@ -15,17 +16,6 @@ use proprio_dynamics::{ContactSet, Kinematics, Solver, Structure};
 use proprio_identification::online::COVERED;
 use proprio_identification::statistics::deviate;
 use proprio_topics::Nanos;
-
-/// The deviate above which a residual is significant: by chance, 3 of 10 million instants.
-pub(super) const SIGNIFICANT: f64 = 5.0;
-
-/// Time constant of mean residuals.
-pub(super) const TIME_CONSTANT: Nanos = Nanos::from_millis(50);
-
-/// The part of an exponential mean that is left after this time.
-pub(super) fn kept(since: Nanos) -> f64 {
-    (-since.seconds() / TIME_CONSTANT.seconds()).exp()
-}
 
 /// Time after which a mean shows a step whole, but for a thousandth.
 const SETTLED: Nanos = Nanos::from_millis(350);

@@ -24,10 +24,10 @@
 //!
 //! A contact that is detected from the start on may as well be a wrong offset, a wrong mounting, or
 //! another direction of gravity. So it counts only once the residual of its sub-tree has been
-//! plausible without it for [`FREE`]. One that was there before the residual could not be tested,
+//! plausible without it for [`CONFIRMED`]. One that was there before the residual could not be tested,
 //! because of a fault, may still be there after it.
 
-use super::offset_steps::{OffsetStep, SIGNIFICANT, TIME_CONSTANT, kept};
+use super::offset_steps::OffsetStep;
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{
@@ -37,6 +37,19 @@ use proprio_dynamics::{
 use proprio_identification::statistics::deviate;
 use proprio_topics::Nanos;
 
+/// The deviate above which a residual is significant. By chance one test of six degrees of freedom
+/// exceeds it with probability 1.3e-7 (2.9e-7 if [`deviate`] were exact). The mean has some ten
+/// independent values a second, so it does every nine days in each sub-tree; that of the instant
+/// every two hours at 1 kHz, if there were no error but the noise of single readings.
+pub(super) const SIGNIFICANT: f64 = 5.0;
+/// Time constant of mean residuals.
+const TIME_CONSTANT: Nanos = Nanos::from_millis(50);
+
+/// The part of an exponential mean that is left after this time.
+pub(super) fn kept(since: Nanos) -> f64 {
+    (-since.seconds() / TIME_CONSTANT.seconds()).exp()
+}
+
 /// The deviate up to which a residual is plausible: 99 % of instants without an unknown wrench.
 const PLAUSIBLE: f64 = 2.326;
 /// Advantage of the contact that was detected before, a deviate: of two that fit about equally well
@@ -45,9 +58,9 @@ const PREVIOUS: f64 = 1.0;
 /// Distance from a contact's position to the force of a detected contact, one standard deviation
 /// \[m\]: 99 % within 17 cm, the size of a hand or a foot.
 const CONTACT_RADIUS: f64 = 0.05;
-/// Time in which a plausible residual confirms the model: twenty means that are independent.
-const FREE: f64 = 1.0;
-/// Time in which a plausible residual shows that a contact has ended.
+/// Time in which a plausible residual confirms the model \[s\]: some ten independent means.
+const CONFIRMED: f64 = 1.0;
+/// Time in which a plausible residual shows that a contact has ended \[s\].
 const GONE: f64 = 2.0;
 /// Rounding error of the variances computed in single precision, relative.
 const ROUNDING_SHARE: f64 = 1e-6;
@@ -100,12 +113,12 @@ struct SubtreeState {
     mean: Option<Mean>,
     /// What the residual may be instead of a contact.
     steps: Vec<OffsetStep>,
-    /// When it was last tested, and for how long the residual was plausible without a contact
-    /// \[s\].
+    /// When it was last tested.
     tested: Nanos,
-    free: f64,
-    /// For how long it has been so without a break.
-    lately: f64,
+    /// For how long in all, and how long without a break until now, the residual was plausible
+    /// without a contact \[s\].
+    plausible_in_all: f64,
+    plausible_lately: f64,
     /// The detected contact, or the last one, if it may still be there.
     lingering: Option<usize>,
 }
@@ -120,7 +133,7 @@ struct Mean {
 }
 
 /// The solver's result at one instant.
-pub(super) struct Solved<'a> {
+pub(super) struct SolvedInstant<'a> {
     pub(super) t: Nanos,
     pub(super) structure: &'a Structure,
     pub(super) kinematics: &'a Kinematics,
@@ -136,8 +149,8 @@ impl ResidualMonitor {
             mean: None,
             steps: OffsetStep::of_subtree(structure, number),
             tested: Nanos::MIN,
-            free: 0.0,
-            lately: 0.0,
+            plausible_in_all: 0.0,
+            plausible_lately: 0.0,
             lingering: None,
         };
         Self {
@@ -166,7 +179,7 @@ impl ResidualMonitor {
     /// whose model has been confirmed without it.
     pub(super) fn touched(&self, structure: &Structure) -> SensorSet {
         self.sensors_where(structure, |state| {
-            state.lingering.is_some() && state.free >= FREE
+            state.lingering.is_some() && state.plausible_in_all >= CONFIRMED
         })
     }
 
@@ -208,7 +221,7 @@ impl ResidualMonitor {
     /// F/T noise, `P + M`; none where the sub-tree has a fault. Does not allocate.
     pub(super) fn update(
         &mut self,
-        solved: &Solved<'_>,
+        solved: &SolvedInstant<'_>,
         covariance: impl Fn(usize) -> Option<Matrix6<f64>>,
     ) {
         let Self { subtrees, least } = self;
@@ -216,17 +229,18 @@ impl ResidualMonitor {
             let before = state.residual.contact;
             state.residual = SubtreeResidual::NOTHING;
             let subtree = &solved.structure.subtrees()[number];
-            let is_free =
+            let leaves_equations =
                 |contact: usize| solved.structure.contacts()[contact].kind != ContactKind::Wrench;
             let known = subtree.contacts.intersection(solved.known);
-            let model_covariance = if subtree.sensors.is_empty() || !known.iter().all(is_free) {
-                None
-            } else {
-                covariance(number)
-            };
+            let model_covariance =
+                if subtree.sensors.is_empty() || !known.iter().all(leaves_equations) {
+                    None
+                } else {
+                    covariance(number)
+                };
             let Some(model_covariance) = model_covariance else {
                 // A contact that was there may still be there after the fault.
-                (state.mean, state.lately) = (None, 0.0);
+                (state.mean, state.plausible_lately) = (None, 0.0);
                 if !known.is_empty() {
                     state.lingering = None;
                 }
@@ -267,19 +281,22 @@ impl ResidualMonitor {
                 .saturating_sub(std::mem::replace(&mut state.tested, solved.t));
             if state.residual.significance <= PLAUSIBLE {
                 let since = since.min(TIME_CONSTANT).seconds();
-                (state.free, state.lately) = (state.free + since, state.lately + since);
+                (state.plausible_in_all, state.plausible_lately) = (
+                    state.plausible_in_all + since,
+                    state.plausible_lately + since,
+                );
             } else {
-                state.lately = 0.0;
+                state.plausible_lately = 0.0;
             }
             if state.residual.contact.is_some() {
                 state.lingering = state.residual.contact;
             } else if state.residual.is_unexplained
-                || state.lately > GONE
+                || state.plausible_lately > GONE
                 || known != ContactSet::EMPTY
             {
                 state.lingering = None;
             }
-            state.residual.is_unconfirmed = is_disturbed && state.free < FREE;
+            state.residual.is_unconfirmed = is_disturbed && state.plausible_in_all < CONFIRMED;
         }
     }
 
@@ -294,7 +311,7 @@ impl ResidualMonitor {
     pub(super) fn reset(&mut self) {
         for subtree in &mut self.subtrees {
             (subtree.residual, subtree.mean) = (SubtreeResidual::NOTHING, None);
-            subtree.lately = 0.0;
+            subtree.plausible_lately = 0.0;
             subtree.steps.iter_mut().for_each(OffsetStep::end);
         }
     }
@@ -320,7 +337,7 @@ impl Mean {
 
 /// The test of one sub-tree at one instant.
 struct SubtreeTest<'a> {
-    solved: &'a Solved<'a>,
+    solved: &'a SolvedInstant<'a>,
     number: usize,
     known: ContactSet,
     b: Vector6<f64>,

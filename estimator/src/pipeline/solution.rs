@@ -2,17 +2,13 @@
 //! with their validity.
 
 use super::Pipeline;
-use super::channels::At;
-use super::contacts::Place;
-use super::offset_steps::OffsetStepCover;
-use super::residuals::{self, ResidualMonitor, SubtreeResidual};
-use super::validity::{Dependences, ValidityCheck, first_fault};
-use crate::setup::Setup;
-use crate::uncertainty::{OperatingPoint, Uncertainty};
-use proprio_dynamics::{ContactSet, Dependence, Determinacy, DofSet, SensorSet, Solver, Structure};
-use proprio_identification::online::Doubt;
+use super::inputs::EvaluationPoint;
+use super::residuals::{SolvedInstant, SubtreeResidual};
+use super::validity::{Judge, ValidityCheck, first_fault};
+use crate::uncertainty::OperatingPoint;
+use proprio_dynamics::{ContactSet, DofSet};
 use proprio_identification::robot::ChannelRole;
-use proprio_topics::{ContactWrench, JointTorque, NO_CAUSE, NO_CONTACT, Nanos, Reason, Residual};
+use proprio_topics::{NO_CONTACT, Nanos, Reason, Residual};
 
 impl Pipeline {
     /// Computes the estimate at `t`: evaluates the channels, solves, tests the residuals, solves
@@ -22,7 +18,7 @@ impl Pipeline {
         self.contacts
             .place(&mut self.structure, &self.setup.robot.always, t);
         let base = self.place_base(&known);
-        let at = At {
+        let at = EvaluationPoint {
             t,
             until: self.until(t),
             setup: &self.setup,
@@ -112,7 +108,7 @@ impl Pipeline {
                 self.unwatched.push((unwatched, reason, cause));
             }
         }
-        let solved = residuals::Solved {
+        let solved = SolvedInstant {
             t,
             structure,
             kinematics: &self.kinematics,
@@ -192,163 +188,6 @@ impl Pipeline {
             }
         }
         stuck
-    }
-}
-
-/// Says of each result whether it is valid, and if not, why.
-struct Judge<'a> {
-    setup: &'a Setup,
-    structure: &'a Structure,
-    solver: &'a Solver,
-    uncertainty: &'a Uncertainty,
-    residuals: &'a ResidualMonitor,
-    steps: &'a OffsetStepCover,
-    /// Of the contacts.
-    places: &'a [Place],
-    dependences: &'a Dependences,
-    /// What on-line identification has not refuted, by degree of freedom.
-    doubts: Option<&'a [Doubt]>,
-    validity: ValidityCheck<'a>,
-    /// The sensors of the sub-trees whose model has not been confirmed without a contact.
-    unconfirmed: SensorSet,
-    /// The joints whose encoders may be stuck.
-    stuck: DofSet,
-    is_solved: bool,
-}
-
-impl Judge<'_> {
-    /// Why the residual of a link's sub-tree speaks against what acts on the link.
-    fn doubt(&self, link: usize) -> Option<Reason> {
-        let structure = self.structure;
-        let number = structure.subtree_of(link)?;
-        let sensors = structure.subtrees().get(number)?.sensors;
-        let residual = self.residuals.subtrees().nth(number)?;
-        if residual.is_unexplained {
-            return Some(Reason::Unexplained);
-        }
-        // What a wrong offset does to one sub-tree, it does to the other one at that sensor.
-        let is_unconfirmed = !sensors.intersection(&self.unconfirmed).is_empty();
-        is_unconfirmed.then_some(Reason::Contradicted)
-    }
-
-    fn doubts(&self, dof: usize) -> Option<&Doubt> {
-        self.doubts?.get(dof)
-    }
-
-    /// The number of the channel with this role, for who reads the estimate.
-    fn channel(&self, role: ChannelRole) -> u32 {
-        let mut channels = self.setup.robot.channels.iter();
-        let number = channels.position(|channel| channel.role == role);
-        number.map_or(NO_CAUSE, |number| u32::try_from(number).unwrap_or(NO_CAUSE))
-    }
-
-    /// Why the torque of a degree of freedom is not valid, and the channel that causes it. The
-    /// deviation does not matter.
-    fn torque_reason(&self, dof: usize) -> (Reason, u32) {
-        let none = Dependence::default();
-        let dependence = self.dependences.torques.get(dof).unwrap_or(&none);
-        let (reason, cause) = self.validity.reason_and_cause(dependence);
-        if reason != Reason::None {
-            return (reason, cause);
-        }
-        if self.solver.torque_certainty().get(dof) == Some(&Determinacy::Assumed) {
-            return (Reason::Undetermined, cause);
-        }
-        if let Some(leading) = self.doubts(dof).and_then(|doubt| doubt.leading.as_ref()) {
-            let channel = leading.role().map_or(NO_CAUSE, |role| self.channel(role));
-            return (Reason::Contradicted, channel);
-        }
-        let mut moved = self.structure.moved_by(dof).iter();
-        if let Some(reason) = moved.find_map(|link| self.doubt(*link)) {
-            return (reason, cause);
-        }
-        match dependence.dofs.intersection(&self.stuck).iter().next() {
-            Some(stuck) => (Reason::Frozen, self.channel(ChannelRole::Joint(stuck))),
-            None => (Reason::None, cause),
-        }
-    }
-
-    fn torque(&self, dof: usize) -> JointTorque {
-        let least = self.doubts(dof).map_or(0.0, |doubt| doubt.deviation);
-        let step = self.steps.torque().get(dof).copied().unwrap_or(0.0);
-        let std = self.uncertainty.torque_std(self.solver, dof);
-        let deviation = std.max(least).max(step);
-        let bound = self.setup.max_deviation.get(dof);
-        let (mut reason, mut cause) = self.torque_reason(dof);
-        let is_uncertain = bound.is_some_and(|most| deviation > *most) || least.is_infinite();
-        if reason == Reason::None && is_uncertain {
-            reason = Reason::Uncertain;
-        }
-        let torque = self.solver.torque().get(dof).copied();
-        let torque = torque.filter(|x| self.is_solved && x.is_finite() && !std.is_nan());
-        if torque.is_none() {
-            (reason, cause) = (Reason::NotFinite, NO_CAUSE);
-        }
-        let is_valid = reason == Reason::None;
-        // What is published keeps the bound, however it came about.
-        debug_assert!(
-            !is_valid || bound.is_none_or(|most| deviation <= *most),
-            "joint {dof} is valid, with a deviation of {deviation} Nm"
-        );
-        // Of an uncertain torque the deviation is the reason.
-        let has_deviation = is_valid || reason == Reason::Uncertain;
-        JointTorque {
-            torque: torque.filter(|_| is_valid).unwrap_or(f64::NAN),
-            standard_deviation: if has_deviation { deviation } else { f64::NAN },
-            valid: u32::from(is_valid),
-            reason: reason.in_memory(),
-            cause,
-            reserved: 0,
-        }
-    }
-
-    /// `active` are the contacts that are known to be present.
-    fn contact(&self, contact: usize, active: &ContactSet) -> ContactWrench {
-        let (Some(result), Some(dependence), Some(at)) = (
-            self.solver.contacts().get(contact),
-            self.dependences.contacts.get(contact),
-            self.places.get(contact),
-        ) else {
-            return ContactWrench::ABSENT;
-        };
-        let (mut reason, mut cause) = self.validity.reason_and_cause(dependence);
-        let specs = self.structure.contacts();
-        if reason == Reason::None {
-            let link = specs.get(contact).map(|spec| spec.frame.link);
-            reason = link.and_then(|link| self.doubt(link)).unwrap_or_default();
-        }
-        let is_detected = self.validity.detected.contains(contact);
-        // One that may still be there is not reported.
-        let is_known = is_detected || active.contains(contact);
-        match result.certainty {
-            _ if !is_known => (reason, cause) = (Reason::Absent, NO_CAUSE),
-            Determinacy::Absent => (reason, cause) = (Reason::Absent, NO_CAUSE),
-            Determinacy::Assumed if reason == Reason::None => reason = Reason::Undetermined,
-            _ => {}
-        }
-        let wrench = result.wrench.force_first();
-        let deviation = self.uncertainty.contact_std(self.solver, contact);
-        let deviation: [f64; 6] =
-            std::array::from_fn(|i| deviation[i].max(self.steps.contact(contact, wrench[i])));
-        let is_finite = result.wrench.is_finite() && deviation.iter().all(|x| x.is_finite());
-        if !self.is_solved || !is_finite {
-            (reason, cause) = (Reason::NotFinite, NO_CAUSE);
-        }
-        let is_valid = reason == Reason::None;
-        let unless_withheld = |values| if is_valid { values } else { [f64::NAN; 6] };
-        let [fx, fy, fz, tx, ty, tz] = unless_withheld(wrench);
-        ContactWrench {
-            force: [fx, fy, fz],
-            torque: [tx, ty, tz],
-            standard_deviation: unless_withheld(deviation),
-            valid: u32::from(is_valid),
-            reason: reason.in_memory(),
-            cause,
-            detected: u32::from(is_detected),
-            position: at.position.into(),
-            located: u32::from(at.is_located),
-            reserved: 0,
-        }
     }
 }
 

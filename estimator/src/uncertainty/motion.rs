@@ -62,6 +62,17 @@ pub(crate) struct OperatingPoint<'a> {
     pub(crate) solver: &'a Solver,
 }
 
+/// Standard deviations of a joint's measured state beside its encoder's offset.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct JointStd {
+    /// Of the acceleration \[rad/s^2 or m/s^2\].
+    pub(crate) acceleration: f64,
+    /// Of a sample of the position \[rad or m\].
+    pub(crate) noise: f64,
+    /// What extrapolation adds to that.
+    pub(crate) extrapolation: f64,
+}
+
 /// Adds the squares of each column's first numbers, times its sigma.
 struct AddSquares<'a> {
     columns: &'a [f64],
@@ -153,9 +164,13 @@ impl MotionErrors {
         })
     }
 
-    /// Sets the standard deviations of a joint's acceleration, and of its position beside the
-    /// encoder's offset.
-    pub(super) fn set_joint(&mut self, dof: usize, acceleration: f64, [a, b]: [f64; 2]) {
+    /// Sets how uncertain a joint's measured state is.
+    pub(super) fn set_joint(&mut self, dof: usize, deviations: JointStd) {
+        let JointStd {
+            acceleration,
+            noise,
+            extrapolation,
+        } = deviations;
         let (accelerations, rest) = self.sigma.split_at_mut(self.dofs);
         if let (Some(to), Some(position), Some(offset)) = (
             accelerations.get_mut(dof),
@@ -163,7 +178,7 @@ impl MotionErrors {
             self.encoder_offset.get(dof),
         ) {
             *to = acceleration;
-            *position = sum_of_squares([*offset, a, b]).sqrt();
+            *position = sum_of_squares([*offset, noise, extrapolation]).sqrt();
         }
     }
 

@@ -84,6 +84,15 @@ impl Reason {
             Self::None
         }
     }
+
+    /// This reason, or `other` if there is none.
+    #[must_use]
+    pub const fn or(self, other: Self) -> Self {
+        match self {
+            Self::None => other,
+            reason => reason,
+        }
+    }
 }
 
 /// `JointTorque::cause` and `ContactWrench::cause` if no single channel is the cause.

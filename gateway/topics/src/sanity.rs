@@ -190,6 +190,10 @@ impl<const N: usize> Repeats<N> {
     }
 }
 
+/// The longest run of equal readings that may be one measurement, sent several times: some boards
+/// send faster than they measure.
+pub const LONGEST_COPIES: u32 = 16;
+
 /// How far a reading may be from where those before it lead: so many times the largest such
 /// distance of about the last [`MEMORY`] readings. That of white noise exceeds it never: the
 /// largest of 32 is two deviations, and ten are left.

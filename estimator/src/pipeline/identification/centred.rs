@@ -84,6 +84,13 @@ impl Default for Centred {
     }
 }
 
+/// A value or derivative of a signal, and its standard error.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Estimated {
+    pub(crate) value: f64,
+    pub(crate) error: f64,
+}
+
 /// Fewest samples for a derivative.
 pub(crate) const MIN_SAMPLES: usize = 5;
 
@@ -244,21 +251,25 @@ impl Centred {
 
     /// A signal in the middle: value, first and second derivative, each with its standard error.
     ///
-    /// `statistics` are those of the signal. `by` selects the window: the standard deviation of the
-    /// samples, NaN if it is not known, and the order of the derivative that matters. The standard
+    /// `statistics` are those of the signal. Two arguments select the window: the standard deviation
+    /// of the samples, NaN if it is not known, and the order of the derivative that matters. The standard
     /// errors use the noise at rest, because in motion a polynomial's residual is not noise alone.
     /// They are zero before the first instant at rest.
     pub(crate) fn fit(
         &self,
         number: usize,
         statistics: &mut SignalStatistics,
-        by: (f64, usize),
-    ) -> [(f64, f64); 3] {
-        const NONE: (f64, f64) = (f64::NAN, 0.0);
+        sample_std: f64,
+        order: usize,
+    ) -> [Estimated; 3] {
+        const NONE: Estimated = Estimated {
+            value: f64::NAN,
+            error: 0.0,
+        };
         if self.count < MIN_SAMPLES || number >= self.signals.len() {
             return [NONE; 3];
         }
-        let sigma = by.0 / (self.share as f64).sqrt();
+        let sigma = sample_std / (self.share as f64).sqrt();
         let signal = &self.signals[number];
         let [rest, short, middle, wide] = Arch::new().dispatch(Fits {
             bases: &self.bases,
@@ -276,42 +287,31 @@ impl Centred {
         };
         let moving = statistics.choose(
             [short, middle, wide.filter(|_| short.is_some())],
-            (sigma, by.1),
+            (sigma, order),
         );
         let chosen = if is_quiet { rest } else { moving.or(rest) };
         if let (true, Some(rest)) = (is_quiet, &rest) {
-            let weight = if statistics.rest_variance.is_nan() {
-                1.0
-            } else {
-                REST_WEIGHT
+            let mean = &mut statistics.rest_variance;
+            *mean = match mean.is_nan() {
+                true => rest.variance,
+                false => *mean + REST_WEIGHT * (rest.variance - *mean),
             };
-            statistics.rest_variance = if statistics.rest_variance.is_nan() {
-                0.0
-            } else {
-                statistics.rest_variance
-            };
-            statistics.rest_variance += weight * (rest.variance - statistics.rest_variance);
         }
-        let deviation = if statistics.rest_variance.is_nan() {
-            0.0
-        } else {
-            statistics.rest_variance.sqrt()
-        };
+        let point_std = statistics.rest_variance.max(0.0).sqrt();
         chosen.map_or([NONE; 3], |fit| {
-            std::array::from_fn(|i| (fit.at[i], fit.errors[i] * deviation))
+            std::array::from_fn(|i| Estimated {
+                value: fit.at[i],
+                error: fit.errors[i] * point_std,
+            })
         })
     }
 
     /// Standard deviation of a signal's samples as found at rest, updated with these;
     /// `statistics` as for [`Centred::fit`].
-    pub(crate) fn deviation(&self, number: usize, statistics: &mut SignalStatistics) -> f64 {
-        self.fit(number, statistics, (f64::NAN, 0));
+    pub(crate) fn sample_std(&self, number: usize, statistics: &mut SignalStatistics) -> f64 {
+        self.fit(number, statistics, f64::NAN, 0);
         // The polynomial was fitted to means of this many samples.
-        if statistics.rest_variance.is_nan() {
-            0.0
-        } else {
-            (statistics.rest_variance * self.share as f64).sqrt()
-        }
+        (statistics.rest_variance.max(0.0) * self.share as f64).sqrt()
     }
 }
 

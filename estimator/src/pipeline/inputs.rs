@@ -1,13 +1,13 @@
 //! What every channel says at an instant: measured, interpolated, differentiated or extrapolated;
 //! of an F/T sensor, corrected for calibration, temperature and offset.
 
-use super::buffers::{ChannelBuffer, OrReason, stale, temperature_at};
+use super::buffers::{ChannelBuffer, stale, temperature_at};
 use super::prediction::{Extrapolated, Predictor};
 use crate::differentiate::{Grid, Unavailable, Window};
 use crate::history::{ChannelValue, History};
 use crate::inertial::InertialState;
 use crate::setup::Setup;
-use crate::uncertainty::Uncertainty;
+use crate::uncertainty::{JointStd, Uncertainty};
 use proprio_dynamics::spatial::{Pose, Vec3, Wrench};
 use proprio_dynamics::{FrameMotion, JointState};
 use proprio_identification::robot::{BaseMotion, ChannelRole};
@@ -34,7 +34,7 @@ pub(super) struct Inputs {
 }
 
 /// The instant that the channels are evaluated at, and what is known besides the samples.
-pub(super) struct At<'a> {
+pub(super) struct EvaluationPoint<'a> {
     pub(super) t: Nanos,
     /// The last stamp whose samples may be used.
     pub(super) until: Nanos,
@@ -77,7 +77,7 @@ impl Inputs {
     /// the motion of the base link unless an IMU measures it.
     pub(super) fn evaluate(
         &mut self,
-        mut at: At<'_>,
+        mut at: EvaluationPoint<'_>,
         buffers: &[ChannelBuffer],
         base: FrameMotion,
     ) {
@@ -107,17 +107,21 @@ impl Inputs {
     /// Evaluates a joint. Returns why its state is not valid; none without a sample.
     fn joint(
         &mut self,
-        at: &mut At<'_>,
+        at: &mut EvaluationPoint<'_>,
         dof: usize,
         history: &History<3>,
         window: &Window<1>,
     ) -> Option<Reason> {
         let sample = history.at(at.t, at.until)?;
-        let (state, [acceleration_std, position_std], reason) =
+        let (state, [acceleration, extrapolation], reason) =
             joint_at(at, &sample, window, &mut self.grid);
         let [noise] = window.noise(at.t);
-        at.uncertainty
-            .set_joint(dof, acceleration_std, [noise, position_std]);
+        let deviations = JointStd {
+            acceleration,
+            noise,
+            extrapolation,
+        };
+        at.uncertainty.set_joint(dof, deviations);
         for (all, own) in [
             &mut self.position,
             &mut self.velocity,
@@ -140,7 +144,7 @@ impl Inputs {
     /// sample.
     fn wrench(
         &mut self,
-        at: &mut At<'_>,
+        at: &mut EvaluationPoint<'_>,
         sensor: usize,
         history: &History<6>,
         temperatures: &History<1>,
@@ -190,7 +194,7 @@ impl Inputs {
     /// Evaluates the IMU. Returns why its motion is not valid; none without a sample.
     fn imu(
         &mut self,
-        at: &mut At<'_>,
+        at: &mut EvaluationPoint<'_>,
         history: &History<9>,
         window: &Window<3>,
         predictor: &Option<Predictor<3>>,
@@ -219,7 +223,7 @@ impl Inputs {
 /// Position, velocity and acceleration of a joint, the standard deviations of the acceleration and
 /// of an extrapolated position, and why they are not valid.
 fn joint_at(
-    at: &At<'_>,
+    at: &EvaluationPoint<'_>,
     held: &ChannelValue<3>,
     window: &Window<1>,
     grid: &mut Grid,
@@ -263,7 +267,7 @@ fn joint_at(
 /// Motion of the IMU, standard deviations of its angular acceleration, and why the motion is not
 /// valid.
 fn imu_at(
-    at: &At<'_>,
+    at: &EvaluationPoint<'_>,
     held: &ChannelValue<9>,
     window: &Window<3>,
     grid: &mut Grid,
