@@ -95,15 +95,7 @@ fn an_arm_that_stands_still_learns_nothing_of_its_masses() {
     };
     place.write("still.log", &session(10.0, &settings));
     place
-        .run(&[
-            "decode",
-            "--config",
-            "gateway.toml",
-            "--log",
-            "still.log",
-            "--out",
-            "still.csv",
-        ])
+        .line("decode --config gateway.toml --log still.log --out still.csv")
         .good();
     let hand = "link = \"l_hand\"\n";
     place.change(
@@ -118,15 +110,7 @@ fn an_arm_that_stands_still_learns_nothing_of_its_masses() {
         ],
     );
     place
-        .run(&[
-            "estimate",
-            "--config",
-            "learning.toml",
-            "--log",
-            "still.csv",
-            "--out",
-            "e.csv",
-        ])
+        .line("estimate --config learning.toml --log still.csv --out e.csv")
         .good();
     let estimates = table(&place.read("e.csv"));
     let at = |column: &str, t: f64| {

@@ -33,9 +33,9 @@ fn estimates_from_files_are_those_of_other_libraries() {
         for config in ["imu.toml", "fixed.toml"] {
             place.write("log.csv", &text);
             let report = place
-                .run(&[
-                    "estimate", "--config", config, "--log", "log.csv", "--out", "e.csv", "--json",
-                ])
+                .line(&format!(
+                    "estimate --config {config} --log log.csv --out e.csv --json"
+                ))
                 .good()
                 .json();
             assert_eq!(
@@ -125,7 +125,7 @@ fn identified_parameters_take_the_place_of_the_urdfs() {
         )],
     );
     let check = place
-        .run(&["estimator", "--config", "named.toml", "--check"])
+        .line("estimator --config named.toml --check")
         .good()
         .out;
     assert!(
@@ -137,7 +137,7 @@ fn identified_parameters_take_the_place_of_the_urdfs() {
         "{check}"
     );
     let check = place
-        .run(&["estimator", "--config", "estimator.toml", "--check"])
+        .line("estimator --config estimator.toml --check")
         .good()
         .out;
     assert!(
@@ -145,15 +145,7 @@ fn identified_parameters_take_the_place_of_the_urdfs() {
         "{check}"
     );
     place
-        .run(&[
-            "estimate",
-            "--config",
-            "named.toml",
-            "--log",
-            "log.csv",
-            "--out",
-            "named.csv",
-        ])
+        .line("estimate --config named.toml --log log.csv --out named.csv")
         .good();
     assert!(
         place.read("named.csv") == place.read("e.csv"),
@@ -171,7 +163,7 @@ fn a_second_gateway_or_estimator_is_refused_by_the_first_ones_number() {
         until(PATIENCE, || first.log().contains("running").then_some(()))
             .unwrap_or_else(|| panic!("{verb}: {}", first.log()));
         let number = format!("process {}", first.id());
-        place.run(&[verb, "--config", config]).fails(
+        place.line(&format!("{verb} --config {config}")).fails(
             1,
             &[&number, "only one gateway and one estimator per robot"],
         );
@@ -228,16 +220,7 @@ fn a_second_gateway_or_estimator_is_refused_by_the_first_ones_number() {
 fn the_simulator_tells_what_it_did_as_json() {
     let place = Place::new();
     let ran = place
-        .run(&[
-            "simulate",
-            "--seconds",
-            "0.5",
-            "--truth",
-            "truth.csv",
-            "--fault",
-            "lost:0.1",
-            "--json",
-        ])
+        .line("simulate --seconds 0.5 --truth truth.csv --fault lost:0.1 --json")
         .good();
     let summary = ran.json();
     let push = "link l_hand is pushed at contact hand with up to 10 N and 0.3 Nm, from 0.2 s to \
@@ -259,7 +242,7 @@ fn the_simulator_tells_what_it_did_as_json() {
     process.end();
     let log = process.log();
     assert!(log.contains("from 8 s to 12 s of every 20 s"), "{log}");
-    let calm = place.run(&["simulate", "--seconds", "0.2", "--no-push"]);
+    let calm = place.line("simulate --seconds 0.2 --no-push");
     let calm = calm.good();
     assert!(!calm.err.contains("pushed"), "{}", calm.err);
     assert!(

@@ -57,17 +57,7 @@ fn a_mixed_bus_on_the_screen_of_candump_decodes() {
     .concat();
     place.write("gateway.toml", &config);
     let report = place
-        .run(&[
-            "decode",
-            "--config",
-            "gateway.toml",
-            "--log",
-            "screen.log",
-            "--out",
-            "s.csv",
-            "--all",
-            "--json",
-        ])
+        .line("decode --config gateway.toml --log screen.log --out s.csv --all --json")
         .good()
         .json();
     for device in report["devices"].as_array().unwrap() {

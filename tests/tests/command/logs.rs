@@ -121,15 +121,7 @@ fn faults_and_gaps_of_a_log_are_in_its_table_of_samples() {
     assert!(faults > 3 && gaps == 1, "{faults} faults, {gaps} gaps");
     place.write("faults.log", &(lines.join("\n") + "\n"));
     place
-        .run(&[
-            "decode",
-            "--config",
-            "gateway.toml",
-            "--log",
-            "faults.log",
-            "--out",
-            "samples.csv",
-        ])
+        .line("decode --config gateway.toml --log faults.log --out samples.csv")
         .good();
     let samples = table(&place.read("samples.csv"));
     let since = |row: usize| samples["t"][row] - T0.seconds();
@@ -231,15 +223,9 @@ fn stamps_that_go_backwards_are_counted_and_take_nothing_else_with_them() {
     place.write("bad.log", &(lines.join("\n") + "\n"));
     let decode = |log: &str, out: &str| {
         place
-            .run(&[
-                "decode",
-                "--config",
-                "gateway.toml",
-                "--log",
-                log,
-                "--out",
-                out,
-            ])
+            .line(&format!(
+                "decode --config gateway.toml --log {log} --out {out}"
+            ))
             .good()
     };
     decode("good.log", "good.csv");
@@ -340,30 +326,18 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
     let there = names(&place);
     for out in ["new.csv", "keep.csv"] {
         let decode = |log: &str| {
-            place.run(&[
-                "decode",
-                "--config",
-                "gateway.toml",
-                "--log",
-                log,
-                "--out",
-                out,
-            ])
+            place.line(&format!(
+                "decode --config gateway.toml --log {log} --out {out}"
+            ))
         };
         decode("none").fails(1, &["none: cannot be read", "No such file"]);
         decode("empty").fails(1, &["empty: the log holds no frame", "it is empty"]);
         decode("text").fails(1, &["text: the log holds no frame", "line 1"]);
         decode("noise").fails(1, &["noise: the log holds no frame"]);
         let estimate = |log: &str| {
-            place.run(&[
-                "estimate",
-                "--config",
-                "estimator.toml",
-                "--log",
-                log,
-                "--out",
-                out,
-            ])
+            place.line(&format!(
+                "estimate --config estimator.toml --log {log} --out {out}"
+            ))
         };
         estimate("none").fails(1, &["none: cannot be read", "No such file"]);
         estimate("empty").fails(1, &["empty: ", "must name the columns"]);
@@ -385,15 +359,9 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
         estimate("header.csv").fails(2, &["header.csv", "no column for"]);
         estimate("rest.csv").fails(1, &["rest.csv: the trigger channel", "no estimate"]);
         let encode = |log: &str| {
-            place.run(&[
-                "encode",
-                "--config",
-                "gateway.toml",
-                "--samples",
-                log,
-                "--out",
-                out,
-            ])
+            place.line(&format!(
+                "encode --config gateway.toml --samples {log} --out {out}"
+            ))
         };
         encode("none").fails(1, &["none: cannot be read", "No such file"]);
         encode("empty").fails(1, &["empty: ", "must name the columns"]);
@@ -403,26 +371,10 @@ fn what_is_no_log_at_all_is_told_and_leaves_no_file() {
         assert_eq!(place.read("keep.csv"), "precious");
     }
     place
-        .run(&[
-            "decode",
-            "--config",
-            "gateway.toml",
-            "--log",
-            "other.log",
-            "--out",
-            "new.csv",
-        ])
+        .line("decode --config gateway.toml --log other.log --out new.csv")
         .fails(1, &["other.log: no sample in 2 frames", "interfaces"]);
     place
-        .run(&[
-            "decode",
-            "--config",
-            "gateway.toml",
-            "--log",
-            "text",
-            "--out",
-            "no/such/folder.csv",
-        ])
+        .line("decode --config gateway.toml --log text --out no/such/folder.csv")
         .fails(
             1,
             &["no/such/folder.csv: cannot be written", "No such file"],
@@ -487,16 +439,7 @@ fn encode_and_decode_are_inverses_within_half_a_step() {
     let samples = oracle("icub_left_arm_mujoco.csv");
     place.write("samples.csv", &samples);
     let report = place
-        .run(&[
-            "encode",
-            "--config",
-            "gateway.toml",
-            "--samples",
-            "samples.csv",
-            "--out",
-            "session.log",
-            "--json",
-        ])
+        .line("encode --config gateway.toml --samples samples.csv --out session.log --json")
         .good()
         .json();
     assert_eq!(
@@ -534,15 +477,7 @@ fn encode_and_decode_are_inverses_within_half_a_step() {
     assert_eq!(compared, 201 * (1 + 14 + 6 + 6));
     // Quantised values do not change any more: the log is equal bit for bit.
     place
-        .run(&[
-            "encode",
-            "--config",
-            "gateway.toml",
-            "--samples",
-            "again.csv",
-            "--out",
-            "again.log",
-        ])
+        .line("encode --config gateway.toml --samples again.csv --out again.log")
         .good();
     // (Frames of one instant are in the order of the table's columns.)
     let sorted = |name: &str| {
@@ -559,15 +494,7 @@ fn encode_and_decode_are_inverses_within_half_a_step() {
     // Input and output may be the same file, and the output is readable for all users.
     place.write("same", &samples);
     place
-        .run(&[
-            "encode",
-            "--config",
-            "gateway.toml",
-            "--samples",
-            "same",
-            "--out",
-            "same",
-        ])
+        .line("encode --config gateway.toml --samples same --out same")
         .good();
     assert_same(&place.read("same"), &place.read("session.log"), "in place");
     assert_eq!(
@@ -643,37 +570,13 @@ fn standard_input_and_output_serve_as_files() {
     // The same result as with files.
     place.write("samples.csv", &samples);
     place
-        .run(&[
-            "encode",
-            "--config",
-            "gateway.toml",
-            "--samples",
-            "samples.csv",
-            "--out",
-            "a.log",
-        ])
+        .line("encode --config gateway.toml --samples samples.csv --out a.log")
         .good();
     place
-        .run(&[
-            "decode",
-            "--config",
-            "gateway.toml",
-            "--log",
-            "a.log",
-            "--out",
-            "a.csv",
-        ])
+        .line("decode --config gateway.toml --log a.log --out a.csv")
         .good();
     place
-        .run(&[
-            "estimate",
-            "--config",
-            "estimator.toml",
-            "--log",
-            "a.csv",
-            "--out",
-            "e.csv",
-        ])
+        .line("estimate --config estimator.toml --log a.csv --out e.csv")
         .good();
     assert_eq!(
         (
@@ -685,15 +588,7 @@ fn standard_input_and_output_serve_as_files() {
     );
     let before = place.names();
     place
-        .run(&[
-            "decode",
-            "--config",
-            "gateway.toml",
-            "--log",
-            "a.log",
-            "--out",
-            "/dev/null",
-        ])
+        .line("decode --config gateway.toml --log a.log --out /dev/null")
         .good();
     assert_eq!(place.names(), before);
     assert!(

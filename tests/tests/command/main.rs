@@ -179,6 +179,11 @@ impl Place {
         finish(self.command(args), b"", &args.join(" "))
     }
 
+    /// Runs `proprio` with these words, which spaces separate, until it ends.
+    fn line(&self, words: &str) -> Ran {
+        self.run(&words.split_whitespace().collect::<Vec<_>>())
+    }
+
     /// Runs `proprio` until it ends, with `input` as its standard input.
     fn run_with(&self, args: &[&str], input: &[u8]) -> Ran {
         finish(self.command(args), input, &args.join(" "))
@@ -294,7 +299,7 @@ fn session(seconds: f64, settings: &SimulationSettings) -> String {
 #[test]
 fn every_verb_has_help() {
     let place = Place::new();
-    let help = place.run(&["--help"]).good();
+    let help = place.line("--help").good();
     let listed: Vec<&str> = help
         .out
         .lines()
@@ -323,10 +328,10 @@ fn every_verb_has_help() {
                 "is not installed",
                 &format!("cargo install --path bridge/{verb}"),
             ];
-            place.run(&[verb, "--help"]).fails(1, &expected);
+            place.line(&format!("{verb} --help")).fails(1, &expected);
             continue;
         }
-        let help = place.run(&[verb, "--help"]).good();
+        let help = place.line(&format!("{verb} --help")).good();
         assert!(
             help.out.contains(&format!("Usage: proprio {verb}")),
             "{}",
@@ -335,7 +340,7 @@ fn every_verb_has_help() {
         assert!(help.err.is_empty(), "{}", help.err);
         assert!(
             place
-                .run(&["help", verb])
+                .line(&format!("help {verb}"))
                 .good()
                 .out
                 .contains("Usage: proprio")
@@ -354,10 +359,10 @@ fn every_verb_has_help() {
             assert!(parts >= 2, "{verb}: {option:?} says nothing");
         }
     }
-    assert!(place.run(&["--version"]).good().out.starts_with("proprio "));
-    let page = place.run(&["help", "unexplained"]).good();
+    assert!(place.line("--version").good().out.starts_with("proprio "));
+    let page = place.line("help unexplained").good();
     assert!(page.out.starts_with("## `unexplained`\n"), "{}", page.out);
-    let script = place.run(&["completions", "bash"]).good();
+    let script = place.line("completions bash").good();
     assert!(script.out.contains("identify"));
 }
 

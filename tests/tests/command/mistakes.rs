@@ -31,29 +31,29 @@ fn typing_mistakes_end_with_2_and_say_what_was_meant() {
             ran.err
         );
     }
-    assert_eq!(place.run(&[]).code, Some(2));
+    assert_eq!(place.line("").code, Some(2));
     place
-        .run(&["simulate", "--robot", "nobody"])
+        .line("simulate --robot nobody")
         .fails(2, &["there is no robot \"nobody\"", "no gateway.toml in"]);
     place
-        .run(&["simulate", "--seconds", "0"])
+        .line("simulate --seconds 0")
         .fails(2, &["seconds = 0 must be above 0"]);
     place
-        .run(&["simulate", "--bus", "udp:x"])
+        .line("simulate --bus udp:x")
         .fails(2, &["\"udp:x\"", "virtual:left_arm"]);
     for verb in ["simulate", "demo"] {
         place
-            .run(&[verb, "--fault", "lots"])
+            .line(&format!("{verb} --fault lots"))
             .fails(2, &["fault \"lots\"", "lost", "for example"]);
         place
-            .run(&[verb, "--fault", "silent:nose@1..2"])
+            .line(&format!("{verb} --fault silent:nose@1..2"))
             .fails(2, &["no board or channel \"nose\"", "l_arm_ft_sensor"]);
     }
     place
-        .run(&["demo", "--seconds", "3", "--fault", "push:l_hand=20@4..5"])
+        .line("demo --seconds 3 --fault push:l_hand=20@4..5")
         .fails(2, &["push:l_hand=20@4..5", "after the end", "3 s"]);
     place
-        .run(&["demo", "--robot", "nobody"])
+        .line("demo --robot nobody")
         .fails(2, &["there is no robot \"nobody\""]);
     assert!(
         !place.exists("proprio-demo"),
@@ -140,31 +140,23 @@ fn a_wrong_gateway_toml_is_told_with_file_place_and_what_would_be_legal() {
     ] {
         place.change("gateway.toml", "wrong.toml", &[(from, to)]);
         place
-            .run(&["gateway", "--config", "wrong.toml"])
+            .line("gateway --config wrong.toml")
             .fails_in("wrong.toml", expected);
         if !to.contains("fast") {
             place
-                .run(&["gateway", "--config", "wrong.toml", "--check"])
+                .line("gateway --config wrong.toml --check")
                 .fails_in("wrong.toml", expected);
             place
-                .run(&[
-                    "decode",
-                    "--config",
-                    "wrong.toml",
-                    "--log",
-                    "-",
-                    "--out",
-                    "o.csv",
-                ])
+                .line("decode --config wrong.toml --log - --out o.csv")
                 .fails_in("wrong.toml", expected);
         }
     }
     place
-        .run(&["gateway", "--config", "none.toml"])
+        .line("gateway --config none.toml")
         .fails(2, &["none.toml: cannot be read", "No such file"]);
     assert!(
         place
-            .run(&["gateway", "--config", "gateway.toml", "--check"])
+            .line("gateway --config gateway.toml --check")
             .good()
             .out
             .contains("l_elbow")
@@ -239,20 +231,12 @@ fn a_wrong_estimator_toml_is_told_with_file_place_and_what_would_be_legal() {
             place.run(args).fails_in("wrong.toml", expected);
         }
         place
-            .run(&[
-                "estimate",
-                "--config",
-                "wrong.toml",
-                "--log",
-                "-",
-                "--out",
-                "o.csv",
-            ])
+            .line("estimate --config wrong.toml --log - --out o.csv")
             .fails_in("wrong.toml", expected);
     }
     assert!(!place.exists("o.csv"));
     let check = place
-        .run(&["estimator", "--config", "estimator.toml", "--check"])
+        .line("estimator --config estimator.toml --check")
         .good()
         .out;
     assert!(
@@ -279,7 +263,7 @@ fn a_wrong_estimator_toml_is_told_with_file_place_and_what_would_be_legal() {
         "hidden.toml",
         &[("[[contact]]\nname = \"stand\"", stand)],
     );
-    let ran = place.run(&["estimator", "--config", "hidden.toml", "--check"]);
+    let ran = place.line("estimator --config hidden.toml --check");
     assert!(ran.out.contains("mass of all links: "), "{}", ran.out);
     ran.fails_in(
         "hidden.toml",
@@ -348,13 +332,7 @@ fn what_the_gateway_does_not_publish_is_told() {
     check("none.toml").fails_in("none.toml", &["cannot be read"]);
     // --gateway requires --check.
     place
-        .run(&[
-            "estimator",
-            "--config",
-            "estimator.toml",
-            "--gateway",
-            "gateway.toml",
-        ])
+        .line("estimator --config estimator.toml --gateway gateway.toml")
         .fails(2, &["--check"]);
 }
 
@@ -431,11 +409,11 @@ fn a_malformed_urdf_is_told_with_its_place() {
     ] {
         assert!(text != urdf, "{expected:?}: the URDF was not changed");
         place.write("wrong.urdf", &text);
-        let ran = place.run(&["estimator", "--config", "wrong.toml", "--check"]);
+        let ran = place.line("estimator --config wrong.toml --check");
         ran.fails_in("wrong.toml", expected);
         assert!(ran.err.contains("wrong.urdf"), "{}", ran.err);
         place
-            .run(&["estimator", "--config", "wrong.toml"])
+            .line("estimator --config wrong.toml")
             .fails_in("wrong.toml", expected);
     }
     assert!(Model::from_urdf(&urdf, &[]).is_ok());
@@ -483,15 +461,7 @@ fn a_joint_that_is_neither_measured_nor_locked_is_told() {
         )],
     );
     place
-        .run(&[
-            "estimate",
-            "--config",
-            "locked.toml",
-            "--log",
-            "cut.csv",
-            "--out",
-            "o.csv",
-        ])
+        .line("estimate --config locked.toml --log cut.csv --out o.csv")
         .good();
     // Two missing channels give one message.
     place.write(
@@ -508,16 +478,8 @@ fn a_joint_that_is_neither_measured_nor_locked_is_told() {
 fn an_interface_that_is_not_there_is_told_and_so_is_a_kernel_without_can() {
     let place = Place::new();
     on_interface(&place, "nocan7");
-    let ran = place.run(&["gateway", "--config", "can.toml"]);
-    let simulate = place.run(&[
-        "simulate",
-        "--bus",
-        "nocan7",
-        "--bus",
-        "nocan8",
-        "--seconds",
-        "1",
-    ]);
+    let ran = place.line("gateway --config can.toml");
+    let simulate = place.line("simulate --bus nocan7 --bus nocan8 --seconds 1");
     // The message recommends the virtual bus and its configuration.
     let expected = if has_can() {
         "there is no interface nocan7"
@@ -548,12 +510,12 @@ fn an_interface_that_is_not_there_is_told_and_so_is_a_kernel_without_can() {
     until(PATIENCE, || gateway.log().contains("running").then_some(()))
         .expect("the gateway runs on a virtual bus");
     gateway.end();
-    let demo = place.run(&["demo", "--bus", "nocan7", "--seconds", "2", "--out", "d"]);
+    let demo = place.line("demo --bus nocan7 --seconds 2 --out d");
     demo.fails(1, &[expected, "gateway"]);
     if has_can() {
         on_interface(&place, "lo");
         place
-            .run(&["gateway", "--config", "can.toml"])
+            .line("gateway --config can.toml")
             .fails(1, &["lo is not a CAN interface"]);
     }
 }
@@ -659,7 +621,7 @@ fn what_may_not_be_done_is_told() {
 #[test]
 fn the_doctor_looks_at_everything() {
     let place = Place::new();
-    let report = place.run(&["doctor", "--json"]).good().json();
+    let report = place.line("doctor --json").good().json();
     let checks: Vec<&str> = report
         .as_array()
         .unwrap()
@@ -694,7 +656,7 @@ fn the_doctor_looks_at_everything() {
         .find(|f| f["check"] == "kernel CAN")
         .unwrap();
     assert_eq!(can["verdict"] == "ok", has_can(), "{can}");
-    let words = place.run(&["doctor"]).good().out;
+    let words = place.line("doctor").good().out;
     assert!(checks.iter().all(|c| words.contains(c)), "{words}");
     // The folder of a domain belongs in memory.
     let verdict = |base: &Path| {
