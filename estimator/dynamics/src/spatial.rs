@@ -135,8 +135,7 @@ mod inertia;
 
 pub use inertia::{Inconsistency, RigidInertia};
 
-use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
-
+use derive_more::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3, Vector6};
 
 /// A vector in three-dimensional space.
@@ -146,7 +145,7 @@ pub type Vec3 = Vector3<f64>;
 pub type Mat3 = Matrix3<f64>;
 
 /// A motion vector: angular and linear part of a twist, or the axis of a joint.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Add, AddAssign, Clone, Copy, Debug, Mul, Neg, PartialEq, Sub)]
 pub struct Motion {
     /// Angular part [rad/s].
     pub angular: Vec3,
@@ -189,61 +188,9 @@ impl Motion {
     }
 }
 
-impl Add for Motion {
-    type Output = Self;
-    #[inline]
-    fn add(self, other: Self) -> Self {
-        Self {
-            angular: self.angular + other.angular,
-            linear: self.linear + other.linear,
-        }
-    }
-}
-
-impl Sub for Motion {
-    type Output = Self;
-    #[inline]
-    fn sub(self, other: Self) -> Self {
-        Self {
-            angular: self.angular - other.angular,
-            linear: self.linear - other.linear,
-        }
-    }
-}
-
-impl AddAssign for Motion {
-    #[inline]
-    fn add_assign(&mut self, other: Self) {
-        self.angular += other.angular;
-        self.linear += other.linear;
-    }
-}
-
-impl Neg for Motion {
-    type Output = Self;
-    #[inline]
-    fn neg(self) -> Self {
-        Self {
-            angular: -self.angular,
-            linear: -self.linear,
-        }
-    }
-}
-
-impl Mul<f64> for Motion {
-    type Output = Self;
-    #[inline]
-    fn mul(self, factor: f64) -> Self {
-        Self {
-            angular: self.angular * factor,
-            linear: self.linear * factor,
-        }
-    }
-}
-
 /// A force vector: torque about a point, and force. The same type holds a momentum (angular about
 /// the point, and linear).
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Add, AddAssign, Clone, Copy, Debug, Mul, Neg, PartialEq, Sub, SubAssign)]
 pub struct Wrench {
     /// Torque about the origin of the frame in use \[Nm\].
     pub torque: Vec3,
@@ -311,66 +258,6 @@ impl Wrench {
         Self {
             torque: self.torque - point.cross(&self.force),
             force: self.force,
-        }
-    }
-}
-
-impl Add for Wrench {
-    type Output = Self;
-    #[inline]
-    fn add(self, other: Self) -> Self {
-        Self {
-            torque: self.torque + other.torque,
-            force: self.force + other.force,
-        }
-    }
-}
-
-impl Sub for Wrench {
-    type Output = Self;
-    #[inline]
-    fn sub(self, other: Self) -> Self {
-        Self {
-            torque: self.torque - other.torque,
-            force: self.force - other.force,
-        }
-    }
-}
-
-impl AddAssign for Wrench {
-    #[inline]
-    fn add_assign(&mut self, other: Self) {
-        self.torque += other.torque;
-        self.force += other.force;
-    }
-}
-
-impl SubAssign for Wrench {
-    #[inline]
-    fn sub_assign(&mut self, other: Self) {
-        self.torque -= other.torque;
-        self.force -= other.force;
-    }
-}
-
-impl Neg for Wrench {
-    type Output = Self;
-    #[inline]
-    fn neg(self) -> Self {
-        Self {
-            torque: -self.torque,
-            force: -self.force,
-        }
-    }
-}
-
-impl Mul<f64> for Wrench {
-    type Output = Self;
-    #[inline]
-    fn mul(self, factor: f64) -> Self {
-        Self {
-            torque: self.torque * factor,
-            force: self.force * factor,
         }
     }
 }
@@ -506,7 +393,7 @@ fn product(a: &Mat3, b: &Mat3) -> Mat3 {
     product
 }
 
-impl Mul for Pose {
+impl std::ops::Mul for Pose {
     type Output = Self;
     /// `x_ac = x_ab * x_bc`.
     #[inline(always)]

@@ -153,7 +153,7 @@ fn distribute(
         for (i, share) in shares.iter().enumerate() {
             if i != main && !nothing(share) {
                 let body = from_pseudo(&(map * share.old.pseudo_inertia() * map.transpose()));
-                rest = rest + scaled(&body, -1.0);
+                rest = rest - body;
                 result[i] = Some(body);
             }
         }
@@ -186,14 +186,6 @@ fn from_pseudo(pseudo: &Matrix4<f64>) -> RigidInertia {
         mass: pseudo[(3, 3)],
         first_moment: pseudo.fixed_view::<3, 1>(0, 3).into_owned(),
         inertia: Mat3::from_diagonal_element(sigma.trace()) - sigma,
-    }
-}
-
-fn scaled(inertia: &RigidInertia, factor: f64) -> RigidInertia {
-    RigidInertia {
-        mass: inertia.mass * factor,
-        first_moment: inertia.first_moment * factor,
-        inertia: inertia.inertia * factor,
     }
 }
 
