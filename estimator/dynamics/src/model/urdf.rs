@@ -13,8 +13,8 @@ mod elements;
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
-use self::elements::{check_expanded, location, numbers, once, part, read_sensors, required};
-use super::xml::{self, Document, ElementRef, XmlError};
+use self::elements::{check_expanded, defect, numbers, once, part, place, read_sensors, required};
+use super::xml::{self, Document, ElementRef};
 use super::{
     AxisKind, Frame, Joint, JointAxis, JointFacts, JointKind, Limits, MeasurementDirection,
     MeasurementFrame, Model, ModelError, POINT, SensorElement, Unread,
@@ -50,36 +50,6 @@ struct UrdfJoint<'d> {
     velocity: Option<f64>,
     /// The joint that it follows, with multiplier and offset.
     mimic: Option<(&'d str, f64, f64)>,
-}
-
-/// Reads and checks a URDF, folds fixed joints and numbers the result.
-pub(super) fn read(text: &str, keep: &[&str]) -> Result<Model, ModelError> {
-    let document = parse(text)?;
-    let robot = robot(&document)?;
-    let mut warnings = Vec::new();
-    let (sensors, unread) = read_sensors(robot, &mut warnings);
-    let (links, numbers) = read_links(robot, &mut warnings)?;
-    let mut joints = read_joints(robot, &numbers, &mut warnings)?;
-    let tree = Tree::build(&links, &joints, &mut warnings)?;
-    check_kept(keep, &joints, &sensors)?;
-    let coordinates = Coordinates::of(&mut joints, &mut warnings)?;
-    Folding {
-        links: &links,
-        joints: &joints,
-        keep: keep.iter().copied().collect(),
-        coordinates,
-    }
-    .fold(
-        &tree,
-        robot.attribute("name").unwrap_or_default().to_owned(),
-        (sensors, unread),
-        warnings,
-    )
-}
-
-/// The XML of a text.
-pub(super) fn parse(text: &str) -> Result<Document<'_>, ModelError> {
-    Document::parse(text).map_err(|XmlError { line, reason }| ModelError::Syntax { line, reason })
 }
 
 /// The `<robot>` of a document.
@@ -121,7 +91,6 @@ fn origin(node: ElementRef<'_>, owner: ElementRef<'_>) -> Result<Pose, ModelErro
 /// The name of a link or a joint, which must be the first of its name.
 fn name<'d>(
     node: ElementRef<'d>,
-    kind: &'static str,
     seen: &mut HashMap<&'d str, usize>,
     nodes: impl Fn(usize) -> ElementRef<'d>,
 ) -> Result<&'d str, ModelError> {
@@ -133,11 +102,12 @@ fn name<'d>(
     )?;
     match seen.insert(name, seen.len()) {
         None => Ok(name),
-        Some(first) => Err(ModelError::Duplicate {
-            location: location(node, node),
-            kind,
-            first: nodes(first).line(),
-        }),
+        Some(first) => {
+            let (kind, first) = (node.name(), nodes(first).line());
+            let what =
+                format_args!("the {kind} on line {first} has the same name; rename one of them");
+            Err(defect(node, node, what))
+        }
     }
 }
 
@@ -148,7 +118,7 @@ fn read_links<'d>(
     let mut links: Vec<UrdfLink<'_>> = Vec::new();
     let mut numbers = HashMap::new();
     for node in robot.children().filter(|node| node.name() == "link") {
-        let name = name(node, "link", &mut numbers, |first| links[first].node)?;
+        let name = name(node, &mut numbers, |first| links[first].node)?;
         let mut link = UrdfLink {
             node,
             name,
@@ -176,9 +146,9 @@ fn read_inertia(
 ) -> Result<(), ModelError> {
     let (owner, name) = (link.node, link.name);
     once(inertial, owner, &["origin", "mass", "inertia"], warnings);
-    let mass = part(inertial, owner, "<mass>", "add <mass value=\"...\"/> in kg")?;
+    let mass = part(inertial, owner, "mass", "add <mass value=\"...\"/> in kg")?;
     let remedy = "add <inertia ixx=\"...\" .../> about the centre of mass, in kg m^2";
-    let tensor = part(inertial, owner, "<inertia>", remedy)?;
+    let tensor = part(inertial, owner, "inertia", remedy)?;
     let number = |node: ElementRef<'_>, attribute, remedy| {
         required(node, owner, attribute, remedy)?;
         numbers(node, owner, attribute).map(|one| one.map_or(0.0, |[number]| number))
@@ -226,7 +196,7 @@ fn read_joints<'d>(
     let mut joints: Vec<UrdfJoint<'_>> = Vec::new();
     let mut seen = HashMap::new();
     for node in robot.children().filter(|node| node.name() == "joint") {
-        let name = name(node, "joint", &mut seen, |first| joints[first].node)?;
+        let name = name(node, &mut seen, |first| joints[first].node)?;
         let used = ["origin", "parent", "child", "axis", "limit", "mimic"];
         once(node, node, &used, warnings);
         let joint = read_joint(node, name, links)?;
@@ -254,36 +224,29 @@ fn read_joint<'d>(
 ) -> Result<UrdfJoint<'d>, ModelError> {
     let types = "write type=\"revolute\", \"continuous\", \"prismatic\" or \"fixed\"";
     let word = required(node, node, "type", types)?;
-    let link = |role, tag, remedy| {
-        let element = part(node, node, tag, remedy)?;
+    let link = |role, remedy| {
+        let element = part(node, node, role, remedy)?;
         let link = required(
             element,
             node,
             "link",
             "write link=\"...\", the name of a link",
         )?;
-        links
-            .get(link)
-            .copied()
-            .ok_or_else(|| ModelError::UnknownLink {
-                location: location(element, node),
-                role,
-                link: link.to_owned(),
-            })
+        links.get(link).copied().ok_or_else(|| {
+            let what = format_args!(
+                "its {role} link {link} is not in the URDF; correct the name or add the link"
+            );
+            defect(element, node, what)
+        })
     };
-    let parent = link("parent", "<parent>", "add <parent link=\"...\"/>")?;
-    let child = link("child", "<child>", "add <child link=\"...\"/>")?;
+    let parent = link("parent", "add <parent link=\"...\"/>")?;
+    let child = link("child", "add <child link=\"...\"/>")?;
     let kind = match word {
         "revolute" | "continuous" => Some(JointKind::Revolute(axis(node)?)),
         "prismatic" => Some(JointKind::Prismatic(axis(node)?)),
         "fixed" => Some(JointKind::Fixed),
         "floating" | "planar" => None,
-        _ => {
-            return Err(ModelError::UnsupportedJoint {
-                location: location(node, node),
-                kind: word.to_owned(),
-            });
-        }
+        _ => return Err(unsupported(node)),
     };
     let moves = is_moving(kind.as_ref());
     let limit = |attribute| match node.child("limit") {
@@ -319,6 +282,22 @@ fn read_joint<'d>(
     })
 }
 
+/// The error that a joint of this type is.
+fn unsupported(joint: ElementRef<'_>) -> ModelError {
+    let kind = joint.attribute("type").unwrap_or_default();
+    let what = match kind {
+        "floating" | "planar" => {
+            "is possible only between the root and the robot, where it is dropped because any \
+             link can be the base; remove the joint, or make it of prismatic and continuous joints"
+        }
+        "spherical" | "ball" => {
+            "is not supported; write three continuous joints with massless links between them"
+        }
+        _ => "is not a type of joint; types are revolute, continuous, prismatic and fixed",
+    };
+    defect(joint, joint, format_args!("type=\"{kind}\" {what}"))
+}
+
 /// The direction of a joint's `<axis>`, x without one.
 fn axis(node: ElementRef<'_>) -> Result<JointAxis, ModelError> {
     let Some(axis) = node.child("axis") else {
@@ -330,7 +309,8 @@ fn axis(node: ElementRef<'_>) -> Result<JointAxis, ModelError> {
     let remedy = "write its direction, such as xyz=\"0 0 1\"";
     required(axis, node, "xyz", remedy)?;
     let direction = numbers(axis, node, "xyz")?.unwrap_or_default();
-    JointAxis::new(Vec3::from(direction)).ok_or_else(|| ModelError::ZeroAxis(location(axis, node)))
+    let zero = "its <axis> xyz is zero; write a direction, such as xyz=\"0 0 1\"";
+    JointAxis::new(Vec3::from(direction)).ok_or_else(|| defect(axis, node, zero))
 }
 
 /// The joint that a joint follows, with multiplier and offset.
@@ -378,12 +358,14 @@ impl Tree {
         let mut children = vec![Vec::new(); links.len()];
         for (number, joint) in joints.iter().enumerate() {
             if let Some(first) = above[joint.child].replace(number) {
-                return Err(ModelError::TwoParents {
-                    location: location(joint.node, joint.node),
-                    link: links[joint.child].name.to_owned(),
-                    first: joints[first].name.to_owned(),
-                    line: joints[first].node.line(),
-                });
+                let what = format_args!(
+                    "its child {} is already the child of joint {} (line {}); loops cannot be \
+                     described, only trees: remove one of the joints",
+                    links[joint.child].name,
+                    joints[first].name,
+                    joints[first].node.line()
+                );
+                return Err(defect(joint.node, joint.node, what));
             }
             children[joint.parent].push(number);
         }
@@ -407,7 +389,9 @@ impl Tree {
         }
         if let Some(lost) = reached.iter().position(|&found| !found) {
             let node = links[lost].node;
-            return Err(ModelError::Loop(location(node, node)));
+            let what =
+                "the joints above it form a loop; only trees can be described: remove a joint";
+            return Err(defect(node, node, what));
         }
         let mut tree = Self {
             // There is one, because it was reached.
@@ -448,10 +432,7 @@ impl Tree {
         let is_robot = |joint: &&UrdfJoint<'_>| !self.dropped.contains(&joint.parent);
         match (joints.iter().filter(is_robot)).find(|joint| joint.kind.is_none()) {
             None => Ok(()),
-            Some(joint) => Err(ModelError::UnsupportedJoint {
-                location: location(joint.node, joint.node),
-                kind: joint.node.attribute("type").unwrap_or_default().to_owned(),
-            }),
+            Some(joint) => Err(unsupported(joint.node)),
         }
     }
 }
@@ -505,7 +486,7 @@ impl Coordinates {
                 warnings.push(format!(
                     "{}: its <mimic> joint=\"{leader}\" is not a joint of the URDF: it is taken as \
                      a joint of its own, which is measured or in [locked]",
-                    location(mimic, joint.node)
+                    place(mimic, joint.node)
                 ));
                 joint.mimic = None;
             }
@@ -543,13 +524,10 @@ impl Coordinates {
                 let Some((follows, multiplier, shift)) = leader.mimic else {
                     break;
                 };
-                let error = |reason| ModelError::Mimic {
-                    location: leader.node.child("mimic").map_or_else(
-                        || location(leader.node, leader.node),
-                        |mimic| location(mimic, leader.node),
-                    ),
-                    follows: follows.to_owned(),
-                    reason,
+                let error = |reason| {
+                    let mimic = leader.node.child("mimic").unwrap_or(leader.node);
+                    let what = format_args!("its <mimic> joint=\"{follows}\" {reason}");
+                    defect(mimic, leader.node, what)
                 };
                 let Some(next) = numbers.get(follows).and_then(|&number| joints.get(number)) else {
                     break;
@@ -656,7 +634,8 @@ impl Folding<'_, '_> {
             self.check_body(&members, &inertia, total, &mut model.warnings)?;
             match above {
                 Some((number, ..)) if !has_inertial => {
-                    unknown.push((location(node, node), self.joints[number].name.to_owned()));
+                    let joint = self.joints[number].name;
+                    unknown.push(format!("{}, beyond joint {joint}", place(node, node)));
                 }
                 Some((number, ..)) if inertia.mass == 0.0 => model.warnings.push(format!(
                     "link {name}: the body that joint {} moves is massless",
@@ -679,7 +658,11 @@ impl Folding<'_, '_> {
             }));
         }
         if !unknown.is_empty() {
-            return Err(ModelError::MissingInertial(unknown));
+            return Err(ModelError::Defect(format!(
+                "{}: the mass is unknown, because no <inertial> is there or in a link fixed to it; \
+                 add one (with mass 0 and inertia 0 if it is meant to be massless)",
+                unknown.join("; ")
+            )));
         }
         Ok(model)
     }
@@ -779,37 +762,37 @@ impl Folding<'_, '_> {
         // What the sum of the robot's masses, with arms of a metre, has as rounding error.
         let rounding = f64::EPSILON * total;
         let slack = INERTIA_TOLERANCE * moments.amax() + POINT * body.mass.abs() + rounding;
-        let named = |worst: Option<&usize>| {
-            let worst = worst.copied().unwrap_or(members[0]);
-            let link = &self.links[worst];
-            let node = link.node.child("inertial").unwrap_or(link.node);
-            let others = members.iter().filter(|&&other| other != worst);
-            let others = others.map(|&other| &self.links[other]);
-            let others = others.filter(|other| other.has_inertial);
-            let names = others.map(|other| other.name.to_owned()).collect();
-            (location(node, link.node), names)
+        // Names the worst of the links, and those that are fixed to it.
+        let refused = |value: &dyn Fn(&UrdfLink<'_>) -> f64, what: String, remedy| {
+            let links = || members.iter().map(|&link| &self.links[link]);
+            let worst = links().min_by(|a, b| value(a).total_cmp(&value(b)));
+            let worst = worst.unwrap_or(&self.links[members[0]]);
+            let others = links().filter(|other| other.name != worst.name && other.has_inertial);
+            let others: Vec<&str> = others.map(|other| other.name).collect();
+            let together = if others.is_empty() {
+                String::new()
+            } else {
+                let others = others.join(", ");
+                format!(", together with the links fixed to it ({others})")
+            };
+            let node = worst.node.child("inertial").unwrap_or(worst.node);
+            let what = format_args!("{what}{together}; {remedy}");
+            Err(defect(node, worst.node, what))
         };
         if body.mass < -rounding {
-            let mass = |&link: &usize| self.links[link].inertia.mass;
-            let worst = (members.iter()).min_by(|a, b| mass(a).total_cmp(&mass(b)));
-            let (location, with) = named(worst);
-            return Err(ModelError::NegativeMass {
-                location,
-                mass: body.mass,
-                with,
-            });
+            let what = format!("the mass is {} kg", body.mass);
+            let remedy = "a mass cannot be negative: correct the <mass>";
+            return refused(&|link| link.inertia.mass, what, remedy);
         }
-        let negative = |&link: &usize| self.links[link].negative.unwrap_or(0.0);
         if moments.min() < -slack {
-            let worst = members
-                .iter()
-                .min_by(|a, b| negative(a).total_cmp(&negative(b)));
-            let (location, with) = named(worst);
-            return Err(ModelError::InertiaNotPositive {
-                location,
-                least: moments.min(),
-                with,
-            });
+            let what = format!(
+                "the inertia is not positive semidefinite (least principal moment about the \
+                 centre of mass {:.3e} kg m^2)",
+                moments.min()
+            );
+            let remedy = "no body has this inertia: correct ixx to izz of the <inertia> (about the \
+                          centre of mass, in kg m^2)";
+            return refused(&|link| link.negative.unwrap_or(0.0), what, remedy);
         }
         for link in members.iter().map(|&link| &self.links[link]) {
             let name = link.name;
@@ -840,7 +823,27 @@ impl Model {
     /// The first error found ([`ModelError`]). Oddities that are not errors become lines of
     /// [`Model::warnings`].
     pub fn from_urdf(text: &str, keep: &[&str]) -> Result<Self, ModelError> {
-        read(text, keep)
+        let document = Document::parse(text)?;
+        let robot = robot(&document)?;
+        let mut warnings = Vec::new();
+        let (sensors, unread) = read_sensors(robot, &mut warnings);
+        let (links, numbers) = read_links(robot, &mut warnings)?;
+        let mut joints = read_joints(robot, &numbers, &mut warnings)?;
+        let tree = Tree::build(&links, &joints, &mut warnings)?;
+        check_kept(keep, &joints, &sensors)?;
+        let coordinates = Coordinates::of(&mut joints, &mut warnings)?;
+        Folding {
+            links: &links,
+            joints: &joints,
+            keep: keep.iter().copied().collect(),
+            coordinates,
+        }
+        .fold(
+            &tree,
+            robot.attribute("name").unwrap_or_default().to_owned(),
+            (sensors, unread),
+            warnings,
+        )
     }
 
     /// [`Model::from_urdf`] on a file.
