@@ -355,7 +355,7 @@ impl Recursion<'_> {
                 continue;
             }
             let inner = self.inner(visit);
-            let mut rows = Subspace::empty();
+            let mut rows = Subspace::default();
             let mut reach = match visit.parent.and_then(|parent| reaches[parent].as_ref()) {
                 None => match self.gravity {
                     None => Reach::free(),
@@ -382,7 +382,7 @@ impl Recursion<'_> {
     /// The twists along which the balance of a part is measured, where its pass begins.
     fn measured_twists(&self, part: usize) -> Subspace<6> {
         if self.measured == Measurement::Torques {
-            return Subspace::empty();
+            return Subspace::default();
         }
         let applied = self.contacts.iter().filter(|(of, _)| *of == part);
         let unknown = applied
