@@ -17,7 +17,7 @@
 use crate::error::{DynamicsError, check_size};
 use crate::kinematics::Kinematics;
 use crate::solver::Solver;
-use crate::spatial::{Mat3, Motion, stack};
+use crate::spatial::{Mat3, Motion, stack, symmetric};
 use crate::structure::{ContactKind, Structure};
 use nalgebra::Matrix6;
 
@@ -207,13 +207,6 @@ fn covariance(
     let arm = x_bf.point(&spec.position).cross_matrix();
     let turned = across * direction.powi(2);
     let mixed = arm * turned;
-    let mut covariance = Matrix6::zeros();
     let torque = across * std.position.powi(2) + mixed * arm.transpose();
-    covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&torque);
-    covariance.fixed_view_mut::<3, 3>(0, 3).copy_from(&mixed);
-    covariance
-        .fixed_view_mut::<3, 3>(3, 0)
-        .copy_from(&mixed.transpose());
-    covariance.fixed_view_mut::<3, 3>(3, 3).copy_from(&turned);
-    Some(covariance)
+    Some(symmetric(&torque, &mixed, &turned))
 }

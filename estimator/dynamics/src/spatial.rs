@@ -136,7 +136,7 @@ mod inertia;
 pub use inertia::{Inconsistency, RigidInertia};
 
 use derive_more::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
-use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector3, Vector6};
 
 /// A vector in three-dimensional space.
 pub type Vec3 = Vector3<f64>;
@@ -237,14 +237,8 @@ impl Wrench {
 
     /// The six components in the order of samples and logs, `[fx fy fz tx ty tz]` [N, Nm].
     pub fn force_first(&self) -> [f64; 6] {
-        [
-            self.force.x,
-            self.force.y,
-            self.force.z,
-            self.torque.x,
-            self.torque.y,
-            self.torque.z,
-        ]
+        let (n, f) = (&self.torque, &self.force);
+        [f.x, f.y, f.z, n.x, n.y, n.z]
     }
 
     /// Whether every component is finite.
@@ -266,6 +260,20 @@ impl Wrench {
 #[inline]
 pub fn stack(upper: &Vec3, lower: &Vec3) -> Vector6<f64> {
     Vector6::new(upper.x, upper.y, upper.z, lower.x, lower.y, lower.z)
+}
+
+/// The symmetric matrix `[upper, mixed; mixed^T, lower]`.
+pub(crate) fn symmetric(upper: &Mat3, mixed: &Mat3, lower: &Mat3) -> Matrix6<f64> {
+    let mut matrix = Matrix6::zeros();
+    let mut put = |row, column, block: &Mat3| {
+        let mut view = matrix.fixed_view_mut::<3, 3>(row, column);
+        view.copy_from(block);
+    };
+    put(0, 0, upper);
+    put(0, 3, mixed);
+    put(3, 0, &mixed.transpose());
+    put(3, 3, lower);
+    matrix
 }
 
 /// Pose of one frame in another: `x_ab` takes coordinates in `b` to coordinates in `a`.
