@@ -223,6 +223,14 @@ impl Wrench {
         }
     }
 
+    /// A force that acts at a point.
+    pub(crate) fn of_force(point: &Vec3, force: Vec3) -> Self {
+        Self {
+            torque: point.cross(&force),
+            force,
+        }
+    }
+
     /// The inverse of [`Wrench::torque_first`].
     pub fn from_torque_first([tx, ty, tz, fx, fy, fz]: [f64; 6]) -> Self {
         Self::from_parts([fx, fy, fz], [tx, ty, tz])
