@@ -262,7 +262,7 @@ impl Kinematics {
         for ((x_pc, joint), (q, sin_cos)) in
             self.local.iter_mut().zip(model.joints()).zip(positions)
         {
-            *x_pc = joint.pose_by(*q, *sin_cos);
+            *x_pc = joint.kind.place(&joint.placement, *q, *sin_cos);
         }
         for &number in &self.steps {
             let (joint, x_pc) = (&model.joints()[number], &self.local[number]);

@@ -146,26 +146,29 @@ impl Joint {
     /// Pose of the child in the parent, `x_pc(q)`, with the joint at `q` [rad or m]; `q` is ignored
     /// for a fixed joint.
     pub fn pose(&self, q: f64) -> Pose {
-        self.pose_by(q, q.sin_cos())
+        self.kind.place(&self.placement, q, q.sin_cos())
     }
+}
 
-    /// The same, with sine and cosine of `q` given.
+impl JointKind {
+    /// Pose of the child in the parent with the joint at `q` [rad or m], whose sine and cosine are
+    /// given; `placement` is that with the joint at zero.
     #[inline(always)]
-    pub(crate) fn pose_by(&self, q: f64, sin_cos: (f64, f64)) -> Pose {
+    pub(crate) fn place(&self, placement: &Pose, q: f64, sin_cos: (f64, f64)) -> Pose {
         let Pose {
             rotation,
             translation,
-        } = &self.placement;
-        match &self.kind {
-            JointKind::Revolute(axis) => Pose {
+        } = placement;
+        match self {
+            Self::Revolute(axis) => Pose {
                 rotation: axis.turn_by(rotation, sin_cos),
                 translation: *translation,
             },
-            JointKind::Prismatic(axis) => Pose {
+            Self::Prismatic(axis) => Pose {
                 rotation: *rotation,
                 translation: translation + rotation * axis.vector * q,
             },
-            JointKind::Fixed => self.placement,
+            Self::Fixed => *placement,
         }
     }
 }

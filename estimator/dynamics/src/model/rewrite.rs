@@ -202,7 +202,7 @@ impl Model {
         keep: &[&str],
         inertias: &[RigidInertia],
     ) -> Result<String, ModelError> {
-        let mut model = Model::from_urdf(text, keep)?;
+        let mut model = Self::from_urdf(text, keep)?;
         if inertias.len() != model.link_count() {
             return Err(ModelError::InertiaCount {
                 given: inertias.len(),

@@ -325,21 +325,6 @@ fn mimic(node: ElementRef<'_>) -> Result<Option<(&str, f64, f64)>, ModelError> {
     Ok(Some((follows, multiplier, offset)))
 }
 
-/// The pose of a joint's child in the joint's parent, with the joint at a position.
-fn moved(placement: &Pose, kind: Option<JointKind>, position: f64) -> Pose {
-    let (kind, placement) = (kind.unwrap_or(JointKind::Fixed), *placement);
-    Joint {
-        kind,
-        parent: 0,
-        child: 0,
-        placement,
-        dof: None,
-        ratio: 0.0,
-        offset: 0.0,
-    }
-    .pose(position)
-}
-
 /// The URDF's tree: its root, and the joints below each link in the order of the file.
 struct Tree {
     root: usize,
@@ -500,8 +485,9 @@ impl Coordinates {
                  {position}",
                 joint.name
             ));
-            joint.origin = moved(&joint.origin, joint.kind, position);
-            joint.kind = Some(JointKind::Fixed);
+            if let Some(kind) = joint.kind.replace(JointKind::Fixed) {
+                joint.origin = kind.place(&joint.origin, position, position.sin_cos());
+            }
         }
         Ok(coordinates)
     }

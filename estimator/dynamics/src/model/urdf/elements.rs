@@ -181,26 +181,26 @@ pub(super) fn read_sensors(
                     why,
                 });
             }
-            Ok(sensor) => match sensors.iter().find(|other| is_same_sensor(other, &sensor)) {
-                None => sensors.push(sensor),
-                Some(other) if is_same_description(other, &sensor) => {}
-                Some(_) => {
-                    warnings.push(format!(
+            Ok(sensor) => {
+                // A name is its own among the sensors of a joint only.
+                let id = (&sensor.joint, &sensor.name);
+                match sensors
+                    .iter()
+                    .find(|other| (&other.joint, &other.name) == id)
+                {
+                    None => sensors.push(sensor),
+                    Some(other) if is_same_description(other, &sensor) => {}
+                    Some(_) => warnings.push(format!(
                         "line {}: F/T sensor {name} in joint {} is described twice, and \
                          differently; the first description counts",
                         node.line(),
                         sensor.joint
-                    ));
+                    )),
                 }
-            },
+            }
         }
     }
     (sensors, unread)
-}
-
-/// Whether two elements are of one sensor. A name is its own among the sensors of a joint only.
-fn is_same_sensor(a: &SensorElement, b: &SensorElement) -> bool {
-    (&a.joint, &a.name) == (&b.joint, &b.name)
 }
 
 pub(super) fn read_sensor(
