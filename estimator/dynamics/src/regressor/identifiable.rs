@@ -79,7 +79,7 @@ mod regime;
 
 use nalgebra::DMatrix;
 
-use self::assemble::{Composite, Hidden, NullVector, assemble};
+use self::assemble::{Assembled, Composite, Hidden, assemble};
 use self::pass::{Units, Visit, check_vector, contact_wrenches, pass, sides};
 use self::reach::{Reach, Subspace};
 use crate::error::{DynamicsError, check_size};
@@ -107,9 +107,7 @@ pub use regime::{BaseRegime, JointMotion, Measurement, Offsets, ParameterColumn,
 pub struct Identifiable {
     columns: Vec<ParameterColumn>,
     names: Vec<String>,
-    basis: DMatrix<f64>,
-    null: Vec<NullVector>,
-    confused: usize,
+    assembled: Assembled,
 }
 
 impl Identifiable {
@@ -154,17 +152,13 @@ impl Identifiable {
             Offsets::Unknown => scope.sensors(),
         };
         let composites = recursion.composites(model, &links, &sensors);
-        let Recursion {
-            units, tolerance, ..
-        } = recursion;
-        let assembled = assemble(&composites, sensors.len(), &units, tolerance);
+        let (units, tolerance) = (&recursion.units, recursion.tolerance);
+        let assembled = assemble(&composites, sensors.len(), units, tolerance);
         let (columns, names) = labels(model, scope, &links, &sensors);
         Ok(Self {
             columns,
             names,
-            basis: assembled.basis,
-            null: assembled.null,
-            confused: assembled.confused,
+            assembled,
         })
     }
 
@@ -172,12 +166,12 @@ impl Identifiable {
     /// subspace, so that `pi = B^T phi` are the base parameters of any `phi` and `B pi` is its
     /// identifiable part (eq. (7)).
     pub fn basis(&self) -> &DMatrix<f64> {
-        &self.basis
+        &self.assembled.basis
     }
 
     /// Its dimension: the number of identifiable combinations.
     pub fn rank(&self) -> usize {
-        self.basis.ncols()
+        self.assembled.basis.ncols()
     }
 
     /// The meaning of each column.
@@ -195,8 +189,9 @@ impl Identifiable {
     /// unobservable parameters of a single link. The last [`Identifiable::confused`] ones state
     /// which offset is not separable from which parameters.
     pub fn null(&self) -> DMatrix<f64> {
-        let mut null = DMatrix::zeros(self.columns.len(), self.null.len());
-        for (k, vector) in self.null.iter().enumerate() {
+        let vectors = &self.assembled.null;
+        let mut null = DMatrix::zeros(self.columns.len(), vectors.len());
+        for (k, vector) in vectors.iter().enumerate() {
             for &(column, entry) in &vector.entries {
                 null[(column, k)] = entry;
             }
@@ -208,12 +203,12 @@ impl Identifiable {
     /// rank with them. In these directions an offset and inertial parameters, or several offsets,
     /// are not separable in this regime.
     pub fn confused(&self) -> usize {
-        self.confused
+        self.assembled.confused
     }
 
     /// The base parameters as readable sums, one per dimension: see [`BaseParameter`].
     pub fn base_parameters(&self) -> Vec<BaseParameter> {
-        expression::base_parameters(&self.names, &self.null)
+        expression::base_parameters(&self.names, &self.assembled.null)
     }
 }
 

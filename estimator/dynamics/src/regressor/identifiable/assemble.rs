@@ -88,6 +88,7 @@ pub(super) struct Composite {
 }
 
 /// Result of `assemble`.
+#[derive(Clone, Debug)]
 pub(super) struct Assembled {
     /// Orthonormal columns.
     pub(super) basis: DMatrix<f64>,
