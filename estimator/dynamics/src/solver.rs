@@ -485,25 +485,14 @@ impl Solver {
                 .sum();
             self.torque_deviation[dof] = sum.sqrt();
         }
-        let Self {
-            sensor_poses,
-            contact_rows,
-            contacts,
-            ..
-        } = self;
-        let variance = |sensor: usize, motion: &Motion| {
-            variance(structure, sensor, &sensor_poses[sensor], motion)
-        };
         for subtree in structure.subtrees() {
             for contact in subtree.contacts.iter() {
-                let rows = &contact_rows[contact];
-                contacts[contact].deviation = rows.map(|row| {
-                    subtree
-                        .sensors
-                        .iter()
-                        .map(|sensor| variance(sensor, &row))
-                        .sum::<f64>()
-                        .sqrt()
+                self.contacts[contact].deviation = self.contact_rows[contact].map(|row| {
+                    let sensors = subtree.sensors.iter();
+                    let variances = sensors.map(|sensor| {
+                        variance(structure, sensor, &self.sensor_poses[sensor], &row)
+                    });
+                    variances.sum::<f64>().sqrt()
                 });
             }
         }

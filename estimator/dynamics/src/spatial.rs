@@ -145,7 +145,7 @@ pub type Vec3 = Vector3<f64>;
 pub type Mat3 = Matrix3<f64>;
 
 /// A motion vector: angular and linear part of a twist, or the axis of a joint.
-#[derive(Add, AddAssign, Clone, Copy, Debug, Mul, Neg, PartialEq, Sub)]
+#[derive(Add, AddAssign, Clone, Copy, Debug, Default, Mul, Neg, PartialEq, Sub)]
 pub struct Motion {
     /// Angular part [rad/s].
     pub angular: Vec3,
@@ -156,10 +156,7 @@ pub struct Motion {
 impl Motion {
     /// No motion.
     pub fn zero() -> Self {
-        Self {
-            angular: Vec3::zeros(),
-            linear: Vec3::zeros(),
-        }
+        Self::default()
     }
 
     /// Unit rotation about the line through `point` along `axis`, as a twist at the origin:
@@ -190,7 +187,7 @@ impl Motion {
 
 /// A force vector: torque about a point, and force. The same type holds a momentum (angular about
 /// the point, and linear).
-#[derive(Add, AddAssign, Clone, Copy, Debug, Mul, Neg, PartialEq, Sub, SubAssign)]
+#[derive(Add, AddAssign, Clone, Copy, Debug, Default, Mul, Neg, PartialEq, Sub, SubAssign)]
 pub struct Wrench {
     /// Torque about the origin of the frame in use \[Nm\].
     pub torque: Vec3,
@@ -198,20 +195,11 @@ pub struct Wrench {
     pub force: Vec3,
 }
 
-impl Default for Wrench {
-    fn default() -> Self {
-        Self::zero()
-    }
-}
-
 impl Wrench {
     /// No force, no torque.
     #[inline]
     pub fn zero() -> Self {
-        Self {
-            torque: Vec3::zeros(),
-            force: Vec3::zeros(),
-        }
+        Self::default()
     }
 
     /// A wrench from its force and torque parts, in the order of samples and logs: `[fx fy fz]`

@@ -6,7 +6,7 @@ use nalgebra::Matrix4;
 
 /// Inertia of a rigid body about the origin of its link frame, in link axes: the ten inertial
 /// parameters. The sum of two bodies described in the same frame is both, fixed to each other.
-#[derive(Add, Clone, Copy, Debug, PartialEq, Sub)]
+#[derive(Add, Clone, Copy, Debug, Default, PartialEq, Sub)]
 pub struct RigidInertia {
     /// Mass \[kg\].
     pub mass: f64,
@@ -44,11 +44,7 @@ pub enum Inconsistency {
 impl RigidInertia {
     /// No mass.
     pub fn zero() -> Self {
-        Self {
-            mass: 0.0,
-            first_moment: Vec3::zeros(),
-            inertia: Mat3::zeros(),
-        }
+        Self::default()
     }
 
     /// From mass \[kg\], centre of mass in link axes \[m\], and the tensor of inertia about the
