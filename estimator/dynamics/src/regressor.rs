@@ -50,5 +50,5 @@ mod tree;
 
 pub use estimate::EstimateRows;
 pub use link::{LINK_PARAMETERS, LinkRows, WITH_FORCE, link_regressor, link_rows};
-pub use subtree::{PresentContact, StackedRegressor, SubTreeRegressor, Weighting};
+pub use subtree::{PresentContact, StackedRegressor, SubTreeRegressor};
 pub use tree::Regressor;

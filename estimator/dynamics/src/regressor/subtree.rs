@@ -13,25 +13,6 @@ use crate::regressor::link::{LINK_PARAMETERS, WITH_FORCE, link_rows};
 use crate::spatial::{Pose, Wrench};
 use crate::structure::{ContactSet, Structure};
 
-/// How forces are compared with torques when contact columns are eliminated. The remaining rows
-/// span the same space with either weighting: all rows to which no present contact contributes. The
-/// weighting chooses a basis of it, and so the weights of least squares on these rows. (Contacts
-/// count as dependent if a singular value of their columns, in the chosen weighting, is below 1e-8
-/// of the greatest. Near this limit the two weightings may disagree with each other and with the
-/// solver.)
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Weighting {
-    /// The noise of the sub-tree's F/T sensors: its rows are whitened, with unit covariance within
-    /// the sub-tree. (If the Cholesky factorisation of the covariance fails by rounding, only the
-    /// variances are used, as in the solver, and the covariance is only approximately unit.) A
-    /// sub-tree without sensors has no noise: it is treated as with `LengthScale`.
-    Noise,
-    /// The structure's length scale `d`, about the origin of the sub-tree's top link: rows `p` with
-    /// `p diag(d^2, d^2, d^2, 1, 1, 1) p'^T = 1 or 0`, orthonormal in newtons. They depend on that
-    /// point.
-    LengthScale,
-}
-
 /// A present contact and its columns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PresentContact {
@@ -165,12 +146,18 @@ impl SubTreeRegressor {
     }
 
     /// Number of rows that remain without contact columns: six minus the rank of these columns.
-    /// Zero before [`StackedRegressor::eliminate_contacts`].
+    /// (Contacts count as dependent if a singular value of their columns, weighted as the rows are,
+    /// is below 1e-8 of the greatest. Near this limit the solver may disagree.)
     pub fn remaining(&self) -> usize {
         self.remaining
     }
 
-    /// One of the remaining rows, over links and offsets only.
+    /// One of the remaining rows, over links and offsets only: whitened, with unit covariance of
+    /// F/T noise within the sub-tree. (If the Cholesky factorisation of the covariance fails by
+    /// rounding, only the variances are used, as in the solver, and the covariance is only
+    /// approximately unit.) Without sensors there is no noise: rows `p` are orthonormal in newtons,
+    /// `p diag(d^2, d^2, d^2, 1, 1, 1) p'^T = 1 or 0` with the structure's length scale `d`, about
+    /// the origin of the top link.
     ///
     /// # Panics
     /// There is no such row; see [`SubTreeRegressor::remaining`].
@@ -249,7 +236,6 @@ impl SubTreeRegressor {
             });
         }
         self.unknown = column - self.known;
-        self.remaining = 0;
     }
 
     /// Right side and covariance from raw readings and known wrenches, after the offset columns: a
@@ -290,13 +276,14 @@ impl SubTreeRegressor {
         }
     }
 
-    fn eliminate(&mut self, structure: &Structure, weighting: Weighting) {
+    /// Computes the combinations of the six equations to which no present contact contributes, at
+    /// most `6 - rank`. They are valid for any wrenches at the contacts.
+    fn eliminate(&mut self, structure: &Structure) {
         self.remaining = 0;
         // With a full unknown wrench no row remains.
         if self.contacts.iter().any(|contact| contact.unknowns == 6) {
             return;
         }
-        let length = structure.length_scale();
         self.least.clear();
         for present in &self.contacts {
             for column in present.column..present.column + present.unknowns {
@@ -304,9 +291,10 @@ impl SubTreeRegressor {
                 self.least.push(unit, 1.0);
             }
         }
-        let lower = match weighting {
-            Weighting::Noise if !self.sensors.is_empty() => noise_factor(self.covariance),
-            _ => scale_factor(length),
+        let lower = if self.sensors.is_empty() {
+            scale_factor(structure.length_scale())
+        } else {
+            noise_factor(self.covariance)
         };
         self.least.factorise(&lower);
         for weights in self.least.complement() {
@@ -378,7 +366,8 @@ impl StackedRegressor {
         }
     }
 
-    /// Computes all rows, right sides and covariances. `readings` are the raw readings of the
+    /// Computes all rows, right sides and covariances, and the rows that remain without contacts
+    /// ([`SubTreeRegressor::projected_row`]). `readings` are the raw readings of the
     /// structure's sensors, offsets *not* removed, in their measurement frames; contacts in
     /// `active` are present; `external` wrenches are known.
     ///
@@ -399,18 +388,9 @@ impl StackedRegressor {
         for subtree in &mut self.subtrees {
             subtree.update(structure, kinematics, active);
             subtree.measure(structure, kinematics, readings, external);
+            subtree.eliminate(structure);
         }
         Ok(())
-    }
-
-    /// Eliminates the contact columns from the rows of the last update: computes the combinations
-    /// of the six equations to which no present contact contributes, at most `6 - rank` per
-    /// sub-tree ([`SubTreeRegressor::projected_row`]). They are valid for any wrenches at the
-    /// contacts.
-    pub fn eliminate_contacts(&mut self, weighting: Weighting) {
-        for subtree in &mut self.subtrees {
-            subtree.eliminate(&self.structure, weighting);
-        }
     }
 
     /// The structure that it was made for.
