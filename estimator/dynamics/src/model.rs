@@ -182,6 +182,18 @@ pub struct Limits {
     pub upper: f64,
 }
 
+impl Limits {
+    /// The position in the middle.
+    pub fn middle(&self) -> f64 {
+        0.5 * (self.lower + self.upper)
+    }
+
+    /// The distance from the middle to either end.
+    pub fn half(&self) -> f64 {
+        0.5 * (self.upper - self.lower)
+    }
+}
+
 /// A frame fixed to a body: a URDF link, folded or not.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Frame {

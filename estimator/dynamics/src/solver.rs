@@ -97,7 +97,7 @@ impl Solver {
             torque: vec![0.0; dofs],
             torque_deviation: vec![0.0; dofs],
             torque_certainty: vec![Determinacy::Assumed; dofs],
-            contacts: vec![ContactSolution::ABSENT; contacts],
+            contacts: vec![ContactSolution::absent(); contacts],
             balances: vec![
                 Balance {
                     residual: Wrench::zero(),
@@ -214,7 +214,7 @@ impl Solver {
         let subtree = &structure.subtrees()[number];
         let present = subtree.contacts.intersection(active);
         for contact in subtree.contacts.difference(active).iter() {
-            self.contacts[contact] = ContactSolution::ABSENT;
+            self.contacts[contact] = ContactSolution::absent();
             self.contact_rows[contact] = [Motion::zero(); 6];
         }
         let b = self.wrenches[subtree.top];

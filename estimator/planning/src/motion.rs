@@ -198,12 +198,11 @@ impl FourierSeries {
             let Some(limits) = limits else {
                 return (still, Vec::new());
             };
-            let Limits { lower, upper } = limits.range;
-            let half = 0.5 * (upper - lower);
+            let (middle, half) = (limits.range.middle(), limits.range.half());
             let [place, series @ ..] = chunks.next().unwrap_or_default() else {
-                return (0.5 * (lower + upper), Vec::new());
+                return (middle, Vec::new());
             };
-            let start = 0.5 * (lower + upper) + 0.8 * half * place.tanh();
+            let start = middle + 0.8 * half * place.tanh();
             let pairs = series.chunks_exact(2).zip(1..);
             let pairs = pairs.map(|(pair, k)| {
                 let rate = TAU * CYCLES * f64::from(k) / seconds;

@@ -330,46 +330,27 @@ impl Recursion<'_> {
     fn hidden(&self) -> Vec<Option<Hidden>> {
         let (units, tolerance) = (&self.units, self.tolerance);
         let torques = self.measured != Measurement::Wrench;
-        let parts: Vec<_> = self
-            .visits
-            .iter()
-            .map(|v| self.scope.part_of(v.link))
-            .collect();
-        // Links between the base and a measured one are needed too.
-        let mut is_needed: Vec<bool> = parts.iter().map(Option::is_some).collect();
-        for (number, visit) in self.visits.iter().enumerate().rev() {
-            if let Some(parent) = visit.parent {
-                is_needed[parent] |= is_needed[number];
-            }
-        }
-        let mut reaches: Vec<Option<Reach>> = vec![None; self.visits.len()];
+        let mut reaches: Vec<Reach> = Vec::with_capacity(self.visits.len());
         let mut all_hidden = Vec::with_capacity(self.visits.len());
-        for (number, visit) in self.visits.iter().enumerate() {
-            if !is_needed[number] {
-                all_hidden.push(None);
-                continue;
-            }
-            let inner = self.inner(visit);
+        for visit in &self.visits {
+            let (part, inner) = (self.scope.part_of(visit.link), self.inner(visit));
             let mut rows = Subspace::default();
-            let mut reach = match visit.parent.and_then(|parent| reaches[parent].as_ref()) {
-                None => match self.gravity {
-                    None => Reach::free(),
-                    Some(gravity) => Reach::standing(&(gravity / -units.acceleration)),
-                },
-                Some(before) => before.moved(&units.pose(&visit.placement)),
+            let mut reach = match (visit.parent, self.gravity) {
+                (Some(parent), _) => reaches[parent].moved(&units.pose(&visit.placement)),
+                (None, None) => Reach::free(),
+                (None, Some(gravity)) => Reach::standing(&(gravity / -units.acceleration)),
             };
             if let Some((twist, moves)) = &visit.freedom {
                 let measured = torques && inner.is_some();
                 let reached = reach.cross(&units.twist(twist), *moves, measured, tolerance);
                 rows.join(&reached, tolerance);
             }
-            if let (Some(part), None) = (parts[number], inner) {
+            if let (Some(part), None) = (part, inner) {
                 reach.begin(self.measured_twists(part), tolerance);
                 rows = reach.rows().clone();
             }
-            let hidden = parts[number].map(|_| Hidden::new(&rows, units, tolerance));
-            all_hidden.push(hidden);
-            reaches[number] = Some(reach);
+            all_hidden.push(part.map(|_| Hidden::new(&rows, units, tolerance)));
+            reaches.push(reach);
         }
         all_hidden
     }

@@ -124,7 +124,8 @@ proptest! {
     fn link_regressor_times_parameters_is_the_net_wrench(seed in any::<u64>()) {
         let mut random = Random::new(seed);
         let motion = motion(&mut random);
-        let regressor = link_regressor(&motion);
+        let rows = link_regressor(&motion);
+        let regressor = nalgebra::SMatrix::<f64, 6, 10>::from_fn(|row, column| rows[row][column]);
         let wrench = |p: &[f64; 10]| {
             torque_first(&RigidInertia::from_parameters(p).net_wrench(
                 &motion.angular_velocity,
