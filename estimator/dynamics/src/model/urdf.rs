@@ -25,6 +25,9 @@ use crate::spatial::{Mat3, Pose, RigidInertia, Vec3};
 /// or with six digits.
 const INERTIA_TOLERANCE: f64 = 1e-5;
 
+/// Numbers of links or joints by their names, in the order of the text.
+type Numbers<'d> = HashMap<&'d str, usize>;
+
 /// A link of the URDF, before folding.
 struct UrdfLink<'d> {
     node: ElementRef<'d>,
@@ -91,7 +94,7 @@ fn origin(node: ElementRef<'_>, owner: ElementRef<'_>) -> Result<Pose, ModelErro
 /// The name of a link or a joint, which must be the first of its name.
 fn name<'d>(
     node: ElementRef<'d>,
-    seen: &mut HashMap<&'d str, usize>,
+    seen: &mut Numbers<'d>,
     nodes: impl Fn(usize) -> ElementRef<'d>,
 ) -> Result<&'d str, ModelError> {
     let name = required(
@@ -114,7 +117,7 @@ fn name<'d>(
 fn read_links<'d>(
     robot: ElementRef<'d>,
     warnings: &mut Vec<String>,
-) -> Result<(Vec<UrdfLink<'d>>, HashMap<&'d str, usize>), ModelError> {
+) -> Result<(Vec<UrdfLink<'d>>, Numbers<'d>), ModelError> {
     let mut links: Vec<UrdfLink<'_>> = Vec::new();
     let mut numbers = HashMap::new();
     for node in robot.children().filter(|node| node.name() == "link") {
@@ -190,13 +193,13 @@ fn read_inertia(
 
 fn read_joints<'d>(
     robot: ElementRef<'d>,
-    links: &HashMap<&'d str, usize>,
+    links: &Numbers<'d>,
     warnings: &mut Vec<String>,
-) -> Result<Vec<UrdfJoint<'d>>, ModelError> {
+) -> Result<(Vec<UrdfJoint<'d>>, Numbers<'d>), ModelError> {
     let mut joints: Vec<UrdfJoint<'_>> = Vec::new();
-    let mut seen = HashMap::new();
+    let mut numbers = HashMap::new();
     for node in robot.children().filter(|node| node.name() == "joint") {
-        let name = name(node, &mut seen, |first| joints[first].node)?;
+        let name = name(node, &mut numbers, |first| joints[first].node)?;
         let used = ["origin", "parent", "child", "axis", "limit", "mimic"];
         once(node, node, &used, warnings);
         let joint = read_joint(node, name, links)?;
@@ -209,7 +212,7 @@ fn read_joints<'d>(
         }
         joints.push(joint);
     }
-    Ok(joints)
+    Ok((joints, numbers))
 }
 
 /// Whether a joint has a coordinate; one without a kind lets the whole robot float.
@@ -220,7 +223,7 @@ fn is_moving(kind: Option<&JointKind>) -> bool {
 fn read_joint<'d>(
     node: ElementRef<'d>,
     name: &'d str,
-    links: &HashMap<&'d str, usize>,
+    links: &Numbers<'d>,
 ) -> Result<UrdfJoint<'d>, ModelError> {
     let types = "write type=\"revolute\", \"continuous\", \"prismatic\" or \"fixed\"";
     let word = required(node, node, "type", types)?;
@@ -463,10 +466,14 @@ impl Coordinates {
     /// Degrees of freedom are numbered in the order of the file. A joint with a `<mimic>` has the
     /// one of the joint that it follows, if necessary through others. One that follows a fixed
     /// joint is made fixed where that holds it.
-    fn of(joints: &mut [UrdfJoint<'_>], warnings: &mut Vec<String>) -> Result<Self, ModelError> {
-        let names: HashSet<&str> = joints.iter().map(|joint| joint.name).collect();
+    fn of(
+        joints: &mut [UrdfJoint<'_>],
+        numbers: &Numbers<'_>,
+        warnings: &mut Vec<String>,
+    ) -> Result<Self, ModelError> {
         for joint in joints.iter_mut() {
-            if let Some((leader, ..)) = joint.mimic.filter(|(leader, ..)| !names.contains(leader)) {
+            let is_unknown = |(leader, ..): &(&str, f64, f64)| !numbers.contains_key(leader);
+            if let Some((leader, ..)) = joint.mimic.filter(is_unknown) {
                 let mimic = joint.node.child("mimic").unwrap_or(joint.node);
                 warnings.push(format!(
                     "{}: its <mimic> joint=\"{leader}\" is not a joint of the URDF: it is taken as \
@@ -476,7 +483,7 @@ impl Coordinates {
                 joint.mimic = None;
             }
         }
-        let coordinates = Self::resolve(joints)?;
+        let coordinates = Self::resolve(joints, numbers)?;
         for &(number, leader, position) in &coordinates.held {
             let leader = joints[leader].name;
             let joint = &mut joints[number];
@@ -493,32 +500,31 @@ impl Coordinates {
     }
 
     /// The same without changing the joints.
-    fn resolve(joints: &[UrdfJoint<'_>]) -> Result<Self, ModelError> {
+    fn resolve(joints: &[UrdfJoint<'_>], numbers: &Numbers<'_>) -> Result<Self, ModelError> {
         let moves = |joint: &UrdfJoint<'_>| is_moving(joint.kind.as_ref());
         let leads = |joint: &UrdfJoint<'_>| moves(joint) && joint.mimic.is_none();
         let leaders: Vec<usize> = (0..joints.len()).filter(|&j| leads(&joints[j])).collect();
-        let numbers: HashMap<&str, usize> =
-            joints.iter().map(|j| j.name).zip(0..joints.len()).collect();
         let (mut of, mut held) = (Vec::with_capacity(joints.len()), Vec::new());
         for (number, joint) in joints.iter().enumerate() {
             if !moves(joint) {
                 of.push(None);
                 continue;
             }
-            let (mut leader, mut ratio, mut offset) = (joint, 1.0, 0.0);
+            let (mut leader, mut ratio, mut offset) = (number, 1.0, 0.0);
             for steps in 0.. {
-                let Some((follows, multiplier, shift)) = leader.mimic else {
+                let UrdfJoint { node, mimic, .. } = joints[leader];
+                let Some((follows, multiplier, shift)) = mimic else {
                     break;
                 };
                 let error = |reason| {
-                    let mimic = leader.node.child("mimic").unwrap_or(leader.node);
+                    let element = node.child("mimic").unwrap_or(node);
                     let what = format_args!("its <mimic> joint=\"{follows}\" {reason}");
-                    defect(mimic, leader.node, what)
+                    defect(element, node, what)
                 };
-                let Some(next) = numbers.get(follows).and_then(|&number| joints.get(number)) else {
+                let Some(&next) = numbers.get(follows) else {
                     break;
                 };
-                if next.kind.is_none() {
+                if joints[next].kind.is_none() {
                     return Err(error(
                         "is the motion of the whole robot; name a joint of the robot, or remove \
                          the <mimic>",
@@ -533,14 +539,10 @@ impl Coordinates {
                 (ratio, offset) = (ratio * multiplier, ratio * shift + offset);
                 leader = next;
             }
-            if !moves(leader) {
-                held.extend(
-                    numbers
-                        .get(leader.name)
-                        .map(|&leader| (number, leader, offset)),
-                );
+            if !moves(&joints[leader]) {
+                held.push((number, leader, offset));
             }
-            let dof = leaders.iter().position(|&l| joints[l].name == leader.name);
+            let dof = leaders.iter().position(|&other| other == leader);
             of.push(dof.map(|dof| (dof, ratio, offset)));
         }
         Ok(Self { of, leaders, held })
@@ -814,10 +816,10 @@ impl Model {
         let mut warnings = Vec::new();
         let (sensors, unread) = read_sensors(robot, &mut warnings);
         let (links, numbers) = read_links(robot, &mut warnings)?;
-        let mut joints = read_joints(robot, &numbers, &mut warnings)?;
+        let (mut joints, numbers) = read_joints(robot, &numbers, &mut warnings)?;
         let tree = Tree::build(&links, &joints, &mut warnings)?;
         check_kept(keep, &joints, &sensors)?;
-        let coordinates = Coordinates::of(&mut joints, &mut warnings)?;
+        let coordinates = Coordinates::of(&mut joints, &numbers, &mut warnings)?;
         Folding {
             links: &links,
             joints: &joints,
