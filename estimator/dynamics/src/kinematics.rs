@@ -314,6 +314,14 @@ impl Kinematics {
         &self.links[link].motion
     }
 
+    /// Pose in the base of a frame fixed to a link.
+    ///
+    /// # Panics
+    /// There is no such link.
+    pub fn frame_pose(&self, frame: &Frame) -> Pose {
+        self.links[frame.link].pose * frame.pose
+    }
+
     /// Motion of a frame fixed to a link, in its own axes: what an IMU there would measure.
     ///
     /// # Panics

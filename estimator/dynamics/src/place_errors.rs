@@ -116,7 +116,7 @@ impl PlaceErrors {
                 self.torque[dof] = sum * sum;
             }
         }
-        let x_bf = *kinematics.pose(frame.link) * frame.pose;
+        let x_bf = kinematics.frame_pose(frame);
         for other in structure.subtrees()[number].contacts.iter() {
             let rows = solver.contact_rows(other);
             for (i, (sum, row)) in self.contacts[other].iter_mut().zip(rows).enumerate() {
@@ -195,7 +195,7 @@ fn covariance(
     std: PlaceStd,
 ) -> Option<Matrix6<f64>> {
     let spec = &structure.contacts()[contact];
-    let x_bf = *kinematics.pose(spec.frame.link) * spec.frame.pose;
+    let x_bf = kinematics.frame_pose(&spec.frame);
     let force = x_bf.rotation * solver.contacts()[contact].wrench.force;
     // |f|^2 times the projection across f.
     let across = Mat3::from_diagonal_element(force.norm_squared()) - force * force.transpose();

@@ -37,8 +37,6 @@ mod unknowns;
 pub use estimates::{Balance, ContactSolution, Determinacy};
 pub use unknowns::unknowns;
 
-use unknowns::contact_pose;
-
 use nalgebra::{Matrix6, Vector6};
 
 use crate::error::{DynamicsError, check_sizes};
@@ -267,7 +265,7 @@ impl Solver {
         kinematics: &Kinematics,
     ) -> ResidualWeight {
         let subtree = &structure.subtrees()[number];
-        let x_bf = contact_pose(&structure.contacts()[contact], kinematics);
+        let x_bf = kinematics.frame_pose(&structure.contacts()[contact].frame);
         self.contacts[contact] = ContactSolution {
             wrench: x_bf.wrench_back(&self.wrenches[subtree.top]),
             deviation: [0.0; 6],
@@ -347,7 +345,7 @@ impl Solver {
         let (sum, count) = if sensors.is_empty() {
             let sum = present.iter().fold(Vec3::zeros(), |sum, contact| {
                 let spec = &structure.contacts()[contact];
-                sum + contact_pose(spec, kinematics).point(&spec.position)
+                sum + kinematics.frame_pose(&spec.frame).point(&spec.position)
             });
             (sum, present.len())
         } else {

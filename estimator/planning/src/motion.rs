@@ -85,11 +85,10 @@ impl<'a> Outside<'a> {
         let state = MotionState::at_rest(position.to_vec());
         let motion = FrameMotion::standing(&Vec3::zeros());
         (self.kinematics).update(&self.robot.model, state.joints(), &motion)?;
-        let pose = |frame: &Frame| *self.kinematics.pose(frame.link) * frame.pose;
-        let base = pose(&fence.base).inverse();
+        let base = self.kinematics.frame_pose(&fence.base).inverse();
         let points = fence.points.iter();
         Ok(points
-            .map(|point| (base * pose(point)).translation)
+            .map(|point| (base * self.kinematics.frame_pose(point)).translation)
             .collect())
     }
 
