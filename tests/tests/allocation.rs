@@ -10,7 +10,7 @@
 
 use proprio_drivers::{Claim, Command, Frame, Id, Mode, NotSent};
 use proprio_dynamics::model::{self, Model};
-use proprio_dynamics::regressor::{EstimateRows, Regressor, StackedRegressor, Weighting};
+use proprio_dynamics::regressor::{EstimateRows, Regressor, StackedRegressor};
 use proprio_dynamics::spatial::{self, Pose, Vec3};
 use proprio_dynamics::{
     ContactKind, ContactSet, ContactSpec, DynamicsError, ExternalWrench, FrameMotion,
@@ -744,12 +744,6 @@ fn the_dynamics_allocate_nothing_after_construction() {
             allocates_nothing("stacked regressor", || {
                 stacked.update(&kinematics, &readings, active, &external)
             });
-            for weighting in [Weighting::Noise, Weighting::LengthScale] {
-                allocates_nothing("elimination", || {
-                    stacked.eliminate_contacts(weighting);
-                    Ok::<_, DynamicsError>(())
-                });
-            }
             allocates_nothing("estimate rows", || {
                 let rows = EstimateRows::new(structure, &solver, &kinematics)?;
                 for dof in 0..dofs {

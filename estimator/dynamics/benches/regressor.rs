@@ -18,7 +18,7 @@ use robot::Bench;
 use robot::common;
 
 use divan::{Bencher, black_box};
-use proprio_dynamics::regressor::{EstimateRows, Regressor, StackedRegressor, Weighting};
+use proprio_dynamics::regressor::{EstimateRows, Regressor, StackedRegressor};
 use proprio_dynamics::{ContactSet, Solver};
 
 fn main() {
@@ -87,7 +87,7 @@ fn d_stacked(bencher: Bencher<'_, '_>) {
     });
 }
 
-/// Kinematics and the equations without contacts, whitened.
+/// The same without contacts, whitened.
 #[divan::bench]
 fn e_stacked_and_whitened(bencher: Bencher<'_, '_>) {
     let mut bench = Bench::new(true);
@@ -98,7 +98,6 @@ fn e_stacked_and_whitened(bencher: Bencher<'_, '_>) {
         stacked
             .update(&bench.kinematics, &readings, &ContactSet::EMPTY, &[])
             .expect("the same structure");
-        stacked.eliminate_contacts(Weighting::Noise);
         black_box(&stacked);
     });
 }

@@ -251,22 +251,17 @@ impl Kind {
     /// Whether nothing is unknown.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        matches!(self.gain, Gain::None | Gain::Auto) && !self.temperature
+        self.count() == 0
     }
 
     /// Number of unknowns.
     #[must_use]
     pub fn count(&self) -> usize {
-        let gains = match self.gain {
-            // `Auto` has none until the logs are known.
-            Gain::None | Gain::Auto => 0,
-            Gain::Diagonal => 6,
-            Gain::Full => 36,
-        };
-        gains + 6 * usize::from(self.temperature)
+        self.unknowns().count()
     }
 
-    /// The unknowns in the order of their columns: entries of `E` row by row, then of `k`.
+    /// The unknowns in the order of their columns: entries of `E` row by row, then of `k`. `Auto`
+    /// has none until the logs are known.
     pub fn unknowns(self) -> impl Iterator<Item = Unknown> {
         let gains = (0..6).flat_map(move |channel| {
             (0..6).filter_map(move |of| {

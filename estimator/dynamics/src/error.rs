@@ -69,3 +69,11 @@ pub fn check_size(what: &'static str, got: usize, expected: usize) -> Result<(),
         })
     }
 }
+
+/// Checks several sizes: what each is of, the one given and the one needed.
+pub(crate) fn check_sizes<const N: usize>(
+    sizes: [(&'static str, usize, usize); N],
+) -> Result<(), DynamicsError> {
+    let mut sizes = sizes.into_iter();
+    sizes.try_for_each(|(what, got, expected)| check_size(what, got, expected))
+}

@@ -17,7 +17,7 @@
 
 use wide::f64x4;
 
-use crate::error::{DynamicsError, check_size};
+use crate::error::{DynamicsError, check_size, check_sizes};
 use crate::model::{Frame, Joint, JointAxis, JointKind, Model};
 use crate::spatial::{Motion, Pose, Vec3, Wrench};
 
@@ -100,23 +100,13 @@ struct LinkKinematics {
     motion: FrameMotion,
 }
 
-/// One step of the pass: across a joint, from a link whose state is known to its neighbour.
-#[derive(Clone, Copy, Debug)]
-struct Crossing {
-    from: usize,
-    to: usize,
-    joint: usize,
-    /// From the child to the parent.
-    reversed: bool,
-}
-
 /// Pose, motion and net wrench of every link, from the motion of one of them.
 #[derive(Clone, Debug)]
 pub struct Kinematics {
     base: usize,
-    /// First the joints from the base to the model's root, crossed from child to parent; then every
-    /// other link in the model's order.
-    steps: Vec<Crossing>,
+    /// The joints in the order of the pass: first those from the base to the model's root, crossed
+    /// from child to parent; then every other one in the model's order.
+    steps: Vec<usize>,
     /// Whether joint `j` is crossed from child to parent: the base lies beyond it.
     reversed: Vec<bool>,
     /// Position of each joint, and its sine and cosine; zero for a fixed one.
@@ -189,37 +179,25 @@ impl Kinematics {
         // Joint j moves link j + 1.
         let mut link = base;
         while link > 0 {
-            let joint = link - 1;
-            let parent = model.joints()[joint].parent;
-            self.steps.push(Crossing {
-                from: link,
-                to: parent,
-                joint,
-                reversed: true,
-            });
-            self.reversed[joint] = true;
-            link = parent;
+            self.steps.push(link - 1);
+            self.reversed[link - 1] = true;
+            link = model.joints()[link - 1].parent;
         }
-        for (number, joint) in model.joints().iter().enumerate() {
-            if !self.reversed[number] {
-                self.steps.push(Crossing {
-                    from: joint.parent,
-                    to: joint.child,
-                    joint: number,
-                    reversed: false,
-                });
-            }
-        }
+        let reversed = &self.reversed;
+        let others = (0..reversed.len()).filter(|&joint| !reversed[joint]);
+        self.steps.extend(others);
         Ok(())
     }
 
     fn check_model(&self, model: &Model) -> Result<(), DynamicsError> {
-        check_size("links of the model", model.link_count(), self.links.len())?;
-        check_size(
-            "degrees of freedom of the model",
-            model.dof_count(),
-            self.dofs,
-        )
+        check_sizes([
+            ("links of the model", model.link_count(), self.links.len()),
+            (
+                "degrees of freedom of the model",
+                model.dof_count(),
+                self.dofs,
+            ),
+        ])
     }
 
     /// The link where the pass starts, whose frame is that of base coordinates.
@@ -284,20 +262,21 @@ impl Kinematics {
         for ((x_pc, joint), (q, sin_cos)) in
             self.local.iter_mut().zip(model.joints()).zip(positions)
         {
-            *x_pc = joint.pose_by(*q, *sin_cos);
+            *x_pc = joint.kind.place(&joint.placement, *q, *sin_cos);
         }
-        for step in &self.steps {
-            let (joint, x_pc) = (&model.joints()[step.joint], &self.local[step.joint]);
+        for &number in &self.steps {
+            let (joint, x_pc) = (&model.joints()[number], &self.local[number]);
+            let (parent, child) = (joint.parent, joint.child);
             let (dq, ddq) = joint.dof.map_or((0.0, 0.0), |dof| {
                 let ratio = joint.ratio;
                 (ratio * state.velocity[dof], ratio * state.acceleration[dof])
             });
-            if step.reversed {
-                self.links[step.to] = down_to_parent(&self.links[step.from], joint, x_pc, dq, ddq);
+            if self.reversed[number] {
+                self.links[parent] = down_to_parent(&self.links[child], joint, x_pc, dq, ddq);
             } else {
-                self.links[step.to].pose = self.links[step.from].pose * *x_pc;
-                self.links[step.to].motion =
-                    up_to_child(&self.links[step.from].motion, joint, x_pc, dq, ddq);
+                self.links[child].pose = self.links[parent].pose * *x_pc;
+                self.links[child].motion =
+                    up_to_child(&self.links[parent].motion, joint, x_pc, dq, ddq);
             }
         }
         for ((net, link), inertia) in self.net.iter_mut().zip(&self.links).zip(model.inertias()) {
@@ -333,6 +312,14 @@ impl Kinematics {
     #[inline]
     pub fn motion(&self, link: usize) -> &FrameMotion {
         &self.links[link].motion
+    }
+
+    /// Pose in the base of a frame fixed to a link.
+    ///
+    /// # Panics
+    /// There is no such link.
+    pub fn frame_pose(&self, frame: &Frame) -> Pose {
+        self.links[frame.link].pose * frame.pose
     }
 
     /// Motion of a frame fixed to a link, in its own axes: what an IMU there would measure.
@@ -502,22 +489,13 @@ impl InverseDynamics {
         kinematics: &Kinematics,
         external: &[ExternalWrench],
     ) -> Result<(), DynamicsError> {
-        check_size(
-            "links of the kinematics",
-            kinematics.link_count(),
-            self.transmitted.len(),
-        )?;
-        check_size(
-            "links of the model",
-            model.link_count(),
-            self.transmitted.len(),
-        )?;
-        check_size(
-            "degrees of freedom of the model",
-            model.dof_count(),
-            self.torque.len(),
-        )?;
-        check_external(external, self.transmitted.len())?;
+        let (links, dofs) = (self.transmitted.len(), self.torque.len());
+        check_sizes([
+            ("links of the kinematics", kinematics.link_count(), links),
+            ("links of the model", model.link_count(), links),
+            ("degrees of freedom of the model", model.dof_count(), dofs),
+        ])?;
+        check_external(external, links)?;
         self.transmitted.copy_from_slice(kinematics.net_wrenches());
         for wrench in external {
             self.transmitted[wrench.frame.link] -= wrench.in_base(kinematics);

@@ -28,7 +28,6 @@ mod urdf;
 mod xml;
 
 use std::collections::{HashMap, HashSet};
-use std::fmt;
 use std::path::PathBuf;
 
 use crate::spatial::{Mat3, Pose, RigidInertia, Vec3};
@@ -147,26 +146,29 @@ impl Joint {
     /// Pose of the child in the parent, `x_pc(q)`, with the joint at `q` [rad or m]; `q` is ignored
     /// for a fixed joint.
     pub fn pose(&self, q: f64) -> Pose {
-        self.pose_by(q, q.sin_cos())
+        self.kind.place(&self.placement, q, q.sin_cos())
     }
+}
 
-    /// The same, with sine and cosine of `q` given.
+impl JointKind {
+    /// Pose of the child in the parent with the joint at `q` [rad or m], whose sine and cosine are
+    /// given; `placement` is that with the joint at zero.
     #[inline(always)]
-    pub(crate) fn pose_by(&self, q: f64, sin_cos: (f64, f64)) -> Pose {
+    pub(crate) fn place(&self, placement: &Pose, q: f64, sin_cos: (f64, f64)) -> Pose {
         let Pose {
             rotation,
             translation,
-        } = &self.placement;
-        match &self.kind {
-            JointKind::Revolute(axis) => Pose {
+        } = placement;
+        match self {
+            Self::Revolute(axis) => Pose {
                 rotation: axis.turn_by(rotation, sin_cos),
                 translation: *translation,
             },
-            JointKind::Prismatic(axis) => Pose {
+            Self::Prismatic(axis) => Pose {
                 rotation: *rotation,
                 translation: translation + rotation * axis.vector * q,
             },
-            JointKind::Fixed => self.placement,
+            Self::Fixed => *placement,
         }
     }
 }
@@ -178,6 +180,18 @@ pub struct Limits {
     pub lower: f64,
     /// Greatest position.
     pub upper: f64,
+}
+
+impl Limits {
+    /// The position in the middle.
+    pub fn middle(&self) -> f64 {
+        0.5 * (self.lower + self.upper)
+    }
+
+    /// The distance from the middle to either end.
+    pub fn half(&self) -> f64 {
+        0.5 * (self.upper - self.lower)
+    }
 }
 
 /// A frame fixed to a body: a URDF link, folded or not.
@@ -487,21 +501,6 @@ impl Model {
     }
 }
 
-/// A place in a URDF: `line 8: joint turn`.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Location {
-    /// The line, from 1.
-    pub line: usize,
-    /// The element that is there, such as `link chest`.
-    pub owner: String,
-}
-
-impl fmt::Display for Location {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "line {}: {}", self.line, self.owner)
-    }
-}
-
 /// Why a URDF, or a change of the model made from it, is refused. Messages say what to do.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -531,80 +530,9 @@ pub enum ModelError {
     /// No `<link>` at all.
     #[error("the URDF has no link: nothing in its <robot> is a <link>")]
     NoLinks,
-    /// Two links or two joints of one name.
-    #[error("{location}: the {kind} on line {first} has the same name; rename one of them")]
-    Duplicate {
-        /// The second one.
-        location: Location,
-        /// `link` or `joint`.
-        kind: &'static str,
-        /// The line of the first one.
-        first: usize,
-    },
-    /// An element or an attribute that is needed and is not there.
-    #[error("{location}: {what} has no {missing}{}; {remedy}", instead(.there))]
-    Missing {
-        /// The link or joint.
-        location: Location,
-        /// The element that lacks it, such as `<axis>`.
-        what: String,
-        /// What it lacks: `xyz`, or `<mass>`.
-        missing: &'static str,
-        /// The attributes that it has instead.
-        there: Vec<String>,
-        /// What to do.
-        remedy: &'static str,
-    },
-    /// An attribute that is needed and is empty.
-    #[error("{location}: {what} has an empty {attribute}; {remedy}")]
-    Empty {
-        /// The link or joint.
-        location: Location,
-        /// Its element, such as `its <axis>`.
-        what: String,
-        /// The attribute.
-        attribute: &'static str,
-        /// What to do.
-        remedy: &'static str,
-    },
-    /// An element or a value that xacro would replace.
-    #[error(
-        "{location}: {what} is not expanded: the file is a xacro; expand it first (xacro FILE > \
-         model.urdf)"
-    )]
-    Unexpanded {
-        /// The link, the joint or the robot, at the element's line.
-        location: Location,
-        /// The element, with the attribute if it is one.
-        what: String,
-    },
-    /// A joint refers to a link that does not exist.
-    #[error(
-        "{location}: its {role} link {link} is not in the URDF; correct the name or add the link"
-    )]
-    UnknownLink {
-        /// The joint.
-        location: Location,
-        /// `parent` or `child`.
-        role: &'static str,
-        /// The name that no link has.
-        link: String,
-    },
-    /// A link is the child of two joints.
-    #[error(
-        "{location}: its child {link} is already the child of joint {first} (line {line}); loops \
-         cannot be described, only trees: remove one of the joints"
-    )]
-    TwoParents {
-        /// The second joint.
-        location: Location,
-        /// The link.
-        link: String,
-        /// The first joint.
-        first: String,
-        /// Its line.
-        line: usize,
-    },
+    /// An element that is missing, wrong or of no use: `line 8: joint turn: ` and what to do.
+    #[error("{0}")]
+    Defect(String),
     /// More than one link has no parent.
     #[error(
         "links {} have no parent; a robot has one root: connect the others to it by joints, or \
@@ -612,94 +540,6 @@ pub enum ModelError {
         .0.join(", ")
     )]
     SeveralRoots(Vec<String>),
-    /// Joints that form a loop.
-    #[error("{0}: the joints above it form a loop; only trees can be described: remove a joint")]
-    Loop(Location),
-    /// A number that cannot be parsed.
-    #[error("{location}: {element} {attribute}=\"{value}\" is not {expected}")]
-    Number {
-        /// The owner of the element, at the element's line.
-        location: Location,
-        /// The element, such as `<origin>`.
-        element: String,
-        /// The attribute.
-        attribute: String,
-        /// The value as written.
-        value: String,
-        /// What is expected.
-        expected: &'static str,
-    },
-    /// NaN or infinity.
-    #[error(
-        "{location}: {element} {attribute}=\"{value}\" is not finite; write the number that it is"
-    )]
-    NotFinite {
-        /// The owner of the element, at the element's line.
-        location: Location,
-        /// The element, such as `<origin>`.
-        element: String,
-        /// The attribute.
-        attribute: String,
-        /// The value as written.
-        value: String,
-    },
-    /// The axis of a moving joint has no direction.
-    #[error("{0}: its <axis> xyz is zero; write a direction, such as xyz=\"0 0 1\"")]
-    ZeroAxis(Location),
-    /// A joint of a type that is not supported.
-    #[error("{location}: type=\"{kind}\" {}", unsupported(.kind))]
-    UnsupportedJoint {
-        /// The joint.
-        location: Location,
-        /// Its type.
-        kind: String,
-    },
-    /// A joint that cannot follow another one as its `<mimic>` says.
-    #[error("{location}: its <mimic> joint=\"{follows}\" {reason}")]
-    Mimic {
-        /// The joint.
-        location: Location,
-        /// The joint that it should follow.
-        follows: String,
-        /// Why it cannot, and what to do.
-        reason: &'static str,
-    },
-    /// A body whose mass is negative.
-    #[error(
-        "{location}: the mass is {mass} kg{}; a mass cannot be negative: correct the <mass>",
-        together(.with)
-    )]
-    NegativeMass {
-        /// The link with the least mass, at its `<inertial>`.
-        location: Location,
-        /// The mass of the body.
-        mass: f64,
-        /// The links that are fixed to it.
-        with: Vec<String>,
-    },
-    /// A body whose tensor of inertia is not positive semidefinite.
-    #[error(
-        "{location}: the inertia is not positive semidefinite (least principal moment about the \
-         centre of mass {least:.3e} kg m^2){}; no body has this inertia: correct ixx to izz of the \
-         <inertia> (about the centre of mass, in kg m^2)",
-        together(.with)
-    )]
-    InertiaNotPositive {
-        /// The link with the least moment of its own, at its `<inertial>`.
-        location: Location,
-        /// The least eigenvalue of the body's tensor [kg m^2].
-        least: f64,
-        /// The links that are fixed to it.
-        with: Vec<String>,
-    },
-    /// Moving bodies none of whose links has an `<inertial>`: per body its link and its joint.
-    #[error(
-        "{}: the mass is unknown, because no <inertial> is there or in a link fixed to it; add one \
-         (with mass 0 and inertia 0 if it is meant to be massless)",
-        .0.iter().map(|(location, joint)| format!("{location}, beyond joint {joint}"))
-            .collect::<Vec<_>>().join("; ")
-    )]
-    MissingInertial(Vec<(Location, String)>),
     /// A joint to be kept that the URDF does not have.
     #[error(
         "joint {joint}, named as the joint of an F/T sensor, is not in the URDF; any of its \
@@ -746,38 +586,6 @@ fn advice(root: &str) -> &'static str {
         "sdf" => "; convert it, for example with gz sdf or sdformat_urdf",
         "mujoco" => "; export a URDF of the same robot",
         _ => "",
-    }
-}
-
-fn instead(attributes: &[String]) -> String {
-    if attributes.is_empty() {
-        String::new()
-    } else {
-        format!(" (it has {})", attributes.join(", "))
-    }
-}
-
-fn together(with: &[String]) -> String {
-    if with.is_empty() {
-        String::new()
-    } else {
-        format!(
-            ", together with the links fixed to it ({})",
-            with.join(", ")
-        )
-    }
-}
-
-fn unsupported(kind: &str) -> &'static str {
-    match kind {
-        "floating" | "planar" => {
-            "is possible only between the root and the robot, where it is dropped because any \
-             link can be the base; remove the joint, or make it of prismatic and continuous joints"
-        }
-        "spherical" | "ball" => {
-            "is not supported; write three continuous joints with massless links between them"
-        }
-        _ => "is not a type of joint; types are revolute, continuous, prismatic and fixed",
     }
 }
 

@@ -17,7 +17,7 @@
 use crate::error::{DynamicsError, check_size};
 use crate::kinematics::Kinematics;
 use crate::solver::Solver;
-use crate::spatial::{Mat3, Motion, stack};
+use crate::spatial::{Mat3, Motion, stack, symmetric};
 use crate::structure::{ContactKind, Structure};
 use nalgebra::Matrix6;
 
@@ -116,7 +116,7 @@ impl PlaceErrors {
                 self.torque[dof] = sum * sum;
             }
         }
-        let x_bf = *kinematics.pose(frame.link) * frame.pose;
+        let x_bf = kinematics.frame_pose(frame);
         for other in structure.subtrees()[number].contacts.iter() {
             let rows = solver.contact_rows(other);
             for (i, (sum, row)) in self.contacts[other].iter_mut().zip(rows).enumerate() {
@@ -195,7 +195,7 @@ fn covariance(
     std: PlaceStd,
 ) -> Option<Matrix6<f64>> {
     let spec = &structure.contacts()[contact];
-    let x_bf = *kinematics.pose(spec.frame.link) * spec.frame.pose;
+    let x_bf = kinematics.frame_pose(&spec.frame);
     let force = x_bf.rotation * solver.contacts()[contact].wrench.force;
     // |f|^2 times the projection across f.
     let across = Mat3::from_diagonal_element(force.norm_squared()) - force * force.transpose();
@@ -207,13 +207,6 @@ fn covariance(
     let arm = x_bf.point(&spec.position).cross_matrix();
     let turned = across * direction.powi(2);
     let mixed = arm * turned;
-    let mut covariance = Matrix6::zeros();
     let torque = across * std.position.powi(2) + mixed * arm.transpose();
-    covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&torque);
-    covariance.fixed_view_mut::<3, 3>(0, 3).copy_from(&mixed);
-    covariance
-        .fixed_view_mut::<3, 3>(3, 0)
-        .copy_from(&mixed.transpose());
-    covariance.fixed_view_mut::<3, 3>(3, 3).copy_from(&turned);
-    Some(covariance)
+    Some(symmetric(&torque, &mixed, &turned))
 }

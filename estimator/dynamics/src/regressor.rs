@@ -37,8 +37,7 @@
 //!   omitted there.
 //! - The ten columns of a link are adjacent in every row, so that loops of fixed length over them
 //!   become vector instructions on any processor.
-//! - Zeros are written once. They change only with the base, and then only in the rows of joints
-//!   between the old base and the new one.
+//! - Zeros are written once. They change only with the base.
 //!
 //! The growth of the cost with the size of the robot is documented at [`Regressor`]; speeds are in
 //! docs/book/src/figures/speed.md.
@@ -51,5 +50,5 @@ mod tree;
 
 pub use estimate::EstimateRows;
 pub use link::{LINK_PARAMETERS, LinkRows, WITH_FORCE, link_regressor, link_rows};
-pub use subtree::{PresentContact, StackedRegressor, SubTreeRegressor, Weighting};
+pub use subtree::{PresentContact, StackedRegressor, SubTreeRegressor};
 pub use tree::Regressor;

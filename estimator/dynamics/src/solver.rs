@@ -37,17 +37,14 @@ mod unknowns;
 pub use estimates::{Balance, ContactSolution, Determinacy};
 pub use unknowns::unknowns;
 
-use unknowns::contact_pose;
-
 use nalgebra::{Matrix6, Vector6};
 
-use crate::error::{DynamicsError, check_size};
-use crate::kinematics::{ExternalWrench, Kinematics};
-use crate::kinematics::{check_external, check_readings};
+use crate::error::{DynamicsError, check_sizes};
+use crate::kinematics::{ExternalWrench, Kinematics, check_external, check_readings};
 use crate::least_squares::{LeastSquares, noise_factor, scale_factor};
 use crate::model::Model;
-use crate::spatial::{Mat3, Motion, Pose, Vec3, Wrench, stack};
-use crate::structure::{ContactKind, ContactSet, Route, Structure};
+use crate::spatial::{Mat3, Motion, Pose, Vec3, Wrench, stack, symmetric};
+use crate::structure::{ContactKind, ContactSet, Route, SensorCut, Structure};
 
 /// A value counts as determined if at most this fraction of it comes from the least-norm choice.
 const UNDETERMINED: f64 = 1e-9;
@@ -78,16 +75,6 @@ pub struct Solver {
     least: LeastSquares,
     columns: Vec<Vector6<f64>>,
     owners: Vec<usize>,
-    starts: Vec<usize>,
-}
-
-/// What is solved.
-#[derive(Clone, Copy)]
-struct Given<'a> {
-    model: &'a Model,
-    structure: &'a Structure,
-    kinematics: &'a Kinematics,
-    active: &'a ContactSet,
 }
 
 /// How the part of a sub-tree's imbalance that no contact explains is distributed; a single full
@@ -108,7 +95,7 @@ impl Solver {
             torque: vec![0.0; dofs],
             torque_deviation: vec![0.0; dofs],
             torque_certainty: vec![Determinacy::Assumed; dofs],
-            contacts: vec![ContactSolution::ABSENT; contacts],
+            contacts: vec![ContactSolution::absent(); contacts],
             balances: vec![
                 Balance {
                     residual: Wrench::zero(),
@@ -126,7 +113,6 @@ impl Solver {
             least: LeastSquares::with_capacity(6 * contacts),
             columns: Vec::with_capacity(6 * contacts),
             owners: Vec::with_capacity(6 * contacts),
-            starts: vec![0; contacts],
         }
     }
 
@@ -151,19 +137,14 @@ impl Solver {
         active: &ContactSet,
         external: &[ExternalWrench],
     ) -> Result<(), DynamicsError> {
-        check_size(
-            "links of the model",
-            model.link_count(),
-            self.wrenches.len(),
-        )?;
-        check_size(
-            "links of the kinematics",
-            kinematics.link_count(),
-            self.wrenches.len(),
-        )?;
+        let links = self.wrenches.len();
+        check_sizes([
+            ("links of the model", model.link_count(), links),
+            ("links of the kinematics", kinematics.link_count(), links),
+        ])?;
         self.check_structure(structure)?;
         check_readings(readings, structure.sensors().len())?;
-        check_external(external, self.wrenches.len())?;
+        check_external(external, links)?;
 
         self.active = Some(*active);
         self.wrenches.copy_from_slice(kinematics.net_wrenches());
@@ -193,14 +174,8 @@ impl Solver {
         // Of several joints with one degree of freedom, the torques add up.
         self.torque.fill(0.0);
         self.torque_certainty.fill(Determinacy::Determined);
-        let given = Given {
-            model,
-            structure,
-            kinematics,
-            active,
-        };
         for number in 0..structure.subtrees().len() {
-            self.solve_subtree(number, &given);
+            self.solve_subtree(number, model, structure, kinematics, active);
         }
         Ok(())
     }
@@ -210,52 +185,42 @@ impl Solver {
     /// # Errors
     /// [`DynamicsError::Size`].
     pub fn check_structure(&self, structure: &Structure) -> Result<(), DynamicsError> {
-        check_size(
-            "links of the structure",
-            structure.link_count(),
-            self.wrenches.len(),
-        )?;
-        check_size(
-            "degrees of freedom of the structure",
-            structure.dof_count(),
-            self.torque.len(),
-        )?;
-        check_size(
-            "contacts of the structure",
-            structure.contacts().len(),
-            self.contacts.len(),
-        )?;
-        check_size(
-            "sensors of the structure",
-            structure.sensors().len(),
-            self.sensor_poses.len(),
-        )?;
-        check_size(
-            "sub-trees of the structure",
-            structure.subtrees().len(),
-            self.balances.len(),
-        )
+        let (links, dofs) = (structure.link_count(), structure.dof_count());
+        let (contacts, sensors) = (structure.contacts().len(), structure.sensors().len());
+        let subtrees = structure.subtrees().len();
+        check_sizes([
+            ("links of the structure", links, self.wrenches.len()),
+            (
+                "degrees of freedom of the structure",
+                dofs,
+                self.torque.len(),
+            ),
+            ("contacts of the structure", contacts, self.contacts.len()),
+            ("sensors of the structure", sensors, self.sensor_poses.len()),
+            ("sub-trees of the structure", subtrees, self.balances.len()),
+        ])
     }
 
-    fn solve_subtree(&mut self, number: usize, given: &Given<'_>) {
-        let Given {
-            model,
-            structure,
-            kinematics,
-            active,
-        } = *given;
+    fn solve_subtree(
+        &mut self,
+        number: usize,
+        model: &Model,
+        structure: &Structure,
+        kinematics: &Kinematics,
+        active: &ContactSet,
+    ) {
         let subtree = &structure.subtrees()[number];
         let present = subtree.contacts.intersection(active);
         for contact in subtree.contacts.difference(active).iter() {
-            self.contacts[contact] = ContactSolution::ABSENT;
+            self.contacts[contact] = ContactSolution::absent();
             self.contact_rows[contact] = [Motion::zero(); 6];
         }
         let b = self.wrenches[subtree.top];
         let residual = match (present.iter().next(), present.len()) {
             (Some(contact), 1) if structure.contacts()[contact].kind == ContactKind::Wrench => {
-                self.solve_single(number, contact, given)
+                self.solve_single(number, contact, structure, kinematics)
             }
-            _ => self.solve_unknowns(number, &present, given),
+            _ => self.solve_unknowns(number, &present, structure, kinematics),
         };
         for link in structure.links_of(number) {
             if link == subtree.top {
@@ -292,9 +257,15 @@ impl Solver {
     }
 
     /// One full unknown wrench: it is the imbalance, moved to the contact.
-    fn solve_single(&mut self, number: usize, contact: usize, given: &Given<'_>) -> ResidualWeight {
-        let subtree = &given.structure.subtrees()[number];
-        let x_bf = contact_pose(&given.structure.contacts()[contact], given.kinematics);
+    fn solve_single(
+        &mut self,
+        number: usize,
+        contact: usize,
+        structure: &Structure,
+        kinematics: &Kinematics,
+    ) -> ResidualWeight {
+        let subtree = &structure.subtrees()[number];
+        let x_bf = kinematics.frame_pose(&structure.contacts()[contact].frame);
         self.contacts[contact] = ContactSolution {
             wrench: x_bf.wrench_back(&self.wrenches[subtree.top]),
             deviation: [0.0; 6],
@@ -371,30 +342,29 @@ impl Solver {
         sensors: &ContactSet,
         present: &ContactSet,
     ) -> Vec3 {
-        let mean = |sum: Vec3, count: usize| if count == 0 { sum } else { sum / count as f64 };
-        if sensors.is_empty() {
+        let (sum, count) = if sensors.is_empty() {
             let sum = present.iter().fold(Vec3::zeros(), |sum, contact| {
                 let spec = &structure.contacts()[contact];
-                sum + contact_pose(spec, kinematics).point(&spec.position)
+                sum + kinematics.frame_pose(&spec.frame).point(&spec.position)
             });
-            mean(sum, present.len())
+            (sum, present.len())
         } else {
-            mean(
-                sensors.iter().fold(Vec3::zeros(), |sum, k| {
-                    sum + self.sensor_poses[k].translation
-                }),
-                sensors.len(),
-            )
-        }
+            let sum = sensors.iter().fold(Vec3::zeros(), |sum, k| {
+                sum + self.sensor_poses[k].translation
+            });
+            (sum, sensors.len())
+        };
+        sum / count.max(1) as f64
     }
 
     /// Writes the columns of the unknowns of the present contacts, and factorises them.
-    fn load_unknowns(&mut self, number: usize, present: &ContactSet, given: &Given<'_>) -> Vec3 {
-        let Given {
-            structure,
-            kinematics,
-            ..
-        } = *given;
+    fn load_unknowns(
+        &mut self,
+        number: usize,
+        present: &ContactSet,
+        structure: &Structure,
+        kinematics: &Kinematics,
+    ) -> Vec3 {
         let sensors = &structure.subtrees()[number].sensors;
         let point = self.reference_point(structure, kinematics, sensors, present);
         let length = structure.length_scale;
@@ -403,7 +373,6 @@ impl Solver {
         self.owners.clear();
         for contact in present.iter() {
             let spec = &structure.contacts()[contact];
-            self.starts[contact] = self.columns.len();
             for (column, weight) in unknowns(spec, kinematics, &point, length) {
                 self.columns.push(column);
                 self.owners.push(contact);
@@ -427,22 +396,18 @@ impl Solver {
         &mut self,
         number: usize,
         present: &ContactSet,
-        given: &Given<'_>,
+        structure: &Structure,
+        kinematics: &Kinematics,
     ) -> ResidualWeight {
-        let Given {
-            structure,
-            kinematics,
-            ..
-        } = *given;
-        let point = self.load_unknowns(number, present, given);
+        let point = self.load_unknowns(number, present, structure, kinematics);
         let subtree = &structure.subtrees()[number];
         let measured = !subtree.sensors.is_empty();
         let b = self.wrenches[subtree.top].about(&point);
         let b = stack(&b.torque, &b.force);
         let mut residual = b;
+        let mut start = 0;
         for contact in present.iter() {
             let spec = &structure.contacts()[contact];
-            let start = self.starts[contact];
             let mut determined = self.least.rank() == 6 || measured;
             // Force and torque about the contact's position, each as a motion whose product with b
             // gives it.
@@ -479,6 +444,7 @@ impl Solver {
                 },
             };
             self.contact_rows[contact] = rows.map(|row| about_origin(&row, &point));
+            start += spec.kind.unknowns();
         }
 
         let weight = self.least.unexplained();
@@ -517,25 +483,14 @@ impl Solver {
                 .sum();
             self.torque_deviation[dof] = sum.sqrt();
         }
-        let Self {
-            sensor_poses,
-            contact_rows,
-            contacts,
-            ..
-        } = self;
-        let variance = |sensor: usize, motion: &Motion| {
-            variance(structure, sensor, &sensor_poses[sensor], motion)
-        };
         for subtree in structure.subtrees() {
             for contact in subtree.contacts.iter() {
-                let rows = &contact_rows[contact];
-                contacts[contact].deviation = rows.map(|row| {
-                    subtree
-                        .sensors
-                        .iter()
-                        .map(|sensor| variance(sensor, &row))
-                        .sum::<f64>()
-                        .sqrt()
+                self.contacts[contact].deviation = self.contact_rows[contact].map(|row| {
+                    let sensors = subtree.sensors.iter();
+                    let variances = sensors.map(|sensor| {
+                        variance(structure, sensor, &self.sensor_poses[sensor], &row)
+                    });
+                    variances.sum::<f64>().sqrt()
                 });
             }
         }
@@ -590,17 +545,14 @@ impl Solver {
 
     /// Covariance of `b` [torque; force] from F/T noise, about `point`.
     pub fn noise(&self, structure: &Structure, number: usize, point: &Vec3) -> Matrix6<f64> {
-        let mut covariance = Matrix6::zeros();
-        for sensor in structure.subtrees()[number].sensors.iter() {
-            add_covariance(
-                &mut covariance,
-                structure,
-                sensor,
+        let sensors = structure.subtrees()[number].sensors.iter();
+        sensors.fold(Matrix6::zeros(), |sum, sensor| {
+            sum + covariance(
+                &structure.sensors()[sensor],
                 &self.sensor_poses[sensor],
                 point,
-            );
-        }
-        covariance
+            )
+        })
     }
 
     /// Whether the last solution is for these kinematics, judged by the poses of the F/T sensors.
@@ -665,15 +617,9 @@ fn about_origin(row: &Vector6<f64>, point: &Vec3) -> Motion {
     }
 }
 
-/// Adds `X Sigma X^T` of a sensor, about `point`.
-fn add_covariance(
-    covariance: &mut Matrix6<f64>,
-    structure: &Structure,
-    sensor: usize,
-    x_bm: &Pose,
-    point: &Vec3,
-) {
-    let (r, cut) = (&x_bm.rotation, &structure.sensors()[sensor]);
+/// `X Sigma X^T` of a sensor at `x_bm`, about `point`.
+fn covariance(cut: &SensorCut, x_bm: &Pose, point: &Vec3) -> Matrix6<f64> {
+    let r = &x_bm.rotation;
     let units = cut.covariance_times(&Motion {
         angular: Vec3::repeat(1.0),
         linear: Vec3::repeat(1.0),
@@ -682,12 +628,5 @@ fn add_covariance(
     let (torque, force) = (turned(&units.torque), turned(&units.force));
     let arm = (x_bm.translation - point).cross_matrix();
     let mixed = arm * force;
-    let mut add = |row: usize, column: usize, block: &Mat3| {
-        let mut view = covariance.fixed_view_mut::<3, 3>(row, column);
-        view += block;
-    };
-    add(0, 0, &(torque + mixed * arm.transpose()));
-    add(0, 3, &mixed);
-    add(3, 0, &mixed.transpose());
-    add(3, 3, &force);
+    symmetric(&(torque + mixed * arm.transpose()), &mixed, &force)
 }

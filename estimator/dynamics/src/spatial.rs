@@ -135,9 +135,8 @@ mod inertia;
 
 pub use inertia::{Inconsistency, RigidInertia};
 
-use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
-
-use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3, Vector6};
+use derive_more::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
+use nalgebra::{Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector3, Vector6};
 
 /// A vector in three-dimensional space.
 pub type Vec3 = Vector3<f64>;
@@ -146,7 +145,7 @@ pub type Vec3 = Vector3<f64>;
 pub type Mat3 = Matrix3<f64>;
 
 /// A motion vector: angular and linear part of a twist, or the axis of a joint.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Add, AddAssign, Clone, Copy, Debug, Default, Mul, Neg, PartialEq, Sub)]
 pub struct Motion {
     /// Angular part [rad/s].
     pub angular: Vec3,
@@ -157,10 +156,7 @@ pub struct Motion {
 impl Motion {
     /// No motion.
     pub fn zero() -> Self {
-        Self {
-            angular: Vec3::zeros(),
-            linear: Vec3::zeros(),
-        }
+        Self::default()
     }
 
     /// Unit rotation about the line through `point` along `axis`, as a twist at the origin:
@@ -189,61 +185,9 @@ impl Motion {
     }
 }
 
-impl Add for Motion {
-    type Output = Self;
-    #[inline]
-    fn add(self, other: Self) -> Self {
-        Self {
-            angular: self.angular + other.angular,
-            linear: self.linear + other.linear,
-        }
-    }
-}
-
-impl Sub for Motion {
-    type Output = Self;
-    #[inline]
-    fn sub(self, other: Self) -> Self {
-        Self {
-            angular: self.angular - other.angular,
-            linear: self.linear - other.linear,
-        }
-    }
-}
-
-impl AddAssign for Motion {
-    #[inline]
-    fn add_assign(&mut self, other: Self) {
-        self.angular += other.angular;
-        self.linear += other.linear;
-    }
-}
-
-impl Neg for Motion {
-    type Output = Self;
-    #[inline]
-    fn neg(self) -> Self {
-        Self {
-            angular: -self.angular,
-            linear: -self.linear,
-        }
-    }
-}
-
-impl Mul<f64> for Motion {
-    type Output = Self;
-    #[inline]
-    fn mul(self, factor: f64) -> Self {
-        Self {
-            angular: self.angular * factor,
-            linear: self.linear * factor,
-        }
-    }
-}
-
 /// A force vector: torque about a point, and force. The same type holds a momentum (angular about
 /// the point, and linear).
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Add, AddAssign, Clone, Copy, Debug, Default, Mul, Neg, PartialEq, Sub, SubAssign)]
 pub struct Wrench {
     /// Torque about the origin of the frame in use \[Nm\].
     pub torque: Vec3,
@@ -251,20 +195,11 @@ pub struct Wrench {
     pub force: Vec3,
 }
 
-impl Default for Wrench {
-    fn default() -> Self {
-        Self::zero()
-    }
-}
-
 impl Wrench {
     /// No force, no torque.
     #[inline]
     pub fn zero() -> Self {
-        Self {
-            torque: Vec3::zeros(),
-            force: Vec3::zeros(),
-        }
+        Self::default()
     }
 
     /// A wrench from its force and torque parts, in the order of samples and logs: `[fx fy fz]`
@@ -273,6 +208,14 @@ impl Wrench {
         Self {
             torque: Vec3::from(torque),
             force: Vec3::from(force),
+        }
+    }
+
+    /// A force that acts at a point.
+    pub(crate) fn of_force(point: &Vec3, force: Vec3) -> Self {
+        Self {
+            torque: point.cross(&force),
+            force,
         }
     }
 
@@ -290,14 +233,8 @@ impl Wrench {
 
     /// The six components in the order of samples and logs, `[fx fy fz tx ty tz]` [N, Nm].
     pub fn force_first(&self) -> [f64; 6] {
-        [
-            self.force.x,
-            self.force.y,
-            self.force.z,
-            self.torque.x,
-            self.torque.y,
-            self.torque.z,
-        ]
+        let (n, f) = (&self.torque, &self.force);
+        [f.x, f.y, f.z, n.x, n.y, n.z]
     }
 
     /// Whether every component is finite.
@@ -315,70 +252,24 @@ impl Wrench {
     }
 }
 
-impl Add for Wrench {
-    type Output = Self;
-    #[inline]
-    fn add(self, other: Self) -> Self {
-        Self {
-            torque: self.torque + other.torque,
-            force: self.force + other.force,
-        }
-    }
-}
-
-impl Sub for Wrench {
-    type Output = Self;
-    #[inline]
-    fn sub(self, other: Self) -> Self {
-        Self {
-            torque: self.torque - other.torque,
-            force: self.force - other.force,
-        }
-    }
-}
-
-impl AddAssign for Wrench {
-    #[inline]
-    fn add_assign(&mut self, other: Self) {
-        self.torque += other.torque;
-        self.force += other.force;
-    }
-}
-
-impl SubAssign for Wrench {
-    #[inline]
-    fn sub_assign(&mut self, other: Self) {
-        self.torque -= other.torque;
-        self.force -= other.force;
-    }
-}
-
-impl Neg for Wrench {
-    type Output = Self;
-    #[inline]
-    fn neg(self) -> Self {
-        Self {
-            torque: -self.torque,
-            force: -self.force,
-        }
-    }
-}
-
-impl Mul<f64> for Wrench {
-    type Output = Self;
-    #[inline]
-    fn mul(self, factor: f64) -> Self {
-        Self {
-            torque: self.torque * factor,
-            force: self.force * factor,
-        }
-    }
-}
-
 /// Six numbers from two vectors: [angular; linear] or [torque; force].
 #[inline]
 pub fn stack(upper: &Vec3, lower: &Vec3) -> Vector6<f64> {
     Vector6::new(upper.x, upper.y, upper.z, lower.x, lower.y, lower.z)
+}
+
+/// The symmetric matrix `[upper, mixed; mixed^T, lower]`.
+pub(crate) fn symmetric(upper: &Mat3, mixed: &Mat3, lower: &Mat3) -> Matrix6<f64> {
+    let mut matrix = Matrix6::zeros();
+    let mut put = |row, column, block: &Mat3| {
+        let mut view = matrix.fixed_view_mut::<3, 3>(row, column);
+        view.copy_from(block);
+    };
+    put(0, 0, upper);
+    put(0, 3, mixed);
+    put(3, 0, &mixed.transpose());
+    put(3, 3, lower);
+    matrix
 }
 
 /// Pose of one frame in another: `x_ab` takes coordinates in `b` to coordinates in `a`.
@@ -506,7 +397,7 @@ fn product(a: &Mat3, b: &Mat3) -> Mat3 {
     product
 }
 
-impl Mul for Pose {
+impl std::ops::Mul for Pose {
     type Output = Self;
     /// `x_ac = x_ab * x_bc`.
     #[inline(always)]

@@ -131,13 +131,13 @@ impl SensorCut {
     /// What the sensor reads, without offset, when the parent exerts `wrench` on the child (at the
     /// origin and in the axes of the child).
     pub fn reading(&self, wrench: &Wrench) -> Wrench {
-        self.signed(self.pose.wrench_back(wrench))
+        self.pose.wrench_back(wrench) * self.sign()
     }
 
     /// The wrench that the parent exerts on the child (at the origin and in the axes of the child)
     /// when the sensor reads `reading`, offset removed.
     pub fn transmitted(&self, reading: &Wrench) -> Wrench {
-        self.signed(self.pose.wrench(reading))
+        self.pose.wrench(reading) * self.sign()
     }
 
     /// 1 if the reading is the wrench by the parent on the child, -1 if it is its opposite.
@@ -145,13 +145,6 @@ impl SensorCut {
         match self.direction {
             MeasurementDirection::ChildToParent => -1.0,
             MeasurementDirection::ParentToChild => 1.0,
-        }
-    }
-
-    fn signed(&self, wrench: Wrench) -> Wrench {
-        match self.direction {
-            MeasurementDirection::ChildToParent => -wrench,
-            MeasurementDirection::ParentToChild => wrench,
         }
     }
 
@@ -329,10 +322,10 @@ impl Structure {
             if contact.frame.link >= model.link_count() || !contact.frame.pose.is_finite() {
                 return Err(StructureError::Contact { index });
             }
-            let (position, mut direction) = (contact.position, None);
-            if let ContactKind::ForceAlong(configured) = contact.kind {
-                direction = Some(configured);
-            }
+            let (position, direction) = match contact.kind {
+                ContactKind::ForceAlong(configured) => (contact.position, Some(configured)),
+                ContactKind::Wrench | ContactKind::Force => (contact.position, None),
+            };
             contact.place(index, &position, direction.as_ref())?;
         }
         let mut places = cut_places(model, sensors)?;
@@ -459,28 +452,21 @@ impl Structure {
     ) -> Dependence {
         let place = &self.places[link];
         let subtree = &self.subtrees[place.subtree];
-        let is_below = |other: usize| (link..place.end).contains(&other);
-        let (sensors, contacts, links): (_, _, LinkSet) = match self.route_above(link, active) {
-            Route::Child => (
-                place.sensors_below,
-                place.contacts_below,
-                self.links_of(place.subtree)
-                    .filter(|&l| is_below(l))
-                    .collect(),
-            ),
+        let route = self.route_above(link, active);
+        let (sensors, contacts) = match route {
+            Route::Child => (place.sensors_below, place.contacts_below),
             Route::Parent => (
                 subtree.sensors.difference(&place.sensors_below),
                 subtree.contacts.difference(&place.contacts_below),
-                self.links_of(place.subtree)
-                    .filter(|&l| !is_below(l))
-                    .collect(),
             ),
-            Route::Fused | Route::Whole => (
-                subtree.sensors,
-                subtree.contacts,
-                self.links_of(place.subtree).collect(),
-            ),
+            Route::Fused | Route::Whole => (subtree.sensors, subtree.contacts),
         };
+        let enters = |other: &usize| match route {
+            Route::Child => self.below(link).contains(other),
+            Route::Parent => !self.below(link).contains(other),
+            Route::Fused | Route::Whole => true,
+        };
+        let links = self.links_of(place.subtree).filter(enters).collect();
         self.dependence(sensors, contacts, links, kinematics, active)
     }
 

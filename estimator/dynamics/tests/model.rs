@@ -870,9 +870,9 @@ fn a_rounding_error_of_an_inertia_is_zero() {
     // Without a mass of its own it is measured by that of the robot.
     assert!(body(0.0, -5e-17).is_ok());
     for (mass, xx) in [(1.0, -2e-9), (0.0, -1e-12), (1e-6, -3.6e-8)] {
-        let error = body(mass, xx).unwrap_err();
+        let error = body(mass, xx).unwrap_err().to_string();
         assert!(
-            matches!(error, ModelError::InertiaNotPositive { .. }),
+            error.contains("the inertia is not positive semidefinite"),
             "{error}"
         );
     }

@@ -87,7 +87,7 @@ use proprio_topics::Nanos;
 
 use crate::prior::Prior;
 use crate::robot::Robot;
-use proprio_dynamics::regressor::{StackedRegressor, Weighting};
+use proprio_dynamics::regressor::StackedRegressor;
 use proprio_dynamics::spatial::Wrench;
 use proprio_dynamics::{DynamicsError, Kinematics};
 
@@ -124,7 +124,6 @@ impl Online {
         let mut stacked = StackedRegressor::new(structure);
         let readings = vec![Wrench::zero(); structure.sensors().len()];
         stacked.update(&kinematics, &readings, &robot.always, &[])?;
-        stacked.eliminate_contacts(Weighting::Noise);
         let per = |time: Nanos| usize::try_from(time.0 / period.0.max(1)).unwrap_or(0);
         let (per_job, per_block) = (per(SOLVE + SOLVE).max(1), per(BLOCK) + 2);
         let components: Vec<Component> = (linked_subtrees(&stacked).into_iter())
@@ -217,7 +216,6 @@ impl Online {
             return Ok(());
         }
         self.stacked.update(kinematics, readings, active, &[])?;
-        self.stacked.eliminate_contacts(Weighting::Noise);
         self.newest = t;
         self.snapshot.get_or_insert(t);
         for (component, known) in self.components.iter_mut().zip(&self.solution.components) {

@@ -130,10 +130,9 @@ impl<'a> Planner<'a> {
         for posture in &mut postures {
             for (position, limits) in posture.iter_mut().zip(&task.limits) {
                 if let Some(limits) = limits {
-                    let (lower, upper) = (limits.range.lower, limits.range.upper);
                     // Where a motion may start: see `FourierSeries::within`.
                     let place = 0.8 * (2.0 * rng.f64() - 1.0);
-                    *position = 0.5 * (lower + upper) + 0.5 * (upper - lower) * place;
+                    *position = limits.range.middle() + limits.range.half() * place;
                 }
             }
         }
@@ -304,9 +303,8 @@ impl<'a> Planner<'a> {
         let mut numbers = Vec::new();
         for (limits, position) in self.task.limits.iter().zip(start) {
             if let Some(limits) = limits {
-                let (lower, upper) = (limits.range.lower, limits.range.upper);
-                let half = (0.5 * (upper - lower)).max(f64::MIN_POSITIVE);
-                let place = (position - 0.5 * (lower + upper)) / (0.8 * half);
+                let half = limits.range.half().max(f64::MIN_POSITIVE);
+                let place = (position - limits.range.middle()) / (0.8 * half);
                 numbers.push(place.clamp(-0.99, 0.99).atanh());
                 numbers.extend((0..2 * count).map(|_| normal(rng)));
             }
@@ -316,13 +314,12 @@ impl<'a> Planner<'a> {
 
     /// The criterion; infinite if the start is outside a box.
     fn cost(&self, numbers: &[f64]) -> f64 {
-        let Ok(Some(series)) = self.series(numbers) else {
-            return f64::INFINITY;
+        let covariance = || {
+            let series = self.series(numbers).ok()??;
+            let observations = self.observations(&series).ok()?;
+            self.forecast.after(observations).ok()
         };
-        let Ok(observations) = self.observations(&series) else {
-            return f64::INFINITY;
-        };
-        let Ok(covariance) = self.forecast.after(observations) else {
+        let Some(covariance) = covariance() else {
             return f64::INFINITY;
         };
         let deviations = self.rows.deviations(&covariance.root);

@@ -86,8 +86,7 @@ pub fn only(robot: &Robot, moving: &[usize]) -> Regime {
     }
     for (dof, motion) in regime.joints.iter_mut().enumerate() {
         if *motion == JointMotion::Moving && !moving.contains(&dof) {
-            let range = range(&robot.model, dof);
-            *motion = JointMotion::Locked(0.5 * (range.lower + range.upper));
+            *motion = JointMotion::Locked(range(&robot.model, dof).middle());
         }
     }
     regime
@@ -176,8 +175,7 @@ pub fn at_rest(
     let mut state = MotionState::at_rest(robot.position_without_samples());
     for (dof, position) in state.position.iter_mut().enumerate() {
         if robot.locked[dof].is_nan() {
-            let range = range(&robot.model, dof);
-            *position = 0.5 * (range.lower + range.upper);
+            *position = range(&robot.model, dof).middle();
         }
     }
     let mut puppet = Puppet::new(robot)?;

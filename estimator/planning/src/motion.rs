@@ -85,11 +85,10 @@ impl<'a> Outside<'a> {
         let state = MotionState::at_rest(position.to_vec());
         let motion = FrameMotion::standing(&Vec3::zeros());
         (self.kinematics).update(&self.robot.model, state.joints(), &motion)?;
-        let pose = |frame: &Frame| *self.kinematics.pose(frame.link) * frame.pose;
-        let base = pose(&fence.base).inverse();
+        let base = self.kinematics.frame_pose(&fence.base).inverse();
         let points = fence.points.iter();
         Ok(points
-            .map(|point| (base * pose(point)).translation)
+            .map(|point| (base * self.kinematics.frame_pose(point)).translation)
             .collect())
     }
 
@@ -198,12 +197,11 @@ impl FourierSeries {
             let Some(limits) = limits else {
                 return (still, Vec::new());
             };
-            let Limits { lower, upper } = limits.range;
-            let half = 0.5 * (upper - lower);
+            let (middle, half) = (limits.range.middle(), limits.range.half());
             let [place, series @ ..] = chunks.next().unwrap_or_default() else {
-                return (0.5 * (lower + upper), Vec::new());
+                return (middle, Vec::new());
             };
-            let start = 0.5 * (lower + upper) + 0.8 * half * place.tanh();
+            let start = middle + 0.8 * half * place.tanh();
             let pairs = series.chunks_exact(2).zip(1..);
             let pairs = pairs.map(|(pair, k)| {
                 let rate = TAU * CYCLES * f64::from(k) / seconds;

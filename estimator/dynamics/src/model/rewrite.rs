@@ -20,7 +20,7 @@ use std::ops::Range;
 
 use nalgebra::Matrix4;
 
-use super::xml::ElementRef;
+use super::xml::{Document, ElementRef};
 use super::{Model, ModelError, urdf};
 use crate::spatial::{Mat3, Pose, RigidInertia};
 
@@ -33,89 +33,6 @@ struct Portion<'a> {
     pose: Pose,
     /// In the body's frame.
     old: RigidInertia,
-}
-
-/// `text` with the inertia of each body of its model ([`Model::from_urdf`] with the same `keep`)
-/// replaced by that of `inertias`.
-///
-/// A body whose inertia equals that of the URDF, bit for bit, is left as written.
-///
-/// # Errors
-/// As [`Model::from_urdf`]; the number of inertias differs from that of the bodies, or an inertia
-/// is not finite.
-pub(super) fn rewrite(
-    text: &str,
-    keep: &[&str],
-    inertias: &[RigidInertia],
-) -> Result<String, ModelError> {
-    let mut model = Model::from_urdf(text, keep)?;
-    if inertias.len() != model.link_count() {
-        return Err(ModelError::InertiaCount {
-            given: inertias.len(),
-            needed: model.link_count(),
-        });
-    }
-    let before = model.inertias().to_vec();
-    for (link, inertia) in inertias.iter().enumerate() {
-        model.set_inertia(link, *inertia)?;
-    }
-    let document = urdf::parse(text)?;
-    let raw = urdf::link_inertias(&document)?;
-    let mut bodies: Vec<Vec<Portion<'_>>> = before.iter().map(|_| Vec::new()).collect();
-    for (name, inertia) in &raw {
-        if let Some(frame) = model.frame(name) {
-            bodies[frame.link].push(Portion {
-                name,
-                pose: frame.pose,
-                old: inertia.transformed(&frame.pose),
-            });
-        }
-    }
-    // The body between a moving joint and the F/T sensor in it is no link of the URDF; the link
-    // beyond it gets its inertia.
-    let mut inertias = inertias.to_vec();
-    for joint in model.joints() {
-        if bodies[joint.parent].is_empty() {
-            inertias[joint.child] = inertias[joint.child] + inertias[joint.parent];
-        }
-    }
-    let mut changed = HashMap::new();
-    for (body, shares) in bodies.iter().enumerate() {
-        if inertias[body] == before[body] {
-            continue;
-        }
-        let top = model.link_name(body);
-        for (share, inertia) in
-            shares
-                .iter()
-                .zip(distribute(shares, top, &before[body], &inertias[body]))
-        {
-            if inertia != Some(share.old) {
-                changed.insert(
-                    share.name,
-                    inertia.map(|i| i.transformed(&share.pose.inverse())),
-                );
-            }
-        }
-    }
-    let mut patches = Vec::new();
-    for node in urdf::robot(&document)?
-        .children()
-        .filter(|node| node.name() == "link")
-    {
-        if let Some(inertia) = node.attribute("name").and_then(|name| changed.get(name)) {
-            patch(text, node, inertia.as_ref(), &mut patches);
-        }
-    }
-    patches.sort_by_key(|(range, _)| range.start);
-    let (mut out, mut end) = (String::with_capacity(text.len() + 4096), 0);
-    for (range, new) in patches {
-        out.push_str(text.get(end..range.start).unwrap_or_default());
-        out.push_str(&new);
-        end = range.end;
-    }
-    out.push_str(text.get(end..).unwrap_or_default());
-    Ok(out)
 }
 
 /// The new inertia of each share, in the body's frame; `None` where the link loses its
@@ -153,7 +70,7 @@ fn distribute(
         for (i, share) in shares.iter().enumerate() {
             if i != main && !nothing(share) {
                 let body = from_pseudo(&(map * share.old.pseudo_inertia() * map.transpose()));
-                rest = rest + scaled(&body, -1.0);
+                rest = rest - body;
                 result[i] = Some(body);
             }
         }
@@ -186,14 +103,6 @@ fn from_pseudo(pseudo: &Matrix4<f64>) -> RigidInertia {
         mass: pseudo[(3, 3)],
         first_moment: pseudo.fixed_view::<3, 1>(0, 3).into_owned(),
         inertia: Mat3::from_diagonal_element(sigma.trace()) - sigma,
-    }
-}
-
-fn scaled(inertia: &RigidInertia, factor: f64) -> RigidInertia {
-    RigidInertia {
-        mass: inertia.mass * factor,
-        first_moment: inertia.first_moment * factor,
-        inertia: inertia.inertia * factor,
     }
 }
 
@@ -293,6 +202,73 @@ impl Model {
         keep: &[&str],
         inertias: &[RigidInertia],
     ) -> Result<String, ModelError> {
-        rewrite(text, keep, inertias)
+        let mut model = Self::from_urdf(text, keep)?;
+        if inertias.len() != model.link_count() {
+            return Err(ModelError::InertiaCount {
+                given: inertias.len(),
+                needed: model.link_count(),
+            });
+        }
+        let before = model.inertias().to_vec();
+        for (link, inertia) in inertias.iter().enumerate() {
+            model.set_inertia(link, *inertia)?;
+        }
+        let document = Document::parse(text)?;
+        let raw = urdf::link_inertias(&document)?;
+        let mut bodies: Vec<Vec<Portion<'_>>> = before.iter().map(|_| Vec::new()).collect();
+        for (name, inertia) in &raw {
+            if let Some(frame) = model.frame(name) {
+                bodies[frame.link].push(Portion {
+                    name,
+                    pose: frame.pose,
+                    old: inertia.transformed(&frame.pose),
+                });
+            }
+        }
+        // The body between a moving joint and the F/T sensor in it is no link of the URDF; the link
+        // beyond it gets its inertia.
+        let mut inertias = inertias.to_vec();
+        for joint in model.joints() {
+            if bodies[joint.parent].is_empty() {
+                inertias[joint.child] = inertias[joint.child] + inertias[joint.parent];
+            }
+        }
+        let mut changed = HashMap::new();
+        for (body, shares) in bodies.iter().enumerate() {
+            if inertias[body] == before[body] {
+                continue;
+            }
+            let top = model.link_name(body);
+            for (share, inertia) in
+                shares
+                    .iter()
+                    .zip(distribute(shares, top, &before[body], &inertias[body]))
+            {
+                if inertia != Some(share.old) {
+                    changed.insert(
+                        share.name,
+                        inertia.map(|i| i.transformed(&share.pose.inverse())),
+                    );
+                }
+            }
+        }
+        let mut patches = Vec::new();
+        for node in urdf::robot(&document)?
+            .children()
+            .filter(|node| node.name() == "link")
+        {
+            if let Some(inertia) = node.attribute("name").and_then(|name| changed.get(name)) {
+                patch(text, node, inertia.as_ref(), &mut patches);
+            }
+        }
+        patches.sort_by_key(|(range, _)| range.start);
+        let (mut out, mut end) = (String::with_capacity(text.len() + 4096), 0);
+        for (range, new) in patches {
+            out.push_str(text.get(end..range.start).unwrap_or_default());
+            out.push_str(&new);
+            end = range.end;
+        }
+        out.push_str(text.get(end..).unwrap_or_default());
+        Ok(out)
     }
 }

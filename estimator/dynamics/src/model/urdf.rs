@@ -13,8 +13,8 @@ mod elements;
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
-use self::elements::{check_expanded, location, numbers, once, part, read_sensors, required};
-use super::xml::{self, Document, ElementRef, XmlError};
+use self::elements::{check_expanded, defect, numbers, once, part, place, read_sensors, required};
+use super::xml::{self, Document, ElementRef};
 use super::{
     AxisKind, Frame, Joint, JointAxis, JointFacts, JointKind, Limits, MeasurementDirection,
     MeasurementFrame, Model, ModelError, POINT, SensorElement, Unread,
@@ -24,6 +24,9 @@ use crate::spatial::{Mat3, Pose, RigidInertia, Vec3};
 /// Tolerance on the signs of principal moments, relative to the greatest: a URDF is written by hand
 /// or with six digits.
 const INERTIA_TOLERANCE: f64 = 1e-5;
+
+/// Numbers of links or joints by their names, in the order of the text.
+type Numbers<'d> = HashMap<&'d str, usize>;
 
 /// A link of the URDF, before folding.
 struct UrdfLink<'d> {
@@ -50,36 +53,6 @@ struct UrdfJoint<'d> {
     velocity: Option<f64>,
     /// The joint that it follows, with multiplier and offset.
     mimic: Option<(&'d str, f64, f64)>,
-}
-
-/// Reads and checks a URDF, folds fixed joints and numbers the result.
-pub(super) fn read(text: &str, keep: &[&str]) -> Result<Model, ModelError> {
-    let document = parse(text)?;
-    let robot = robot(&document)?;
-    let mut warnings = Vec::new();
-    let (sensors, unread) = read_sensors(robot, &mut warnings);
-    let (links, numbers) = read_links(robot, &mut warnings)?;
-    let mut joints = read_joints(robot, &numbers, &mut warnings)?;
-    let tree = Tree::build(&links, &joints, &mut warnings)?;
-    check_kept(keep, &joints, &sensors)?;
-    let coordinates = Coordinates::of(&mut joints, &mut warnings)?;
-    Folding {
-        links: &links,
-        joints: &joints,
-        keep: keep.iter().copied().collect(),
-        coordinates,
-    }
-    .fold(
-        &tree,
-        robot.attribute("name").unwrap_or_default().to_owned(),
-        (sensors, unread),
-        warnings,
-    )
-}
-
-/// The XML of a text.
-pub(super) fn parse(text: &str) -> Result<Document<'_>, ModelError> {
-    Document::parse(text).map_err(|XmlError { line, reason }| ModelError::Syntax { line, reason })
 }
 
 /// The `<robot>` of a document.
@@ -121,8 +94,7 @@ fn origin(node: ElementRef<'_>, owner: ElementRef<'_>) -> Result<Pose, ModelErro
 /// The name of a link or a joint, which must be the first of its name.
 fn name<'d>(
     node: ElementRef<'d>,
-    kind: &'static str,
-    seen: &mut HashMap<&'d str, usize>,
+    seen: &mut Numbers<'d>,
     nodes: impl Fn(usize) -> ElementRef<'d>,
 ) -> Result<&'d str, ModelError> {
     let name = required(
@@ -133,22 +105,23 @@ fn name<'d>(
     )?;
     match seen.insert(name, seen.len()) {
         None => Ok(name),
-        Some(first) => Err(ModelError::Duplicate {
-            location: location(node, node),
-            kind,
-            first: nodes(first).line(),
-        }),
+        Some(first) => {
+            let (kind, first) = (node.name(), nodes(first).line());
+            let what =
+                format_args!("the {kind} on line {first} has the same name; rename one of them");
+            Err(defect(node, node, what))
+        }
     }
 }
 
 fn read_links<'d>(
     robot: ElementRef<'d>,
     warnings: &mut Vec<String>,
-) -> Result<(Vec<UrdfLink<'d>>, HashMap<&'d str, usize>), ModelError> {
+) -> Result<(Vec<UrdfLink<'d>>, Numbers<'d>), ModelError> {
     let mut links: Vec<UrdfLink<'_>> = Vec::new();
     let mut numbers = HashMap::new();
     for node in robot.children().filter(|node| node.name() == "link") {
-        let name = name(node, "link", &mut numbers, |first| links[first].node)?;
+        let name = name(node, &mut numbers, |first| links[first].node)?;
         let mut link = UrdfLink {
             node,
             name,
@@ -176,9 +149,9 @@ fn read_inertia(
 ) -> Result<(), ModelError> {
     let (owner, name) = (link.node, link.name);
     once(inertial, owner, &["origin", "mass", "inertia"], warnings);
-    let mass = part(inertial, owner, "<mass>", "add <mass value=\"...\"/> in kg")?;
+    let mass = part(inertial, owner, "mass", "add <mass value=\"...\"/> in kg")?;
     let remedy = "add <inertia ixx=\"...\" .../> about the centre of mass, in kg m^2";
-    let tensor = part(inertial, owner, "<inertia>", remedy)?;
+    let tensor = part(inertial, owner, "inertia", remedy)?;
     let number = |node: ElementRef<'_>, attribute, remedy| {
         required(node, owner, attribute, remedy)?;
         numbers(node, owner, attribute).map(|one| one.map_or(0.0, |[number]| number))
@@ -220,13 +193,13 @@ fn read_inertia(
 
 fn read_joints<'d>(
     robot: ElementRef<'d>,
-    links: &HashMap<&'d str, usize>,
+    links: &Numbers<'d>,
     warnings: &mut Vec<String>,
-) -> Result<Vec<UrdfJoint<'d>>, ModelError> {
+) -> Result<(Vec<UrdfJoint<'d>>, Numbers<'d>), ModelError> {
     let mut joints: Vec<UrdfJoint<'_>> = Vec::new();
-    let mut seen = HashMap::new();
+    let mut numbers = HashMap::new();
     for node in robot.children().filter(|node| node.name() == "joint") {
-        let name = name(node, "joint", &mut seen, |first| joints[first].node)?;
+        let name = name(node, &mut numbers, |first| joints[first].node)?;
         let used = ["origin", "parent", "child", "axis", "limit", "mimic"];
         once(node, node, &used, warnings);
         let joint = read_joint(node, name, links)?;
@@ -239,7 +212,7 @@ fn read_joints<'d>(
         }
         joints.push(joint);
     }
-    Ok(joints)
+    Ok((joints, numbers))
 }
 
 /// Whether a joint has a coordinate; one without a kind lets the whole robot float.
@@ -250,40 +223,33 @@ fn is_moving(kind: Option<&JointKind>) -> bool {
 fn read_joint<'d>(
     node: ElementRef<'d>,
     name: &'d str,
-    links: &HashMap<&'d str, usize>,
+    links: &Numbers<'d>,
 ) -> Result<UrdfJoint<'d>, ModelError> {
     let types = "write type=\"revolute\", \"continuous\", \"prismatic\" or \"fixed\"";
     let word = required(node, node, "type", types)?;
-    let link = |role, tag, remedy| {
-        let element = part(node, node, tag, remedy)?;
+    let link = |role, remedy| {
+        let element = part(node, node, role, remedy)?;
         let link = required(
             element,
             node,
             "link",
             "write link=\"...\", the name of a link",
         )?;
-        links
-            .get(link)
-            .copied()
-            .ok_or_else(|| ModelError::UnknownLink {
-                location: location(element, node),
-                role,
-                link: link.to_owned(),
-            })
+        links.get(link).copied().ok_or_else(|| {
+            let what = format_args!(
+                "its {role} link {link} is not in the URDF; correct the name or add the link"
+            );
+            defect(element, node, what)
+        })
     };
-    let parent = link("parent", "<parent>", "add <parent link=\"...\"/>")?;
-    let child = link("child", "<child>", "add <child link=\"...\"/>")?;
+    let parent = link("parent", "add <parent link=\"...\"/>")?;
+    let child = link("child", "add <child link=\"...\"/>")?;
     let kind = match word {
         "revolute" | "continuous" => Some(JointKind::Revolute(axis(node)?)),
         "prismatic" => Some(JointKind::Prismatic(axis(node)?)),
         "fixed" => Some(JointKind::Fixed),
         "floating" | "planar" => None,
-        _ => {
-            return Err(ModelError::UnsupportedJoint {
-                location: location(node, node),
-                kind: word.to_owned(),
-            });
-        }
+        _ => return Err(unsupported(node)),
     };
     let moves = is_moving(kind.as_ref());
     let limit = |attribute| match node.child("limit") {
@@ -319,6 +285,22 @@ fn read_joint<'d>(
     })
 }
 
+/// The error that a joint of this type is.
+fn unsupported(joint: ElementRef<'_>) -> ModelError {
+    let kind = joint.attribute("type").unwrap_or_default();
+    let what = match kind {
+        "floating" | "planar" => {
+            "is possible only between the root and the robot, where it is dropped because any \
+             link can be the base; remove the joint, or make it of prismatic and continuous joints"
+        }
+        "spherical" | "ball" => {
+            "is not supported; write three continuous joints with massless links between them"
+        }
+        _ => "is not a type of joint; types are revolute, continuous, prismatic and fixed",
+    };
+    defect(joint, joint, format_args!("type=\"{kind}\" {what}"))
+}
+
 /// The direction of a joint's `<axis>`, x without one.
 fn axis(node: ElementRef<'_>) -> Result<JointAxis, ModelError> {
     let Some(axis) = node.child("axis") else {
@@ -330,7 +312,8 @@ fn axis(node: ElementRef<'_>) -> Result<JointAxis, ModelError> {
     let remedy = "write its direction, such as xyz=\"0 0 1\"";
     required(axis, node, "xyz", remedy)?;
     let direction = numbers(axis, node, "xyz")?.unwrap_or_default();
-    JointAxis::new(Vec3::from(direction)).ok_or_else(|| ModelError::ZeroAxis(location(axis, node)))
+    let zero = "its <axis> xyz is zero; write a direction, such as xyz=\"0 0 1\"";
+    JointAxis::new(Vec3::from(direction)).ok_or_else(|| defect(axis, node, zero))
 }
 
 /// The joint that a joint follows, with multiplier and offset.
@@ -343,21 +326,6 @@ fn mimic(node: ElementRef<'_>) -> Result<Option<(&str, f64, f64)>, ModelError> {
     let [multiplier] = numbers(mimic, node, "multiplier")?.unwrap_or([1.0]);
     let [offset] = numbers(mimic, node, "offset")?.unwrap_or([0.0]);
     Ok(Some((follows, multiplier, offset)))
-}
-
-/// The pose of a joint's child in the joint's parent, with the joint at a position.
-fn moved(placement: &Pose, kind: Option<JointKind>, position: f64) -> Pose {
-    let (kind, placement) = (kind.unwrap_or(JointKind::Fixed), *placement);
-    Joint {
-        kind,
-        parent: 0,
-        child: 0,
-        placement,
-        dof: None,
-        ratio: 0.0,
-        offset: 0.0,
-    }
-    .pose(position)
 }
 
 /// The URDF's tree: its root, and the joints below each link in the order of the file.
@@ -378,12 +346,14 @@ impl Tree {
         let mut children = vec![Vec::new(); links.len()];
         for (number, joint) in joints.iter().enumerate() {
             if let Some(first) = above[joint.child].replace(number) {
-                return Err(ModelError::TwoParents {
-                    location: location(joint.node, joint.node),
-                    link: links[joint.child].name.to_owned(),
-                    first: joints[first].name.to_owned(),
-                    line: joints[first].node.line(),
-                });
+                let what = format_args!(
+                    "its child {} is already the child of joint {} (line {}); loops cannot be \
+                     described, only trees: remove one of the joints",
+                    links[joint.child].name,
+                    joints[first].name,
+                    joints[first].node.line()
+                );
+                return Err(defect(joint.node, joint.node, what));
             }
             children[joint.parent].push(number);
         }
@@ -407,7 +377,9 @@ impl Tree {
         }
         if let Some(lost) = reached.iter().position(|&found| !found) {
             let node = links[lost].node;
-            return Err(ModelError::Loop(location(node, node)));
+            let what =
+                "the joints above it form a loop; only trees can be described: remove a joint";
+            return Err(defect(node, node, what));
         }
         let mut tree = Self {
             // There is one, because it was reached.
@@ -448,10 +420,7 @@ impl Tree {
         let is_robot = |joint: &&UrdfJoint<'_>| !self.dropped.contains(&joint.parent);
         match (joints.iter().filter(is_robot)).find(|joint| joint.kind.is_none()) {
             None => Ok(()),
-            Some(joint) => Err(ModelError::UnsupportedJoint {
-                location: location(joint.node, joint.node),
-                kind: joint.node.attribute("type").unwrap_or_default().to_owned(),
-            }),
+            Some(joint) => Err(unsupported(joint.node)),
         }
     }
 }
@@ -497,20 +466,24 @@ impl Coordinates {
     /// Degrees of freedom are numbered in the order of the file. A joint with a `<mimic>` has the
     /// one of the joint that it follows, if necessary through others. One that follows a fixed
     /// joint is made fixed where that holds it.
-    fn of(joints: &mut [UrdfJoint<'_>], warnings: &mut Vec<String>) -> Result<Self, ModelError> {
-        let names: HashSet<&str> = joints.iter().map(|joint| joint.name).collect();
+    fn of(
+        joints: &mut [UrdfJoint<'_>],
+        numbers: &Numbers<'_>,
+        warnings: &mut Vec<String>,
+    ) -> Result<Self, ModelError> {
         for joint in joints.iter_mut() {
-            if let Some((leader, ..)) = joint.mimic.filter(|(leader, ..)| !names.contains(leader)) {
+            let is_unknown = |(leader, ..): &(&str, f64, f64)| !numbers.contains_key(leader);
+            if let Some((leader, ..)) = joint.mimic.filter(is_unknown) {
                 let mimic = joint.node.child("mimic").unwrap_or(joint.node);
                 warnings.push(format!(
                     "{}: its <mimic> joint=\"{leader}\" is not a joint of the URDF: it is taken as \
                      a joint of its own, which is measured or in [locked]",
-                    location(mimic, joint.node)
+                    place(mimic, joint.node)
                 ));
                 joint.mimic = None;
             }
         }
-        let coordinates = Self::resolve(joints)?;
+        let coordinates = Self::resolve(joints, numbers)?;
         for &(number, leader, position) in &coordinates.held {
             let leader = joints[leader].name;
             let joint = &mut joints[number];
@@ -519,42 +492,39 @@ impl Coordinates {
                  {position}",
                 joint.name
             ));
-            joint.origin = moved(&joint.origin, joint.kind, position);
-            joint.kind = Some(JointKind::Fixed);
+            if let Some(kind) = joint.kind.replace(JointKind::Fixed) {
+                joint.origin = kind.place(&joint.origin, position, position.sin_cos());
+            }
         }
         Ok(coordinates)
     }
 
     /// The same without changing the joints.
-    fn resolve(joints: &[UrdfJoint<'_>]) -> Result<Self, ModelError> {
+    fn resolve(joints: &[UrdfJoint<'_>], numbers: &Numbers<'_>) -> Result<Self, ModelError> {
         let moves = |joint: &UrdfJoint<'_>| is_moving(joint.kind.as_ref());
         let leads = |joint: &UrdfJoint<'_>| moves(joint) && joint.mimic.is_none();
         let leaders: Vec<usize> = (0..joints.len()).filter(|&j| leads(&joints[j])).collect();
-        let numbers: HashMap<&str, usize> =
-            joints.iter().map(|j| j.name).zip(0..joints.len()).collect();
         let (mut of, mut held) = (Vec::with_capacity(joints.len()), Vec::new());
         for (number, joint) in joints.iter().enumerate() {
             if !moves(joint) {
                 of.push(None);
                 continue;
             }
-            let (mut leader, mut ratio, mut offset) = (joint, 1.0, 0.0);
+            let (mut leader, mut ratio, mut offset) = (number, 1.0, 0.0);
             for steps in 0.. {
-                let Some((follows, multiplier, shift)) = leader.mimic else {
+                let UrdfJoint { node, mimic, .. } = joints[leader];
+                let Some((follows, multiplier, shift)) = mimic else {
                     break;
                 };
-                let error = |reason| ModelError::Mimic {
-                    location: leader.node.child("mimic").map_or_else(
-                        || location(leader.node, leader.node),
-                        |mimic| location(mimic, leader.node),
-                    ),
-                    follows: follows.to_owned(),
-                    reason,
+                let error = |reason| {
+                    let element = node.child("mimic").unwrap_or(node);
+                    let what = format_args!("its <mimic> joint=\"{follows}\" {reason}");
+                    defect(element, node, what)
                 };
-                let Some(next) = numbers.get(follows).and_then(|&number| joints.get(number)) else {
+                let Some(&next) = numbers.get(follows) else {
                     break;
                 };
-                if next.kind.is_none() {
+                if joints[next].kind.is_none() {
                     return Err(error(
                         "is the motion of the whole robot; name a joint of the robot, or remove \
                          the <mimic>",
@@ -569,14 +539,10 @@ impl Coordinates {
                 (ratio, offset) = (ratio * multiplier, ratio * shift + offset);
                 leader = next;
             }
-            if !moves(leader) {
-                held.extend(
-                    numbers
-                        .get(leader.name)
-                        .map(|&leader| (number, leader, offset)),
-                );
+            if !moves(&joints[leader]) {
+                held.push((number, leader, offset));
             }
-            let dof = leaders.iter().position(|&l| joints[l].name == leader.name);
+            let dof = leaders.iter().position(|&other| other == leader);
             of.push(dof.map(|dof| (dof, ratio, offset)));
         }
         Ok(Self { of, leaders, held })
@@ -656,7 +622,8 @@ impl Folding<'_, '_> {
             self.check_body(&members, &inertia, total, &mut model.warnings)?;
             match above {
                 Some((number, ..)) if !has_inertial => {
-                    unknown.push((location(node, node), self.joints[number].name.to_owned()));
+                    let joint = self.joints[number].name;
+                    unknown.push(format!("{}, beyond joint {joint}", place(node, node)));
                 }
                 Some((number, ..)) if inertia.mass == 0.0 => model.warnings.push(format!(
                     "link {name}: the body that joint {} moves is massless",
@@ -679,7 +646,11 @@ impl Folding<'_, '_> {
             }));
         }
         if !unknown.is_empty() {
-            return Err(ModelError::MissingInertial(unknown));
+            return Err(ModelError::Defect(format!(
+                "{}: the mass is unknown, because no <inertial> is there or in a link fixed to it; \
+                 add one (with mass 0 and inertia 0 if it is meant to be massless)",
+                unknown.join("; ")
+            )));
         }
         Ok(model)
     }
@@ -779,37 +750,37 @@ impl Folding<'_, '_> {
         // What the sum of the robot's masses, with arms of a metre, has as rounding error.
         let rounding = f64::EPSILON * total;
         let slack = INERTIA_TOLERANCE * moments.amax() + POINT * body.mass.abs() + rounding;
-        let named = |worst: Option<&usize>| {
-            let worst = worst.copied().unwrap_or(members[0]);
-            let link = &self.links[worst];
-            let node = link.node.child("inertial").unwrap_or(link.node);
-            let others = members.iter().filter(|&&other| other != worst);
-            let others = others.map(|&other| &self.links[other]);
-            let others = others.filter(|other| other.has_inertial);
-            let names = others.map(|other| other.name.to_owned()).collect();
-            (location(node, link.node), names)
+        // Names the worst of the links, and those that are fixed to it.
+        let refused = |value: &dyn Fn(&UrdfLink<'_>) -> f64, what: String, remedy| {
+            let links = || members.iter().map(|&link| &self.links[link]);
+            let worst = links().min_by(|a, b| value(a).total_cmp(&value(b)));
+            let worst = worst.unwrap_or(&self.links[members[0]]);
+            let others = links().filter(|other| other.name != worst.name && other.has_inertial);
+            let others: Vec<&str> = others.map(|other| other.name).collect();
+            let together = if others.is_empty() {
+                String::new()
+            } else {
+                let others = others.join(", ");
+                format!(", together with the links fixed to it ({others})")
+            };
+            let node = worst.node.child("inertial").unwrap_or(worst.node);
+            let what = format_args!("{what}{together}; {remedy}");
+            Err(defect(node, worst.node, what))
         };
         if body.mass < -rounding {
-            let mass = |&link: &usize| self.links[link].inertia.mass;
-            let worst = (members.iter()).min_by(|a, b| mass(a).total_cmp(&mass(b)));
-            let (location, with) = named(worst);
-            return Err(ModelError::NegativeMass {
-                location,
-                mass: body.mass,
-                with,
-            });
+            let what = format!("the mass is {} kg", body.mass);
+            let remedy = "a mass cannot be negative: correct the <mass>";
+            return refused(&|link| link.inertia.mass, what, remedy);
         }
-        let negative = |&link: &usize| self.links[link].negative.unwrap_or(0.0);
         if moments.min() < -slack {
-            let worst = members
-                .iter()
-                .min_by(|a, b| negative(a).total_cmp(&negative(b)));
-            let (location, with) = named(worst);
-            return Err(ModelError::InertiaNotPositive {
-                location,
-                least: moments.min(),
-                with,
-            });
+            let what = format!(
+                "the inertia is not positive semidefinite (least principal moment about the \
+                 centre of mass {:.3e} kg m^2)",
+                moments.min()
+            );
+            let remedy = "no body has this inertia: correct ixx to izz of the <inertia> (about the \
+                          centre of mass, in kg m^2)";
+            return refused(&|link| link.negative.unwrap_or(0.0), what, remedy);
         }
         for link in members.iter().map(|&link| &self.links[link]) {
             let name = link.name;
@@ -840,7 +811,27 @@ impl Model {
     /// The first error found ([`ModelError`]). Oddities that are not errors become lines of
     /// [`Model::warnings`].
     pub fn from_urdf(text: &str, keep: &[&str]) -> Result<Self, ModelError> {
-        read(text, keep)
+        let document = Document::parse(text)?;
+        let robot = robot(&document)?;
+        let mut warnings = Vec::new();
+        let (sensors, unread) = read_sensors(robot, &mut warnings);
+        let (links, numbers) = read_links(robot, &mut warnings)?;
+        let (mut joints, numbers) = read_joints(robot, &numbers, &mut warnings)?;
+        let tree = Tree::build(&links, &joints, &mut warnings)?;
+        check_kept(keep, &joints, &sensors)?;
+        let coordinates = Coordinates::of(&mut joints, &numbers, &mut warnings)?;
+        Folding {
+            links: &links,
+            joints: &joints,
+            keep: keep.iter().copied().collect(),
+            coordinates,
+        }
+        .fold(
+            &tree,
+            robot.attribute("name").unwrap_or_default().to_owned(),
+            (sensors, unread),
+            warnings,
+        )
     }
 
     /// [`Model::from_urdf`] on a file.

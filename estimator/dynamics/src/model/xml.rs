@@ -16,6 +16,8 @@ use quick_xml::escape::unescape;
 use quick_xml::events::Event;
 use quick_xml::events::attributes::Attributes;
 
+use super::ModelError;
+
 /// The text of a file: in the encoding of its byte order mark or of its declaration, else UTF-8,
 /// else, because many editors wrote it undeclared, Windows-1252 (which includes Latin-1). A
 /// declaration of another encoding is changed to UTF-8, so that the text can be written as such.
@@ -63,15 +65,6 @@ fn declared(text: &str) -> Option<(Range<usize>, String)> {
     Some((from..from + length, label.to_owned()))
 }
 
-/// Why a text is not XML.
-#[derive(Debug)]
-pub(super) struct XmlError {
-    /// The line of the text.
-    pub(super) line: usize,
-    /// What is wrong.
-    pub(super) reason: String,
-}
-
 #[derive(Debug)]
 struct Element<'t> {
     name: &'t str,
@@ -90,6 +83,8 @@ struct Element<'t> {
 pub(super) struct Document<'t> {
     text: &'t str,
     elements: Vec<Element<'t>>,
+    /// While it is read, the elements whose end tag has not come, outermost first.
+    open: Vec<usize>,
 }
 
 impl<'t> Document<'t> {
@@ -97,7 +92,7 @@ impl<'t> Document<'t> {
     ///
     /// # Errors
     /// It has no element, or tags that do not fit together.
-    pub(super) fn parse(text: &'t str) -> Result<Self, XmlError> {
+    pub(super) fn parse(text: &'t str) -> Result<Self, ModelError> {
         // To the other readers a NUL is the end.
         let text = text.split('\0').next().unwrap_or_default();
         let reader_from = |at: usize| {
@@ -112,11 +107,9 @@ impl<'t> Document<'t> {
         // Where the reader began. It would not count a byte order mark.
         let mut base = text.len() - text.trim_start_matches('\u{feff}').len();
         let mut reader = reader_from(base);
-        let mut builder = TreeBuilder {
-            document: Self {
-                text,
-                elements: Vec::new(),
-            },
+        let mut document = Self {
+            text,
+            elements: Vec::new(),
             open: Vec::new(),
         };
         loop {
@@ -125,7 +118,7 @@ impl<'t> Document<'t> {
             match reader.read_event() {
                 Ok(event) => {
                     let end = place(reader.buffer_position());
-                    if builder.take(event, start..end)?.is_break() {
+                    if document.take(event, start..end)?.is_break() {
                         break;
                     }
                 }
@@ -138,18 +131,25 @@ impl<'t> Document<'t> {
                     let length = text.get(start..).and_then(|rest| rest.find('>'));
                     let Some(length) = length.filter(|_| unknown) else {
                         let at = place(reader.error_position());
-                        return Err(builder.document.wrong(at, error.to_string()));
+                        return Err(document.wrong(at, error.to_string()));
                     };
                     base = start + length + 1;
                     reader = reader_from(base);
                 }
             }
         }
-        builder.finish()
+        if let Some(&number) = document.open.last() {
+            let Element { name, range, .. } = &document.elements[number];
+            return Err(document.wrong(range.start, format!("<{name}> is not closed")));
+        }
+        if document.elements.is_empty() {
+            return Err(document.wrong(0, "it has no element".to_owned()));
+        }
+        Ok(document)
     }
 
-    fn wrong(&self, at: usize, reason: String) -> XmlError {
-        XmlError {
+    fn wrong(&self, at: usize, reason: String) -> ModelError {
+        ModelError::Syntax {
             line: line_at(self.text, at),
             reason,
         }
@@ -172,18 +172,13 @@ impl<'t> Document<'t> {
         }
         node(0)
     }
-}
 
-/// A document while it is read.
-struct TreeBuilder<'t> {
-    document: Document<'t>,
-    /// The elements whose end tag has not come, outermost first.
-    open: Vec<usize>,
-}
-
-impl<'t> TreeBuilder<'t> {
     /// Takes what is next in the text, at `range`; breaks at its end.
-    fn take(&mut self, event: Event<'_>, range: Range<usize>) -> Result<ControlFlow<()>, XmlError> {
+    fn take(
+        &mut self,
+        event: Event<'_>,
+        range: Range<usize>,
+    ) -> Result<ControlFlow<()>, ModelError> {
         match event {
             Event::Start(_) => self.start(range, false)?,
             Event::Empty(_) => self.start(range, true)?,
@@ -195,7 +190,7 @@ impl<'t> TreeBuilder<'t> {
             Event::Text(more) => self.add_text(str::from_utf8(&more).unwrap_or_default()),
             Event::CData(more) => self.add_text(str::from_utf8(&more).unwrap_or_default()),
             Event::GeneralRef(_) => {
-                let raw = self.document.text.get(range).unwrap_or_default();
+                let raw = self.text.get(range).unwrap_or_default();
                 self.add_text(&lenient(raw));
             }
             Event::Eof => return Ok(ControlFlow::Break(())),
@@ -204,8 +199,8 @@ impl<'t> TreeBuilder<'t> {
         Ok(ControlFlow::Continue(()))
     }
 
-    fn start(&mut self, range: Range<usize>, is_empty: bool) -> Result<(), XmlError> {
-        let tag = self.document.text.get(range.start + 1..range.end - 1);
+    fn start(&mut self, range: Range<usize>, is_empty: bool) -> Result<(), ModelError> {
+        let tag = self.text.get(range.start + 1..range.end - 1);
         let tag = tag.unwrap_or_default();
         let tag = tag.strip_suffix('/').filter(|_| is_empty).unwrap_or(tag);
         let tag = tag.trim_start();
@@ -213,10 +208,7 @@ impl<'t> TreeBuilder<'t> {
         let name = tag.get(..name_end).unwrap_or_default();
         let mut attributes = Vec::new();
         for attribute in Attributes::new(tag, name_end) {
-            let syntax_error = |error| {
-                self.document
-                    .wrong(range.start, format!("<{name}>: {error}"))
-            };
+            let syntax_error = |error| self.wrong(range.start, format!("<{name}>: {error}"));
             let attribute = attribute.map_err(syntax_error)?;
             let key = str::from_utf8(attribute.key.into_inner()).unwrap_or_default();
             let value = match attribute.value {
@@ -225,7 +217,7 @@ impl<'t> TreeBuilder<'t> {
             };
             attributes.push((key, lenient(value)));
         }
-        let elements = &mut self.document.elements;
+        let elements = &mut self.elements;
         let number = elements.len();
         if let Some(parent) = self.open.last() {
             elements[*parent].children.push(number);
@@ -244,28 +236,28 @@ impl<'t> TreeBuilder<'t> {
         Ok(())
     }
 
-    fn end(&mut self, name: &str, range: Range<usize>) -> Result<ControlFlow<()>, XmlError> {
+    fn end(&mut self, name: &str, range: Range<usize>) -> Result<ControlFlow<()>, ModelError> {
         let Some(number) = self.open.pop() else {
             // After the root it ends the text for the other readers, too.
-            if !self.document.elements.is_empty() {
+            if !self.elements.is_empty() {
                 return Ok(ControlFlow::Break(()));
             }
             let reason = format!("</{name}> closes nothing");
-            return Err(self.document.wrong(range.start, reason));
+            return Err(self.wrong(range.start, reason));
         };
-        let element = &mut self.document.elements[number];
+        let element = &mut self.elements[number];
         element.range.end = range.end;
         if element.name == name {
             return Ok(ControlFlow::Continue(()));
         }
-        let line = line_at(self.document.text, element.range.start);
+        let line = line_at(self.text, element.range.start);
         let reason = format!("</{name}> where <{}> of line {line} is open", element.name);
-        Err(self.document.wrong(range.start, reason))
+        Err(self.wrong(range.start, reason))
     }
 
     /// Text belongs to the innermost open element.
     fn add_text(&mut self, more: &str) {
-        let elements = &mut self.document.elements;
+        let elements = &mut self.elements;
         if let Some(element) = self
             .open
             .last()
@@ -273,18 +265,6 @@ impl<'t> TreeBuilder<'t> {
         {
             element.text.push_str(more);
         }
-    }
-
-    fn finish(self) -> Result<Document<'t>, XmlError> {
-        if let Some(&number) = self.open.last() {
-            let Element { name, range, .. } = &self.document.elements[number];
-            let reason = format!("<{name}> is not closed");
-            return Err(self.document.wrong(range.start, reason));
-        }
-        if self.document.elements.is_empty() {
-            return Err(self.document.wrong(0, "it has no element".to_owned()));
-        }
-        Ok(self.document)
     }
 }
 
@@ -482,8 +462,10 @@ mod tests {
     #[test]
     fn tags_that_do_not_fit_have_their_lines() {
         let error = |text: &str| {
-            let XmlError { line, reason } = Document::parse(text).unwrap_err();
-            format!("{line}: {reason}")
+            let error = Document::parse(text).unwrap_err().to_string();
+            error
+                .trim_start_matches("the URDF is not XML: line ")
+                .to_owned()
         };
         assert_eq!(
             error("<a>\n<b>\n</a>"),

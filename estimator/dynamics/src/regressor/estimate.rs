@@ -7,7 +7,7 @@
 //! coefficients are `m_l^T X* A_l`. Those of the offset of an F/T sensor above link `l` (or, with
 //! the other sign, below it) are `m_l` expressed in the sensor's measurement frame.
 
-use super::link::{LINK_PARAMETERS, in_link_axes, row_along};
+use super::link::{LINK_PARAMETERS, link_regressor, row_along};
 use crate::error::{DynamicsError, check_size};
 use crate::kinematics::{ExternalWrench, Kinematics, check_external, check_readings};
 use crate::solver::Solver;
@@ -98,7 +98,7 @@ impl<'a> EstimateRows<'a> {
                 .kinematics
                 .pose(link)
                 .twist_back(&self.torque_motion(dof, link));
-            links[link] = row_along(&in_link, &in_link_axes(self.kinematics.motion(link)));
+            links[link] = row_along(&in_link, &link_regressor(self.kinematics.motion(link)));
         }
         let offsets = offsets.as_chunks_mut::<6>().0;
         for sensor in self.structure.subtrees()[subtree].sensors.iter() {

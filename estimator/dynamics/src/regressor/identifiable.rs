@@ -79,7 +79,7 @@ mod regime;
 
 use nalgebra::DMatrix;
 
-use self::assemble::{Composite, Hidden, NullVector, assemble};
+use self::assemble::{Assembled, Composite, Hidden, assemble};
 use self::pass::{Units, Visit, check_vector, contact_wrenches, pass, sides};
 use self::reach::{Reach, Subspace};
 use crate::error::{DynamicsError, check_size};
@@ -107,9 +107,7 @@ pub use regime::{BaseRegime, JointMotion, Measurement, Offsets, ParameterColumn,
 pub struct Identifiable {
     columns: Vec<ParameterColumn>,
     names: Vec<String>,
-    basis: DMatrix<f64>,
-    null: Vec<NullVector>,
-    confused: usize,
+    assembled: Assembled,
 }
 
 impl Identifiable {
@@ -154,17 +152,13 @@ impl Identifiable {
             Offsets::Unknown => scope.sensors(),
         };
         let composites = recursion.composites(model, &links, &sensors);
-        let Recursion {
-            units, tolerance, ..
-        } = recursion;
-        let assembled = assemble(&composites, sensors.len(), &units, tolerance);
+        let (units, tolerance) = (&recursion.units, recursion.tolerance);
+        let assembled = assemble(&composites, sensors.len(), units, tolerance);
         let (columns, names) = labels(model, scope, &links, &sensors);
         Ok(Self {
             columns,
             names,
-            basis: assembled.basis,
-            null: assembled.null,
-            confused: assembled.confused,
+            assembled,
         })
     }
 
@@ -172,12 +166,12 @@ impl Identifiable {
     /// subspace, so that `pi = B^T phi` are the base parameters of any `phi` and `B pi` is its
     /// identifiable part (eq. (7)).
     pub fn basis(&self) -> &DMatrix<f64> {
-        &self.basis
+        &self.assembled.basis
     }
 
     /// Its dimension: the number of identifiable combinations.
     pub fn rank(&self) -> usize {
-        self.basis.ncols()
+        self.assembled.basis.ncols()
     }
 
     /// The meaning of each column.
@@ -195,8 +189,9 @@ impl Identifiable {
     /// unobservable parameters of a single link. The last [`Identifiable::confused`] ones state
     /// which offset is not separable from which parameters.
     pub fn null(&self) -> DMatrix<f64> {
-        let mut null = DMatrix::zeros(self.columns.len(), self.null.len());
-        for (k, vector) in self.null.iter().enumerate() {
+        let vectors = &self.assembled.null;
+        let mut null = DMatrix::zeros(self.columns.len(), vectors.len());
+        for (k, vector) in vectors.iter().enumerate() {
             for &(column, entry) in &vector.entries {
                 null[(column, k)] = entry;
             }
@@ -208,12 +203,12 @@ impl Identifiable {
     /// rank with them. In these directions an offset and inertial parameters, or several offsets,
     /// are not separable in this regime.
     pub fn confused(&self) -> usize {
-        self.confused
+        self.assembled.confused
     }
 
     /// The base parameters as readable sums, one per dimension: see [`BaseParameter`].
     pub fn base_parameters(&self) -> Vec<BaseParameter> {
-        expression::base_parameters(&self.names, &self.null)
+        expression::base_parameters(&self.names, &self.assembled.null)
     }
 }
 
@@ -335,46 +330,27 @@ impl Recursion<'_> {
     fn hidden(&self) -> Vec<Option<Hidden>> {
         let (units, tolerance) = (&self.units, self.tolerance);
         let torques = self.measured != Measurement::Wrench;
-        let parts: Vec<_> = self
-            .visits
-            .iter()
-            .map(|v| self.scope.part_of(v.link))
-            .collect();
-        // Links between the base and a measured one are needed too.
-        let mut is_needed: Vec<bool> = parts.iter().map(Option::is_some).collect();
-        for (number, visit) in self.visits.iter().enumerate().rev() {
-            if let Some(parent) = visit.parent {
-                is_needed[parent] |= is_needed[number];
-            }
-        }
-        let mut reaches: Vec<Option<Reach>> = vec![None; self.visits.len()];
+        let mut reaches: Vec<Reach> = Vec::with_capacity(self.visits.len());
         let mut all_hidden = Vec::with_capacity(self.visits.len());
-        for (number, visit) in self.visits.iter().enumerate() {
-            if !is_needed[number] {
-                all_hidden.push(None);
-                continue;
-            }
-            let inner = self.inner(visit);
-            let mut rows = Subspace::empty();
-            let mut reach = match visit.parent.and_then(|parent| reaches[parent].as_ref()) {
-                None => match self.gravity {
-                    None => Reach::free(),
-                    Some(gravity) => Reach::standing(&(gravity / -units.acceleration)),
-                },
-                Some(before) => before.moved(&units.pose(&visit.placement)),
+        for visit in &self.visits {
+            let (part, inner) = (self.scope.part_of(visit.link), self.inner(visit));
+            let mut rows = Subspace::default();
+            let mut reach = match (visit.parent, self.gravity) {
+                (Some(parent), _) => reaches[parent].moved(&units.pose(&visit.placement)),
+                (None, None) => Reach::free(),
+                (None, Some(gravity)) => Reach::standing(&(gravity / -units.acceleration)),
             };
             if let Some((twist, moves)) = &visit.freedom {
                 let measured = torques && inner.is_some();
                 let reached = reach.cross(&units.twist(twist), *moves, measured, tolerance);
                 rows.join(&reached, tolerance);
             }
-            if let (Some(part), None) = (parts[number], inner) {
+            if let (Some(part), None) = (part, inner) {
                 reach.begin(self.measured_twists(part), tolerance);
                 rows = reach.rows().clone();
             }
-            let hidden = parts[number].map(|_| Hidden::new(&rows, units, tolerance));
-            all_hidden.push(hidden);
-            reaches[number] = Some(reach);
+            all_hidden.push(part.map(|_| Hidden::new(&rows, units, tolerance)));
+            reaches.push(reach);
         }
         all_hidden
     }
@@ -382,7 +358,7 @@ impl Recursion<'_> {
     /// The twists along which the balance of a part is measured, where its pass begins.
     fn measured_twists(&self, part: usize) -> Subspace<6> {
         if self.measured == Measurement::Torques {
-            return Subspace::empty();
+            return Subspace::default();
         }
         let applied = self.contacts.iter().filter(|(of, _)| *of == part);
         let unknown = applied

@@ -1,8 +1,6 @@
 //! The regressor of one link, in its own axes or transformed to another frame: six rows of ten
 //! numbers. Every other regressor is built from it.
 
-use nalgebra::SMatrix;
-
 use crate::kinematics::FrameMotion;
 use crate::spatial::{Motion, Pose};
 
@@ -34,14 +32,8 @@ pub type LinkRows = [[f64; LINK_PARAMETERS]; 6];
 /// Source: Traversaro et al. (ICRA 2015), eq. (8) to (10). Their `a + omega x v` of spatial
 /// acceleration and velocity is the classical acceleration here; their `a_g`, to be added to it, is
 /// minus the physical gravity. First given by Atkeson, An, Hollerbach (IJRR 1986).
-pub fn link_regressor(motion: &FrameMotion) -> SMatrix<f64, 6, 10> {
-    let rows = in_link_axes(motion);
-    SMatrix::from_fn(|row, column| rows[row][column])
-}
-
-/// `A_l`.
 #[inline(always)]
-pub(super) fn in_link_axes(motion: &FrameMotion) -> LinkRows {
+pub fn link_regressor(motion: &FrameMotion) -> LinkRows {
     let (w, l, a) = (
         &motion.angular_velocity,
         &motion.angular_acceleration,
@@ -69,7 +61,7 @@ pub(super) fn in_link_axes(motion: &FrameMotion) -> LinkRows {
 )]
 #[inline(always)]
 pub fn link_rows(x_al: &Pose, motion: &FrameMotion) -> LinkRows {
-    let link = in_link_axes(motion);
+    let link = link_regressor(motion);
     let (r, t) = (&x_al.rotation, &x_al.translation);
     let mut rows = [[0.0; LINK_PARAMETERS]; 6];
     for axis in 0..3 {

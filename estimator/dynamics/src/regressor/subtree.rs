@@ -3,7 +3,7 @@
 
 mod columns;
 
-use crate::regressor::subtree::columns::{contact_columns, put, wrench_columns};
+use self::columns::{contact_columns, wrench_columns};
 use nalgebra::{Matrix6, Vector6};
 
 use crate::error::{DynamicsError, check_size};
@@ -12,25 +12,6 @@ use crate::least_squares::{LeastSquares, noise_factor, scale_factor};
 use crate::regressor::link::{LINK_PARAMETERS, WITH_FORCE, link_rows};
 use crate::spatial::{Pose, Wrench};
 use crate::structure::{ContactSet, Structure};
-
-/// How forces are compared with torques when contact columns are eliminated. The remaining rows
-/// span the same space with either weighting: all rows to which no present contact contributes. The
-/// weighting chooses a basis of it, and so the weights of least squares on these rows. (Contacts
-/// count as dependent if a singular value of their columns, in the chosen weighting, is below 1e-8
-/// of the greatest. Near this limit the two weightings may disagree with each other and with the
-/// solver.)
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Weighting {
-    /// The noise of the sub-tree's F/T sensors: its rows are whitened, with unit covariance within
-    /// the sub-tree. (If the Cholesky factorisation of the covariance fails by rounding, only the
-    /// variances are used, as in the solver, and the covariance is only approximately unit.) A
-    /// sub-tree without sensors has no noise: it is treated as with `LengthScale`.
-    Noise,
-    /// The structure's length scale `d`, about the origin of the sub-tree's top link: rows `p` with
-    /// `p diag(d^2, d^2, d^2, 1, 1, 1) p'^T = 1 or 0`, orthonormal in newtons. They depend on that
-    /// point.
-    LengthScale,
-}
 
 /// A present contact and its columns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -58,8 +39,7 @@ pub struct PresentContact {
 pub struct SubTreeRegressor {
     top: usize,
     links: Vec<usize>,
-    /// Number of each sensor, and whether it is above the sub-tree.
-    sensors: Vec<(usize, bool)>,
+    sensors: Vec<usize>,
     contacts: Vec<PresentContact>,
     /// Columns of links and offsets.
     known: usize,
@@ -83,16 +63,7 @@ impl SubTreeRegressor {
     fn new(structure: &Structure, number: usize) -> Self {
         let subtree = &structure.subtrees()[number];
         let links: Vec<usize> = structure.links_of(number).collect();
-        let sensors: Vec<(usize, bool)> = subtree
-            .sensors
-            .iter()
-            .map(|sensor| {
-                (
-                    sensor,
-                    structure.sensors()[sensor].joint() + 1 == subtree.top,
-                )
-            })
-            .collect();
+        let sensors: Vec<usize> = subtree.sensors.iter().collect();
         let known = LINK_PARAMETERS * links.len() + 6 * sensors.len();
         let room = subtree
             .contacts
@@ -131,7 +102,7 @@ impl SubTreeRegressor {
 
     /// The F/T sensors at its ends, ascending.
     pub fn sensors(&self) -> impl ExactSizeIterator<Item = usize> {
-        self.sensors.iter().map(|&(sensor, _)| sensor)
+        self.sensors.iter().copied()
     }
 
     /// Its contacts that were present at the last update, ascending.
@@ -175,12 +146,18 @@ impl SubTreeRegressor {
     }
 
     /// Number of rows that remain without contact columns: six minus the rank of these columns.
-    /// Zero before [`StackedRegressor::eliminate_contacts`].
+    /// (Contacts count as dependent if a singular value of their columns, weighted as the rows are,
+    /// is below 1e-8 of the greatest. Near this limit the solver may disagree.)
     pub fn remaining(&self) -> usize {
         self.remaining
     }
 
-    /// One of the remaining rows, over links and offsets only.
+    /// One of the remaining rows, over links and offsets only: whitened, with unit covariance of
+    /// F/T noise within the sub-tree. (If the Cholesky factorisation of the covariance fails by
+    /// rounding, only the variances are used, as in the solver, and the covariance is only
+    /// approximately unit.) Without sensors there is no noise: rows `p` are orthonormal in newtons,
+    /// `p diag(d^2, d^2, d^2, 1, 1, 1) p'^T = 1 or 0` with the structure's length scale `d`, about
+    /// the origin of the top link.
     ///
     /// # Panics
     /// There is no such row; see [`SubTreeRegressor::remaining`].
@@ -203,13 +180,7 @@ impl SubTreeRegressor {
         &self.projected_measured[..self.remaining]
     }
 
-    fn update(
-        &mut self,
-        structure: &Structure,
-        kinematics: &Kinematics,
-        sensors: &[Signed],
-        active: &ContactSet,
-    ) {
+    fn update(&mut self, structure: &Structure, kinematics: &Kinematics, active: &ContactSet) {
         let to_top = kinematics.pose(self.top).inverse();
         let stride = self.stride;
         for (place, &link) in self.links.iter().enumerate() {
@@ -233,18 +204,19 @@ impl SubTreeRegressor {
             }
         }
         let mut column = LINK_PARAMETERS * self.links.len();
-        for &(sensor, is_above) in &self.sensors {
-            let Signed { child, x_cm, sign } = sensors[sensor];
+        for &sensor in &self.sensors {
+            let cut = &structure.sensors()[sensor];
+            let child = cut.joint() + 1;
             // The child of a sensor's joint is the top of the sub-tree below the sensor.
-            let (x_tm, sign) = if is_above {
-                (x_cm, sign)
+            let (x_tm, sign) = if child == self.top {
+                (*cut.pose(), cut.sign())
             } else {
-                (to_top * *kinematics.pose(child) * x_cm, -sign)
+                (to_top * *kinematics.pose(child) * *cut.pose(), -cut.sign())
             };
-            wrench_columns(&x_tm, |unit| {
-                put(&mut self.values, stride, column, sign, &unit);
+            for unit in wrench_columns(&x_tm) {
+                put(&mut self.values, stride, column, unit * sign);
                 column += 1;
-            });
+            }
         }
         let subtree_contacts =
             structure.subtrees()[structure.subtree_of(self.top).unwrap_or(0)].contacts;
@@ -253,10 +225,10 @@ impl SubTreeRegressor {
             let spec = &structure.contacts()[contact];
             let x_tf = to_top * *kinematics.pose(spec.frame.link) * spec.frame.pose;
             let first = column;
-            contact_columns(spec, &x_tf, |unit| {
-                put(&mut self.values, stride, column, -1.0, &unit);
+            for unit in contact_columns(spec, &x_tf) {
+                put(&mut self.values, stride, column, -unit);
                 column += 1;
-            });
+            }
             self.contacts.push(PresentContact {
                 contact,
                 column: first,
@@ -264,7 +236,6 @@ impl SubTreeRegressor {
             });
         }
         self.unknown = column - self.known;
-        self.remaining = 0;
     }
 
     /// Right side and covariance from raw readings and known wrenches, after the offset columns: a
@@ -275,20 +246,21 @@ impl SubTreeRegressor {
         kinematics: &Kinematics,
         readings: &[Wrench],
         external: &[ExternalWrench],
-        variances: &[[f64; 6]],
     ) {
         self.measured = [0.0; 6];
         self.covariance = Matrix6::zeros();
-        for (place, &(sensor, _)) in self.sensors.iter().enumerate() {
+        for (place, &sensor) in self.sensors.iter().enumerate() {
             let first = LINK_PARAMETERS * self.links.len() + 6 * place;
             let reading = readings[sensor].torque_first();
-            for (channel, (value, variance)) in reading.iter().zip(&variances[sensor]).enumerate() {
+            let noise = structure.sensors()[sensor].noise();
+            let deviations = Wrench::from_parts(noise.force, noise.torque).torque_first();
+            for (channel, (value, deviation)) in reading.iter().zip(deviations).enumerate() {
                 let column =
                     Vector6::from_fn(|row, _| self.values[row * self.stride + first + channel]);
                 for row in 0..6 {
                     self.measured[row] += column[row] * value;
                 }
-                self.covariance += column * column.transpose() * *variance;
+                self.covariance += column * column.transpose() * (deviation * deviation);
             }
         }
         let number = structure.subtree_of(self.top);
@@ -304,13 +276,14 @@ impl SubTreeRegressor {
         }
     }
 
-    fn eliminate(&mut self, structure: &Structure, weighting: Weighting) {
+    /// Computes the combinations of the six equations to which no present contact contributes, at
+    /// most `6 - rank`. They are valid for any wrenches at the contacts.
+    fn eliminate(&mut self, structure: &Structure) {
         self.remaining = 0;
         // With a full unknown wrench no row remains.
         if self.contacts.iter().any(|contact| contact.unknowns == 6) {
             return;
         }
-        let length = structure.length_scale();
         self.least.clear();
         for present in &self.contacts {
             for column in present.column..present.column + present.unknowns {
@@ -318,9 +291,10 @@ impl SubTreeRegressor {
                 self.least.push(unit, 1.0);
             }
         }
-        let lower = match weighting {
-            Weighting::Noise if !self.sensors.is_empty() => noise_factor(self.covariance),
-            _ => scale_factor(length),
+        let lower = if self.sensors.is_empty() {
+            scale_factor(structure.length_scale())
+        } else {
+            noise_factor(self.covariance)
         };
         self.least.factorise(&lower);
         for weights in self.least.complement() {
@@ -340,13 +314,11 @@ impl SubTreeRegressor {
     }
 }
 
-/// A sensor's measurement frame in its child, and the sign with which its reading is the wrench by
-/// the parent on the child.
-#[derive(Clone, Copy, Debug)]
-struct Signed {
-    child: usize,
-    x_cm: Pose,
-    sign: f64,
+/// Writes a column.
+fn put(values: &mut [f64], stride: usize, column: usize, unit: Wrench) {
+    for (row, value) in unit.torque_first().into_iter().enumerate() {
+        values[row * stride + column] = value;
+    }
 }
 
 /// The equations of all sub-trees of a structure.
@@ -380,41 +352,22 @@ pub struct StackedRegressor {
     /// A copy, so that no call can pass a different structure.
     structure: Structure,
     subtrees: Vec<SubTreeRegressor>,
-    sensors: Vec<Signed>,
-    /// Variances of each sensor's channels [torque; force].
-    variances: Vec<[f64; 6]>,
 }
 
 impl StackedRegressor {
     /// For a structure, of which it keeps a copy.
     pub fn new(structure: &Structure) -> Self {
-        let sensors = structure.sensors();
+        let numbers = 0..structure.subtrees().len();
         Self {
-            subtrees: (0..structure.subtrees().len())
+            subtrees: numbers
                 .map(|number| SubTreeRegressor::new(structure, number))
-                .collect(),
-            sensors: sensors
-                .iter()
-                .map(|cut| Signed {
-                    child: cut.joint() + 1,
-                    x_cm: *cut.pose(),
-                    sign: cut.sign(),
-                })
-                .collect(),
-            variances: sensors
-                .iter()
-                .map(|cut| {
-                    let noise = cut.noise();
-                    Wrench::from_parts(noise.force, noise.torque)
-                        .torque_first()
-                        .map(|deviation| deviation * deviation)
-                })
                 .collect(),
             structure: structure.clone(),
         }
     }
 
-    /// Computes all rows, right sides and covariances. `readings` are the raw readings of the
+    /// Computes all rows, right sides and covariances, and the rows that remain without contacts
+    /// ([`SubTreeRegressor::projected_row`]). `readings` are the raw readings of the
     /// structure's sensors, offsets *not* removed, in their measurement frames; contacts in
     /// `active` are present; `external` wrenches are known.
     ///
@@ -430,23 +383,14 @@ impl StackedRegressor {
     ) -> Result<(), DynamicsError> {
         let (structure, links) = (&self.structure, self.structure.link_count());
         check_size("links of the kinematics", kinematics.link_count(), links)?;
-        check_readings(readings, self.sensors.len())?;
+        check_readings(readings, structure.sensors().len())?;
         check_external(external, links)?;
         for subtree in &mut self.subtrees {
-            subtree.update(structure, kinematics, &self.sensors, active);
-            subtree.measure(structure, kinematics, readings, external, &self.variances);
+            subtree.update(structure, kinematics, active);
+            subtree.measure(structure, kinematics, readings, external);
+            subtree.eliminate(structure);
         }
         Ok(())
-    }
-
-    /// Eliminates the contact columns from the rows of the last update: computes the combinations
-    /// of the six equations to which no present contact contributes, at most `6 - rank` per
-    /// sub-tree ([`SubTreeRegressor::projected_row`]). They are valid for any wrenches at the
-    /// contacts.
-    pub fn eliminate_contacts(&mut self, weighting: Weighting) {
-        for subtree in &mut self.subtrees {
-            subtree.eliminate(&self.structure, weighting);
-        }
     }
 
     /// The structure that it was made for.

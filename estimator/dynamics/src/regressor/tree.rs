@@ -1,7 +1,7 @@
 //! The regressor of the whole tree for any base: the wrench on the base and all joint torques.
 
 use super::link::{LINK_PARAMETERS, WITH_FORCE, link_rows, row_along};
-use crate::error::{DynamicsError, check_size};
+use crate::error::{DynamicsError, check_sizes};
 use crate::kinematics::Kinematics;
 use crate::model::{Joint, Model};
 use crate::spatial::Motion;
@@ -38,8 +38,8 @@ struct Hop {
 /// for each moving joint between it and the base. Its cost is the number of links times their mean
 /// depth: linear for limbs of bounded length, quadratic for a chain.
 ///
-/// Rows are stored one after the other. Zeros are written once; when the kinematics start from
-/// another base, only the rows of the joints between the old base and the new one change.
+/// Rows are stored one after the other. Zeros are written when the kinematics start from another
+/// base.
 #[derive(Clone, Debug)]
 pub struct Regressor {
     values: Vec<f64>,
@@ -47,8 +47,6 @@ pub struct Regressor {
     stride: usize,
     /// The base of the current pattern of zeros; `None` before the first update.
     base: Option<usize>,
-    /// Per joint: whether the base is on the side of the child.
-    reversed: Vec<bool>,
     /// Per link: the next moving joint towards the base.
     hops: Vec<Option<Hop>>,
     /// Per link: the axis of the joint above in base coordinates, with the sign for which the net
@@ -70,7 +68,6 @@ impl Regressor {
             values: vec![0.0; (6 + dofs) * stride],
             stride,
             base: None,
-            reversed: vec![false; model.joint_count()],
             hops: vec![None; links],
             axes: vec![Motion::zero(); links],
             sharing,
@@ -84,51 +81,29 @@ impl Regressor {
     /// The size of the model or of the kinematics differs from that at construction. Nothing is
     /// changed in that case.
     pub fn update(&mut self, model: &Model, kinematics: &Kinematics) -> Result<(), DynamicsError> {
-        check_size("links of the model", model.link_count(), self.hops.len())?;
-        check_size(
-            "degrees of freedom of the model",
-            model.dof_count(),
-            self.sharing.len(),
-        )?;
-        check_size(
-            "links of the kinematics",
-            kinematics.link_count(),
-            self.hops.len(),
-        )?;
+        let (links, dofs) = (self.hops.len(), self.sharing.len());
+        check_sizes([
+            ("links of the model", model.link_count(), links),
+            ("degrees of freedom of the model", model.dof_count(), dofs),
+            ("links of the kinematics", kinematics.link_count(), links),
+        ])?;
         if self.base != Some(kinematics.base()) {
             self.rebase(model, kinematics);
         }
-        for joint in model.joints() {
+        for (number, joint) in model.joints().iter().enumerate() {
             if let Some(axis) = kinematics.joint_axis(joint) {
-                self.axes[joint.child] = if self.reversed[joint.child - 1] {
-                    -axis
-                } else {
-                    axis
-                };
+                let is_reversed = kinematics.is_reversed(number);
+                self.axes[joint.child] = if is_reversed { -axis } else { axis };
             }
         }
-        fill(
-            kinematics,
-            &self.hops,
-            &self.axes,
-            self.stride,
-            &mut self.values,
-        );
+        self.fill(kinematics);
         Ok(())
     }
 
     /// Changes to the base of the kinematics: updates the joints between each link and the base,
-    /// and the pattern of zeros of the affected rows.
+    /// and writes the zeros of the joints' rows.
     fn rebase(&mut self, model: &Model, kinematics: &Kinematics) {
-        for (number, joint) in model.joints().iter().enumerate() {
-            let reversed = kinematics.is_reversed(number);
-            if std::mem::replace(&mut self.reversed[number], reversed) != reversed
-                && let Some(dof) = joint.dof
-            {
-                let start = self.stride * (6 + dof);
-                self.values[start..start + self.stride].fill(0.0);
-            }
-        }
+        self.values[6 * self.stride..].fill(0.0);
         let base = kinematics.base();
         let sharing = &self.sharing;
         let hop = |joint: &Joint, next| {
@@ -149,12 +124,58 @@ impl Regressor {
             link = joint.parent;
         }
         for (number, joint) in model.joints().iter().enumerate() {
-            if !self.reversed[number] {
+            if !kinematics.is_reversed(number) {
                 let next = joint.parent;
                 self.hops[joint.child] = hop(joint, next).or(self.hops[next]);
             }
         }
         self.base = Some(base);
+    }
+
+    /// Writes all non-zero entries.
+    ///
+    /// In base coordinates a link's six rows are its part of `Y_n` already; each joint between the link
+    /// and the base takes its row from them, as the component along its axis: six products per column
+    /// of mass and first moment, three for the others, whose force is zero.
+    #[inline(always)]
+    fn fill(&mut self, kinematics: &Kinematics) {
+        let Self {
+            values,
+            stride,
+            hops,
+            axes,
+            ..
+        } = self;
+        let stride = *stride;
+        let (wrench, joints) = values.split_at_mut(6 * stride);
+        for (link, hop) in hops.iter().enumerate() {
+            let rows = link_rows(kinematics.pose(link), kinematics.motion(link));
+            let column = LINK_PARAMETERS * link;
+            for axis in 0..3 {
+                if let Some(out) =
+                    wrench[axis * stride + column..].first_chunk_mut::<LINK_PARAMETERS>()
+                {
+                    *out = rows[axis];
+                }
+                let force = &mut wrench[(axis + 3) * stride + column..][..WITH_FORCE];
+                force.copy_from_slice(&rows[axis + 3][..WITH_FORCE]);
+            }
+            let path = || std::iter::successors(*hop, |hop| hops[hop.next]);
+            let start = |hop: &Hop| stride * hop.dof + column;
+            for hop in path().filter(|hop| hop.is_shared) {
+                joints[start(&hop)..][..LINK_PARAMETERS].fill(0.0);
+            }
+            for hop in path() {
+                if let Some(out) = joints[start(&hop)..].first_chunk_mut::<LINK_PARAMETERS>() {
+                    let row = row_along(&axes[hop.child], &rows);
+                    if hop.is_shared {
+                        out.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
+                    } else {
+                        *out = row;
+                    }
+                }
+            }
+        }
     }
 
     /// A row: 0 to 5 for the wrench on the base [torque; force], then those of the joints.
@@ -169,48 +190,5 @@ impl Regressor {
     /// freedom.
     pub fn joint_row(&self, dof: usize) -> Option<&[f64]> {
         (dof < self.sharing.len()).then(|| self.row(6 + dof))
-    }
-}
-
-/// Writes all non-zero entries.
-///
-/// In base coordinates a link's six rows are its part of `Y_n` already; each joint between the link
-/// and the base takes its row from them, as the component along its axis: six products per column
-/// of mass and first moment, three for the others, whose force is zero.
-#[inline(always)]
-fn fill(
-    kinematics: &Kinematics,
-    hops: &[Option<Hop>],
-    axes: &[Motion],
-    stride: usize,
-    values: &mut [f64],
-) {
-    let (wrench, joints) = values.split_at_mut(6 * stride);
-    for (link, hop) in hops.iter().enumerate() {
-        let rows = link_rows(kinematics.pose(link), kinematics.motion(link));
-        let column = LINK_PARAMETERS * link;
-        for axis in 0..3 {
-            if let Some(out) = wrench[axis * stride + column..].first_chunk_mut::<LINK_PARAMETERS>()
-            {
-                *out = rows[axis];
-            }
-            let force = &mut wrench[(axis + 3) * stride + column..][..WITH_FORCE];
-            force.copy_from_slice(&rows[axis + 3][..WITH_FORCE]);
-        }
-        let path = || std::iter::successors(*hop, |hop| hops[hop.next]);
-        let start = |hop: &Hop| stride * hop.dof + column;
-        for hop in path().filter(|hop| hop.is_shared) {
-            joints[start(&hop)..][..LINK_PARAMETERS].fill(0.0);
-        }
-        for hop in path() {
-            if let Some(out) = joints[start(&hop)..].first_chunk_mut::<LINK_PARAMETERS>() {
-                let row = row_along(&axes[hop.child], &rows);
-                if hop.is_shared {
-                    out.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
-                } else {
-                    *out = row;
-                }
-            }
-        }
     }
 }

@@ -1,6 +1,6 @@
 //! Results of the solver: contact wrenches, balances, and their certainty.
 
-use crate::spatial::{Vec3, Wrench};
+use crate::spatial::Wrench;
 
 /// The basis of a result.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,14 +29,13 @@ pub struct ContactSolution {
 }
 
 impl ContactSolution {
-    pub(crate) const ABSENT: Self = Self {
-        wrench: Wrench {
-            torque: Vec3::new(0.0, 0.0, 0.0),
-            force: Vec3::new(0.0, 0.0, 0.0),
-        },
-        deviation: [0.0; 6],
-        certainty: Determinacy::Absent,
-    };
+    pub(crate) fn absent() -> Self {
+        Self {
+            wrench: Wrench::zero(),
+            deviation: [0.0; 6],
+            certainty: Determinacy::Absent,
+        }
+    }
 }
 
 /// The residual of the six equations of a sub-tree.

@@ -1,14 +1,9 @@
 //! The unknowns of a contact: the columns of `A x = b`.
 
 use crate::kinematics::Kinematics;
-use crate::spatial::{Pose, Vec3, stack};
+use crate::spatial::{Vec3, stack};
 use crate::structure::{ContactKind, ContactSpec};
 use nalgebra::Vector6;
-
-/// The contact's frame in base coordinates.
-pub(super) fn contact_pose(spec: &ContactSpec, kinematics: &Kinematics) -> Pose {
-    *kinematics.pose(spec.frame.link) * spec.frame.pose
-}
 
 /// The columns [torque; force] about `point` of the unknowns of a contact, and their weights in the
 /// least norm: forces and torques at its position, along the axes of its frame.
@@ -18,7 +13,7 @@ pub fn unknowns(
     point: &Vec3,
     length: f64,
 ) -> arrayvec::ArrayVec<(Vector6<f64>, f64), 6> {
-    let x_bf = contact_pose(spec, kinematics);
+    let x_bf = kinematics.frame_pose(&spec.frame);
     let arm = x_bf.point(&spec.position) - point;
     let force = |direction: Vec3| (stack(&arm.cross(&direction), &direction), 1.0);
     let torque = |direction: Vec3| (stack(&direction, &Vec3::zeros()), length);

@@ -1,12 +1,12 @@
 //! Rigid-body inertia: ten parameters, and the test of their physical consistency.
 
 use crate::spatial::{Mat3, Pose, Vec3, Wrench};
+use derive_more::{Add, Sub};
 use nalgebra::Matrix4;
-use std::ops::Add;
 
 /// Inertia of a rigid body about the origin of its link frame, in link axes: the ten inertial
-/// parameters.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// parameters. The sum of two bodies described in the same frame is both, fixed to each other.
+#[derive(Add, Clone, Copy, Debug, Default, PartialEq, Sub)]
 pub struct RigidInertia {
     /// Mass \[kg\].
     pub mass: f64,
@@ -44,11 +44,7 @@ pub enum Inconsistency {
 impl RigidInertia {
     /// No mass.
     pub fn zero() -> Self {
-        Self {
-            mass: 0.0,
-            first_moment: Vec3::zeros(),
-            inertia: Mat3::zeros(),
-        }
+        Self::default()
     }
 
     /// From mass \[kg\], centre of mass in link axes \[m\], and the tensor of inertia about the
@@ -187,17 +183,5 @@ impl RigidInertia {
             return Err(Inconsistency::Triangle { moments });
         }
         Ok(())
-    }
-}
-
-impl Add for RigidInertia {
-    type Output = Self;
-    /// Two bodies fixed to each other, both described in the same frame.
-    fn add(self, other: Self) -> Self {
-        Self {
-            mass: self.mass + other.mass,
-            first_moment: self.first_moment + other.first_moment,
-            inertia: self.inertia + other.inertia,
-        }
     }
 }

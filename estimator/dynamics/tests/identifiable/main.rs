@@ -17,7 +17,7 @@ use proprio_dynamics::regressor::identifiable::{
     BaseParameter, BaseRegime, Identifiable, JointMotion, Measurement, Offsets, ParameterColumn,
     Regime, Scope, Term,
 };
-use proprio_dynamics::regressor::{Regressor, StackedRegressor, SubTreeRegressor, Weighting};
+use proprio_dynamics::regressor::{Regressor, StackedRegressor, SubTreeRegressor};
 use proprio_dynamics::spatial::{Motion, Pose, RigidInertia, Vec3, Wrench};
 use proprio_dynamics::{
     ContactKind, ContactSet, ContactSpec, DynamicsError, FrameMotion, Kinematics, Noise, SensorCut,
@@ -958,7 +958,6 @@ fn joined(links: usize, seed: u64) {
         stacked
             .update(&kinematics, &readings, &present, &[])
             .unwrap();
-        stacked.eliminate_contacts(Weighting::LengthScale);
         for (part, tree) in parts.iter().zip(stacked.subtrees()) {
             let columns = columns_of(tree.links().iter().copied(), tree.sensors());
             assert_eq!(part.columns(), columns);

@@ -14,7 +14,7 @@ use common::{
 use nalgebra::{DMatrix, DVector, Matrix6};
 use proprio_dynamics::model::{Frame, Model};
 use proprio_dynamics::regressor::{
-    EstimateRows, Regressor, StackedRegressor, SubTreeRegressor, Weighting, link_regressor,
+    EstimateRows, Regressor, StackedRegressor, SubTreeRegressor, link_regressor,
 };
 use proprio_dynamics::spatial::{Pose, RigidInertia, Wrench};
 use proprio_dynamics::{
@@ -124,7 +124,8 @@ proptest! {
     fn link_regressor_times_parameters_is_the_net_wrench(seed in any::<u64>()) {
         let mut random = Random::new(seed);
         let motion = motion(&mut random);
-        let regressor = link_regressor(&motion);
+        let rows = link_regressor(&motion);
+        let regressor = nalgebra::SMatrix::<f64, 6, 10>::from_fn(|row, column| rows[row][column]);
         let wrench = |p: &[f64; 10]| {
             torque_first(&RigidInertia::from_parameters(p).net_wrench(
                 &motion.angular_velocity,
@@ -642,79 +643,67 @@ proptest! {
         let mut random = Random::new(seed);
         let scene = Scene::new(links, &mut random);
         let active = scene.all();
-        let mut stacked = scene.stacked(&active);
-        prop_assert!(
-            stacked.subtrees().iter().all(|tree| tree.remaining() == 0),
-            "nothing is projected yet"
-        );
+        let stacked = scene.stacked(&active);
         let solver = scene.solve(&scene.kinematics, &scene.offsets, &active);
-        for weighting in [Weighting::Noise, Weighting::LengthScale] {
-            stacked.eliminate_contacts(weighting);
-            for (tree, balance) in stacked.subtrees().iter().zip(solver.balances()) {
-                let first = tree.contact_column();
-                let columns = columns_of(tree, first, tree.column_count() - first);
-                let reached = if columns.ncols() == 0 {
-                    0
-                } else {
-                    rank(&columns)
-                };
-                prop_assert_eq!(tree.remaining(), 6 - reached);
-                prop_assert_eq!(tree.remaining(), balance.degrees);
-                prop_assert_eq!(tree.projected_measured().len(), tree.remaining());
-                let unknowns = scene.known_of(tree.links(), tree.sensors());
-                let mut basis = DMatrix::zeros(tree.remaining(), 6);
-                for row in 0..tree.remaining() {
-                    // The equation holds for the true parameters and offsets with any contact
-                    // wrenches.
-                    let projected = tree.projected_row(row);
-                    let scale = weight(projected, &unknowns) + size(tree.projected_measured());
-                    prop_assert!(
-                        (dot(projected, &unknowns) - tree.projected_measured()[row]).abs()
-                            < 100.0 * EXACT * scale
-                    );
-                    // It is a combination p of the six rows; the columns of an offset, if any,
-                    // determine p.
-                    if tree.sensors().count() > 0 {
-                        let first = tree.offset_column();
-                        let offset = columns_of(tree, first, 6);
-                        let p = offset
-                            .transpose()
-                            .lu()
-                            .solve(&DVector::from_row_slice(&projected[first..first + 6]))
-                            .unwrap();
-                        prop_assert!(
-                            gap(p.as_slice(), tree.projection(row)) < 1e-9 * size(p.as_slice())
-                        );
-                        let rebuilt = columns_of(tree, 0, tree.contact_column()).tr_mul(&p);
-                        prop_assert!(gap(rebuilt.as_slice(), projected) < 1e-9 * size(projected));
-                        let right: f64 = dot(p.as_slice(), tree.measured());
-                        prop_assert!(
-                            (right - tree.projected_measured()[row]).abs()
-                                < 1e-9 * weight(p.as_slice(), tree.measured())
-                        );
-                        for column in columns.column_iter() {
-                            prop_assert!(
-                                p.dot(&column).abs() < 1e-8 * (1.0 + p.norm() * column.norm()),
-                                "a contact reaches it"
-                            );
-                        }
-                        basis.row_mut(row).copy_from(&p.transpose());
-                    }
-                }
+        for (tree, balance) in stacked.subtrees().iter().zip(solver.balances()) {
+            let first = tree.contact_column();
+            let columns = columns_of(tree, first, tree.column_count() - first);
+            let reached = if columns.ncols() == 0 {
+                0
+            } else {
+                rank(&columns)
+            };
+            prop_assert_eq!(tree.remaining(), 6 - reached);
+            prop_assert_eq!(tree.remaining(), balance.degrees);
+            prop_assert_eq!(tree.projected_measured().len(), tree.remaining());
+            let unknowns = scene.known_of(tree.links(), tree.sensors());
+            let mut basis = DMatrix::zeros(tree.remaining(), 6);
+            for row in 0..tree.remaining() {
+                // The equation holds for the true parameters and offsets with any contact
+                // wrenches.
+                let projected = tree.projected_row(row);
+                let scale = weight(projected, &unknowns) + size(tree.projected_measured());
+                prop_assert!(
+                    (dot(projected, &unknowns) - tree.projected_measured()[row]).abs()
+                        < 100.0 * EXACT * scale
+                );
+                // It is a combination p of the six rows; the columns of an offset, if any,
+                // determine p.
                 if tree.sensors().count() > 0 {
-                    let metric = match weighting {
-                        Weighting::Noise => *tree.covariance(),
-                        Weighting::LengthScale => {
-                            Matrix6::from_diagonal(&[0.01, 0.01, 0.01, 1.0, 1.0, 1.0].into())
-                        }
-                    };
-                    let metric = DMatrix::from_fn(6, 6, |i, j| metric[(i, j)]);
-                    let unit = &basis * metric * basis.transpose();
+                    let first = tree.offset_column();
+                    let offset = columns_of(tree, first, 6);
+                    let p = offset
+                        .transpose()
+                        .lu()
+                        .solve(&DVector::from_row_slice(&projected[first..first + 6]))
+                        .unwrap();
                     prop_assert!(
-                        (unit - DMatrix::identity(tree.remaining(), tree.remaining())).amax()
-                            < 1e-7
+                        gap(p.as_slice(), tree.projection(row)) < 1e-9 * size(p.as_slice())
                     );
+                    let rebuilt = columns_of(tree, 0, tree.contact_column()).tr_mul(&p);
+                    prop_assert!(gap(rebuilt.as_slice(), projected) < 1e-9 * size(projected));
+                    let right: f64 = dot(p.as_slice(), tree.measured());
+                    prop_assert!(
+                        (right - tree.projected_measured()[row]).abs()
+                            < 1e-9 * weight(p.as_slice(), tree.measured())
+                    );
+                    for column in columns.column_iter() {
+                        prop_assert!(
+                            p.dot(&column).abs() < 1e-8 * (1.0 + p.norm() * column.norm()),
+                            "a contact reaches it"
+                        );
+                    }
+                    basis.row_mut(row).copy_from(&p.transpose());
                 }
+            }
+            if tree.sensors().count() > 0 {
+                let metric = tree.covariance();
+                let metric = DMatrix::from_fn(6, 6, |i, j| metric[(i, j)]);
+                let unit = &basis * metric * basis.transpose();
+                prop_assert!(
+                    (unit - DMatrix::identity(tree.remaining(), tree.remaining())).amax()
+                        < 1e-7
+                );
             }
         }
     }

@@ -13,12 +13,12 @@
 //! - `e`: the noise of the *channels*, independent of each other: six per F/T sensor, one per joint
 //!   torque.
 //!
-//! There are two kinds of rows. Rows of F/T sensors are the balances of sub-trees.
-//! [`StackedRegressor::eliminate_contacts`] keeps the combinations that no present contact reaches.
-//! Noise enters these rows as offsets do: `N = G`. Rows of joint torques come from the
-//! [`Regressor`] of the whole tree, for joints beyond which, seen from the base, nothing touches
-//! the robot. There `N = 1` and `G = [tanh(dq / v0), dq, 1]`. If torques are measured at the motor
-//! side, `A` has an extra column for the rotor inertia: its entry is the acceleration of the joint.
+//! There are two kinds of rows. Rows of F/T sensors are the balances of sub-trees, of which
+//! [`StackedRegressor`] keeps the combinations that no present contact reaches. Noise enters these
+//! rows as offsets do: `N = G`. Rows of joint torques come from the [`Regressor`] of the whole
+//! tree, for joints beyond which, seen from the base, nothing touches the robot. There `N = 1` and
+//! `G = [tanh(dq / v0), dq, 1]`. If torques are measured at the motor side, `A` has an extra column
+//! for the rotor inertia: its entry is the acceleration of the joint.
 //!
 //! If the calibrations of F/T sensors are unknown too ([`proprio_dynamics::calibration`]), a sensor
 //! measures `(1 + E) r - k (T - T0) - o`. `A` then has columns for `E` and `k`: the entries that
@@ -36,7 +36,7 @@ use crate::robot::{IdentificationInput, Robot, TorqueSide, is_between};
 use nalgebra::{DVector, Matrix6, Vector6};
 use proprio_dynamics::calibration::{Kind, Unknown};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
-use proprio_dynamics::regressor::{Regressor, StackedRegressor, Weighting};
+use proprio_dynamics::regressor::{Regressor, StackedRegressor};
 use proprio_dynamics::spatial::{RigidInertia, Wrench};
 use proprio_dynamics::{DynamicsError, JointState, Kinematics};
 use std::ops::Range;
@@ -436,7 +436,6 @@ impl<'a> MeasurementModel<'a> {
         }
         self.stacked
             .update(&self.kinematics, &self.readings, &observation.active, &[])?;
-        self.stacked.eliminate_contacts(Weighting::Noise);
         for (unit, subtree) in self.stacked.subtrees().iter().enumerate() {
             let readings = &observation.readings;
             let unread = |sensor: usize| readings.get(sensor).is_none_or(|r| !r.is_finite());

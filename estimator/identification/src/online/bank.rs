@@ -43,7 +43,7 @@ use evidence::{HypothesisFit, HypothesisPosterior, SMALL, SubtreeUnknowns, TickR
 use hypothesis::SeenMotion;
 use nalgebra::Vector6;
 use proprio_dynamics::model::Model;
-use proprio_dynamics::regressor::{EstimateRows, LINK_PARAMETERS, StackedRegressor, Weighting};
+use proprio_dynamics::regressor::{EstimateRows, LINK_PARAMETERS, StackedRegressor};
 use proprio_dynamics::spatial::{RigidInertia, Wrench};
 use proprio_dynamics::{ContactSet, FrameMotion, JointState, Kinematics, Solver, Structure};
 use proprio_topics::Nanos;
@@ -383,15 +383,11 @@ impl Bank {
 impl TickEquations {
     /// Sets the regressor to a tick; false if it can not be computed.
     fn update(&mut self, tick: &Tick, view: MotionReading) -> bool {
-        let is_updated = self.set_kinematics(tick, view)
+        self.set_kinematics(tick, view)
             && self
                 .stacked
                 .update(&self.kinematics, &tick.readings, &tick.active, &[])
-                .is_ok();
-        if is_updated {
-            self.stacked.eliminate_contacts(Weighting::Noise);
-        }
-        is_updated
+                .is_ok()
     }
 
     /// The rows of a unit at a tick, to which the regressor is set.

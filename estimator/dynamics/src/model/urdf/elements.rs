@@ -4,17 +4,23 @@
 use super::{
     ElementRef, MeasurementDirection, MeasurementFrame, ModelError, SensorElement, Unread,
 };
-use crate::model::Location;
 use crate::spatial::Pose;
 use std::collections::HashSet;
+use std::fmt;
 
-/// The location of an element of a link or joint.
-pub(super) fn location(element: ElementRef<'_>, owner: ElementRef<'_>) -> Location {
+/// The place of an element of a link or joint: `line 8: joint turn`.
+pub(super) fn place(element: ElementRef<'_>, owner: ElementRef<'_>) -> String {
     let name = owner.attribute("name").unwrap_or("(without a name)");
-    Location {
-        line: element.line(),
-        owner: format!("{} {name}", owner.name()),
-    }
+    format!("line {}: {} {name}", element.line(), owner.name())
+}
+
+/// The error that something about an element of a link or joint is.
+pub(super) fn defect(
+    element: ElementRef<'_>,
+    owner: ElementRef<'_>,
+    what: impl fmt::Display,
+) -> ModelError {
+    ModelError::Defect(format!("{}: {what}", place(element, owner)))
 }
 
 /// An element's name as it is written.
@@ -22,20 +28,17 @@ fn tag(element: ElementRef<'_>) -> String {
     format!("<{}>", element.name())
 }
 
-/// The element `<...>` directly in another one.
+/// The element of this name directly in another one.
 pub(super) fn part<'d>(
     parent: ElementRef<'d>,
     owner: ElementRef<'d>,
-    missing: &'static str,
-    remedy: &'static str,
+    name: &str,
+    remedy: &str,
 ) -> Result<ElementRef<'d>, ModelError> {
-    let name = missing.trim_matches(['<', '>']);
-    parent.child(name).ok_or_else(|| ModelError::Missing {
-        location: location(parent, owner),
-        what: format!("its {}", tag(parent)),
-        missing,
-        there: Vec::new(),
-        remedy,
+    parent.child(name).ok_or_else(|| {
+        let parent_tag = tag(parent);
+        let what = format_args!("its {parent_tag} has no <{name}>; {remedy}");
+        defect(parent, owner, what)
     })
 }
 
@@ -43,27 +46,22 @@ pub(super) fn part<'d>(
 pub(super) fn required<'d>(
     element: ElementRef<'d>,
     owner: ElementRef<'d>,
-    attribute: &'static str,
-    remedy: &'static str,
+    attribute: &str,
+    remedy: &str,
 ) -> Result<&'d str, ModelError> {
-    let location = || location(element, owner);
-    let what = || format!("its {}", tag(element));
-    match element.attribute(attribute) {
-        Some(value) => expanded(element, owner, attribute, value),
-        None if element.attributes().any(|there| there == attribute) => Err(ModelError::Empty {
-            location: location(),
-            what: what(),
-            attribute,
-            remedy,
-        }),
-        None => Err(ModelError::Missing {
-            location: location(),
-            what: what(),
-            missing: attribute,
-            there: element.attributes().map(str::to_owned).collect(),
-            remedy,
-        }),
+    if let Some(value) = element.attribute(attribute) {
+        return expanded(element, owner, attribute, value);
     }
+    let there: Vec<&str> = element.attributes().collect();
+    let lack = if there.contains(&attribute) {
+        format!("an empty {attribute}")
+    } else if there.is_empty() {
+        format!("no {attribute}")
+    } else {
+        format!("no {attribute} (it has {})", there.join(", "))
+    };
+    let what = format_args!("its {} has {lack}; {remedy}", tag(element));
+    Err(defect(element, owner, what))
 }
 
 /// The value of an attribute, unless xacro would put something else in its place.
@@ -76,10 +74,15 @@ fn expanded<'d>(
     if !value.contains("${") && !value.contains("$(") {
         return Ok(value);
     }
-    Err(ModelError::Unexpanded {
-        location: location(element, owner),
-        what: format!("{} {attribute}=\"{value}\"", tag(element)),
-    })
+    let what = format!("{} {attribute}=\"{value}\"", tag(element));
+    Err(unexpanded(element, owner, &what))
+}
+
+fn unexpanded(element: ElementRef<'_>, owner: ElementRef<'_>, what: &str) -> ModelError {
+    let what = format_args!(
+        "{what} is not expanded: the file is a xacro; expand it first (xacro FILE > model.urdf)"
+    );
+    defect(element, owner, what)
 }
 
 /// Refuses elements that xacro would replace: links and joints may be missing.
@@ -87,10 +90,7 @@ pub(super) fn check_expanded(robot: ElementRef<'_>) -> Result<(), ModelError> {
     let mut inside = robot.descendants();
     match inside.find(|node| node.name().starts_with("xacro:")) {
         None => Ok(()),
-        Some(left) => Err(ModelError::Unexpanded {
-            location: location(left, robot),
-            what: tag(left),
-        }),
+        Some(left) => Err(unexpanded(left, robot, &tag(left))),
     }
 }
 
@@ -109,25 +109,15 @@ pub(super) fn numbers<const N: usize>(
     // An infinite limit means no limit.
     let is_limit = element.name() == "limit";
     let is_wrong = |x: &f64| x.is_nan() || (x.is_infinite() && !is_limit);
+    let not = |expected: &str| {
+        let what = format_args!("{} {attribute}=\"{value}\" is not {expected}", tag(element));
+        Err(defect(element, owner, what))
+    };
     match numbers {
         Some(numbers) if !numbers.iter().any(is_wrong) => Ok(Some(numbers)),
-        Some(_) => Err(ModelError::NotFinite {
-            location: location(element, owner),
-            element: tag(element),
-            attribute: attribute.to_owned(),
-            value: value.to_owned(),
-        }),
-        None => Err(ModelError::Number {
-            location: location(element, owner),
-            element: tag(element),
-            attribute: attribute.to_owned(),
-            value: value.to_owned(),
-            expected: if N == 3 {
-                "three numbers with spaces between them"
-            } else {
-                "a number"
-            },
-        }),
+        Some(_) => not("finite; write the number that it is"),
+        None if N == 3 => not("three numbers with spaces between them"),
+        None => not("a number"),
     }
 }
 
@@ -142,9 +132,9 @@ pub(super) fn once(
     for child in element.children() {
         let name = child.name();
         if names.contains(&name) && !seen.insert(name) {
-            let Location { line, owner } = location(child, owner);
             warnings.push(format!(
-                "line {line}: {owner}: <{name}> occurs twice; the first one counts"
+                "{}: <{name}> occurs twice; the first one counts",
+                place(child, owner)
             ));
         }
     }
@@ -191,26 +181,26 @@ pub(super) fn read_sensors(
                     why,
                 });
             }
-            Ok(sensor) => match sensors.iter().find(|other| is_same_sensor(other, &sensor)) {
-                None => sensors.push(sensor),
-                Some(other) if is_same_description(other, &sensor) => {}
-                Some(_) => {
-                    warnings.push(format!(
+            Ok(sensor) => {
+                // A name is its own among the sensors of a joint only.
+                let id = (&sensor.joint, &sensor.name);
+                match sensors
+                    .iter()
+                    .find(|other| (&other.joint, &other.name) == id)
+                {
+                    None => sensors.push(sensor),
+                    Some(other) if is_same_description(other, &sensor) => {}
+                    Some(_) => warnings.push(format!(
                         "line {}: F/T sensor {name} in joint {} is described twice, and \
                          differently; the first description counts",
                         node.line(),
                         sensor.joint
-                    ));
+                    )),
                 }
-            },
+            }
         }
     }
     (sensors, unread)
-}
-
-/// Whether two elements are of one sensor. A name is its own among the sensors of a joint only.
-fn is_same_sensor(a: &SensorElement, b: &SensorElement) -> bool {
-    (&a.joint, &a.name) == (&b.joint, &b.name)
 }
 
 pub(super) fn read_sensor(

@@ -12,7 +12,7 @@
 use nalgebra::{DMatrix, Matrix6, SMatrix, SymmetricEigen};
 
 use super::pass::{Units, wrench_transform};
-use super::reach::{Subspace, coefficients};
+use super::reach::{Subspace, coefficients, span_more};
 use crate::spatial::{Pose, RigidInertia};
 
 pub(super) type Matrix10 = SMatrix<f64, 10, 10>;
@@ -37,31 +37,9 @@ pub(super) struct Hidden {
 impl Hidden {
     pub(super) fn new(rows: &Subspace<16>, units: &Units, tolerance: f64) -> Self {
         let mut rest: Vec<[f64; 16]> = rows.basis().iter().map(coefficients).collect();
-        // Gram-Schmidt on the parameter part, carrying the offset part along.
-        let inertial = |row: &[f64; 16]| row[..10].iter().map(|x| x * x).sum::<f64>();
-        let take_out = |row: &mut [f64; 16], unit: &[f64; 16]| {
-            let along: f64 = row[..10].iter().zip(&unit[..10]).map(|(a, b)| a * b).sum();
-            row.iter_mut().zip(unit).for_each(|(x, u)| *x -= along * u);
-        };
-        let mut kept: Vec<[f64; 16]> = Vec::new();
-        while kept.len() < 10
-            && let Some((most, _)) = rest
-                .iter()
-                .map(inertial)
-                .enumerate()
-                .max_by(|a, b| a.1.total_cmp(&b.1))
-        {
-            let mut unit = rest[most];
-            kept.iter().for_each(|old| take_out(&mut unit, old));
-            let norm = inertial(&unit).sqrt();
-            if norm <= tolerance {
-                break;
-            }
-            rest.swap_remove(most);
-            unit.iter_mut().for_each(|x| *x /= norm);
-            rest.iter_mut().for_each(|row| take_out(row, &unit));
-            kept.push(unit);
-        }
+        // The span of the parameter part, carrying the offset part along.
+        let mut kept = Vec::new();
+        span_more(&mut kept, &mut rest, 10, tolerance);
         let offsets = rest
             .iter()
             .map(|row| std::array::from_fn(|i| clean(row[10 + i]) * units.offset(i)))
@@ -110,6 +88,7 @@ pub(super) struct Composite {
 }
 
 /// Result of `assemble`.
+#[derive(Clone, Debug)]
 pub(super) struct Assembled {
     /// Orthonormal columns.
     pub(super) basis: DMatrix<f64>,
@@ -399,35 +378,12 @@ fn offset_maps(
 
 /// An independent subset with the same span. The remainder of a row after projection counts if its
 /// norm, with entries multiplied by 1 / `units`, exceeds `tolerance`.
-fn independent_rows(rows: Vec<Vec<f64>>, units: &[f64], tolerance: f64) -> Vec<Vec<f64>> {
-    let mut rest: Vec<Vec<f64>> = rows
-        .into_iter()
-        .map(|row| row.iter().zip(units).map(|(x, unit)| x / unit).collect())
-        .collect();
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    let mut kept: Vec<Vec<f64>> = Vec::new();
-    while let Some((most, _)) = rest
-        .iter()
-        .map(|row| dot(row, row))
-        .enumerate()
-        .max_by(|a, b| a.1.total_cmp(&b.1))
-    {
-        let mut unit = rest.swap_remove(most);
-        for old in &kept {
-            let along = dot(&unit, old);
-            unit.iter_mut().zip(old).for_each(|(x, u)| *x -= along * u);
-        }
-        let norm = dot(&unit, &unit).sqrt();
-        if norm <= tolerance {
-            break;
-        }
-        unit.iter_mut().for_each(|x| *x /= norm);
-        for row in &mut rest {
-            let along = dot(row, &unit);
-            row.iter_mut().zip(&unit).for_each(|(x, u)| *x -= along * u);
-        }
-        kept.push(unit);
+fn independent_rows(mut rows: Vec<Vec<f64>>, units: &[f64], tolerance: f64) -> Vec<Vec<f64>> {
+    for row in &mut rows {
+        row.iter_mut().zip(units).for_each(|(x, unit)| *x /= unit);
     }
+    let mut kept = Vec::new();
+    span_more(&mut kept, &mut rows, units.len(), tolerance);
     for row in &mut kept {
         row.iter_mut().zip(units).for_each(|(x, unit)| *x *= unit);
     }

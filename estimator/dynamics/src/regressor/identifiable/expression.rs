@@ -78,25 +78,21 @@ impl fmt::Display for BaseParameter {
 pub(super) fn base_parameters(names: &[String], null: &[NullVector]) -> Vec<BaseParameter> {
     let mut elimination = Elimination::new(names.len(), null);
     elimination.bound();
-    let Elimination {
-        eliminated,
-        is_kept,
-        vectors,
-    } = elimination;
     let term = |coefficient: f64, column: usize| Term {
         coefficient,
         column,
         name: names[column].clone(),
     };
-    let mut by_column: Vec<(usize, usize)> = eliminated.iter().copied().zip(0..).collect();
+    let eliminated = elimination.eliminated.iter().copied();
+    let mut by_column: Vec<(usize, usize)> = eliminated.zip(0..).collect();
     by_column.sort_unstable();
     (0..names.len())
-        .filter(|&column| is_kept[column])
+        .filter(|&column| elimination.is_kept[column])
         .map(|kept| BaseParameter {
             kept: term(1.0, kept),
             terms: by_column
                 .iter()
-                .map(|&(column, k)| (-vectors[k][kept], column))
+                .map(|&(column, k)| (-elimination.vectors[k][kept], column))
                 .filter(|(coefficient, _)| coefficient.abs() >= BaseParameter::SMALLEST)
                 .map(|(coefficient, column)| term(coefficient, column))
                 .collect(),

@@ -259,10 +259,7 @@ pub(super) fn contact_wrenches(
 fn unit_wrenches(spec: &ContactSpec) -> Vec<Wrench> {
     let pose = &spec.frame.pose;
     let point = pose.point(&spec.position);
-    let force = |along: Vec3| Wrench {
-        torque: point.cross(&along),
-        force: along,
-    };
+    let force = |along: Vec3| Wrench::of_force(&point, along);
     let axes = [Vec3::x(), Vec3::y(), Vec3::z()];
     match spec.kind {
         ContactKind::Wrench => {

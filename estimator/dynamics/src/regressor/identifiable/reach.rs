@@ -6,19 +6,15 @@
 //! wrench `[n; f]` and a transfer of inertia are 4 x 4 matrices as in the documentation of the
 //! parent module.
 
-use nalgebra::{Matrix3, Matrix4};
+use nalgebra::{Matrix3, Matrix4, Matrix4x3};
 
 use crate::spatial::{Mat3, Motion, Pose, Vec3};
 
-/// A subspace of `R^N` by an orthonormal basis.
-#[derive(Clone, Debug)]
+/// A subspace of `R^N` by an orthonormal basis; by default that of the zero alone.
+#[derive(Clone, Debug, Default)]
 pub(super) struct Subspace<const N: usize>(Vec<[f64; N]>);
 
 impl<const N: usize> Subspace<N> {
-    pub(super) fn empty() -> Self {
-        Self(Vec::new())
-    }
-
     /// All of `R^N`.
     fn full() -> Self {
         Self(
@@ -30,7 +26,7 @@ impl<const N: usize> Subspace<N> {
 
     /// The orthogonal complement of the span of `vectors`, each of length one.
     pub(super) fn without(vectors: Vec<[f64; N]>, tolerance: f64) -> Self {
-        let mut taken = Self::empty();
+        let mut taken = Self::default();
         taken.add(vectors, tolerance);
         // The basis is completed by unit vectors. Each addition is the one with the largest part
         // outside the span, at least 1 / sqrt(N); the added vectors are the complement.
@@ -47,34 +43,9 @@ impl<const N: usize> Subspace<N> {
         &self.0
     }
 
-    /// The sum of this subspace and the span of `vectors`. Each step adds the vector with the
-    /// largest part outside, until no such part exceeds `tolerance`; the vectors are of order one.
+    /// The sum of this subspace and the span of `vectors`, which are of order one.
     fn add(&mut self, mut vectors: Vec<[f64; N]>, tolerance: f64) {
-        if self.is_full() {
-            return;
-        }
-        for vector in &mut vectors {
-            self.0.iter().for_each(|unit| take_out(vector, unit));
-        }
-        while !self.is_full() {
-            let norms = vectors.iter().map(|vector| dot(vector, vector));
-            let Some((most, _)) = norms.enumerate().max_by(|a, b| a.1.total_cmp(&b.1)) else {
-                return;
-            };
-            let mut unit = vectors.swap_remove(most);
-            // Projected again: the rounding of the first projection may be large relative to a
-            // small remainder.
-            self.0.iter().for_each(|old| take_out(&mut unit, old));
-            let norm = dot(&unit, &unit).sqrt();
-            if norm <= tolerance {
-                return;
-            }
-            unit.iter_mut().for_each(|x| *x /= norm);
-            vectors
-                .iter_mut()
-                .for_each(|vector| take_out(vector, &unit));
-            self.0.push(unit);
-        }
+        span_more(&mut self.0, &mut vectors, N, tolerance);
     }
 
     /// The sum of both subspaces.
@@ -102,7 +73,7 @@ impl<const N: usize> Subspace<N> {
         for vector in &self.0 {
             let mut unit = map(vector);
             for _ in 0..2 {
-                image.0.iter().for_each(|old| take_out(&mut unit, old));
+                image.0.iter().for_each(|old| take_out(&mut unit, old, N));
             }
             let norm = dot(&unit, &unit).sqrt();
             unit.iter_mut().for_each(|x| *x /= norm);
@@ -112,16 +83,52 @@ impl<const N: usize> Subspace<N> {
     }
 }
 
-fn dot<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
+/// Adds to `units`, which are orthonormal, the span of `vectors`, counting only the first `width`
+/// entries of each. Each step adds the vector with the largest part outside, until no such part
+/// exceeds `tolerance`. The parts outside of the other vectors stay.
+pub(super) fn span_more<V: AsRef<[f64]> + AsMut<[f64]> + Clone>(
+    units: &mut Vec<V>,
+    vectors: &mut Vec<V>,
+    width: usize,
+    tolerance: f64,
+) {
+    let size = |vector: &V| dot(&vector.as_ref()[..width], vector.as_ref());
+    let take_out = |vector: &mut V, unit: &V| take_out(vector.as_mut(), unit.as_ref(), width);
+    for vector in &mut *vectors {
+        units.iter().for_each(|unit| take_out(vector, unit));
+    }
+    while units.len() < width {
+        let sizes = vectors.iter().map(size).enumerate();
+        let Some((most, _)) = sizes.max_by(|a, b| a.1.total_cmp(&b.1)) else {
+            return;
+        };
+        let mut unit = vectors[most].clone();
+        // Projected again: the rounding of the first projection may be large relative to a small
+        // remainder.
+        units.iter().for_each(|old| take_out(&mut unit, old));
+        let norm = size(&unit).sqrt();
+        if norm <= tolerance {
+            return;
+        }
+        vectors.swap_remove(most);
+        unit.as_mut().iter_mut().for_each(|x| *x /= norm);
+        vectors
+            .iter_mut()
+            .for_each(|vector| take_out(vector, &unit));
+        units.push(unit);
+    }
+}
+
+/// The product of two vectors, as far as both go.
+fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-fn take_out<const N: usize>(vector: &mut [f64; N], unit: &[f64; N]) {
-    let along = dot(vector, unit);
-    vector
-        .iter_mut()
-        .zip(unit)
-        .for_each(|(x, u)| *x -= along * u);
+/// Subtracts the multiple of a unit vector that is in the first `width` entries of `vector`.
+fn take_out(vector: &mut [f64], unit: &[f64], width: usize) {
+    let along = dot(&vector[..width], unit);
+    let pairs = vector.iter_mut().zip(unit);
+    pairs.for_each(|(x, u)| *x -= along * u);
 }
 
 /// A linear functional of a transfer `(theta, O)`: `tr(M theta) + e . [n; f]`, ten entries of the
@@ -163,7 +170,7 @@ impl JointTwist {
 }
 
 /// Spans of the quantities that a body attains over all states of the regime.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub(super) struct Reach {
     /// Of `(D, 1)`: three rows of `D = [S(alpha) + S(omega)^2, a]`, then the 1 that multiplies
     /// offsets.
@@ -185,7 +192,7 @@ impl Reach {
         Self {
             acceleration: Subspace::full(),
             omega: Subspace::full(),
-            ..Self::unmeasured()
+            ..Self::default()
         }
     }
 
@@ -196,25 +203,14 @@ impl Reach {
         let norm = dot(&one, &one).sqrt();
         Self {
             acceleration: Subspace(vec![one.map(|x| x / norm)]),
-            omega: Subspace::empty(),
-            ..Self::unmeasured()
-        }
-    }
-
-    fn unmeasured() -> Self {
-        Self {
-            acceleration: Subspace::empty(),
-            omega: Subspace::empty(),
-            axes: Subspace::empty(),
-            mixed: Subspace::empty(),
-            rows: Subspace::empty(),
+            ..Self::default()
         }
     }
 
     /// Starts a separately measured part of the robot: its net wrench is measured here along these
     /// constant twists.
     pub(super) fn begin(&mut self, axes: Subspace<6>, tolerance: f64) {
-        (self.axes, self.mixed, self.rows) = (axes, Subspace::empty(), Subspace::empty());
+        (self.axes, self.mixed, self.rows) = (axes, Subspace::default(), Subspace::default());
         let omegas: Vec<_> = self.omega.basis().iter().map(cross_matrix).collect();
         let twists: Vec<_> = self.axes.basis().iter().map(twist_matrix).collect();
         let mixed = omegas
@@ -251,10 +247,9 @@ impl Reach {
             axes: self
                 .axes
                 .map(|axis| twist(&(back * twist_matrix(axis) * x))),
-            mixed: self.mixed.map(|vector| {
-                let n = x.tr_mul(&mixed_matrix(vector)) * r;
-                std::array::from_fn(|i| n[(i / 3, i % 3)])
-            }),
+            mixed: self
+                .mixed
+                .map(|vector| mixed_vector(&(x.tr_mul(&mixed_matrix(vector)) * r))),
             rows: self.rows.map(|vector| {
                 let (m, e) = row_matrices(vector);
                 row(&(x.tr_mul(&m) * x), &(back * e * x))
@@ -290,7 +285,7 @@ impl Reach {
             self.close(&joint, tolerance);
         }
         let (rows, mixed) = self.gained(&joint, moves, measured);
-        let mut visible = Subspace::empty();
+        let mut visible = Subspace::default();
         visible.add(rows, tolerance);
         self.mixed.add(mixed, tolerance);
         if measured {
@@ -339,8 +334,7 @@ impl Reach {
         self.mixed.close(
             |vector| {
                 let n = mixed_matrix(vector);
-                let turned = s.tr_mul(&n) + n * turn;
-                std::array::from_fn(|i| turned[(i / 3, i % 3)])
+                mixed_vector(&(s.tr_mul(&n) + n * turn))
             },
             tolerance,
         );
@@ -474,12 +468,15 @@ fn embed(turn: &Mat3) -> Matrix4<f64> {
 
 /// The first three columns of `E^T [S(omega), 0; 0, 0]`.
 fn mixed(e: &Matrix4<f64>, omega: &Matrix3<f64>) -> [f64; 12] {
-    let n = e.fixed_view::<3, 4>(0, 0).tr_mul(omega);
+    mixed_vector(&e.fixed_view::<3, 4>(0, 0).tr_mul(omega))
+}
+
+fn mixed_vector(n: &Matrix4x3<f64>) -> [f64; 12] {
     std::array::from_fn(|i| n[(i / 3, i % 3)])
 }
 
-fn mixed_matrix(vector: &[f64; 12]) -> nalgebra::Matrix4x3<f64> {
-    nalgebra::Matrix4x3::from_row_slice(vector)
+fn mixed_matrix(vector: &[f64; 12]) -> Matrix4x3<f64> {
+    Matrix4x3::from_row_slice(vector)
 }
 
 /// A twist as a 4 x 4 matrix, `[S(omega), v; 0, 0]`.
