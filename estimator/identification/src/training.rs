@@ -7,8 +7,6 @@ use crate::finding::{Finding, FindingCode, Severity};
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::reduction::{LogSegment, ReducedLog, Residuals, reduce, residuals};
-use crate::measurement::rows::MeasurementRows;
-use crate::parallel;
 use crate::robot::{ChannelRole, Robot};
 use nalgebra::DVector;
 use proprio_dynamics::spatial::Wrench;
@@ -313,27 +311,14 @@ fn too_few(
     format!("usable instants: {count}, so nothing is identified from this log: {why}")
 }
 
-/// Results of a pass over each segment, on all cores, in the order of the segments.
-pub(crate) fn map_segments<'a, T: Send>(
-    measurement: &MeasurementModel<'_>,
-    segments: &[LogSegment<'a>],
-    pass: impl Fn(&mut MeasurementModel<'_>, usize, LogSegment<'a>) -> T + Sync,
-) -> Vec<T> {
-    parallel::map_with(
-        segments.len(),
-        || measurement.clone(),
-        |measurement, number| pass(measurement, number, segments[number]),
-    )
-}
-
 /// The information of each segment.
 pub(crate) fn reduced_segments(
     measurement: &MeasurementModel<'_>,
     segments: &[LogSegment<'_>],
     noise: &NoiseModel,
 ) -> Vec<ReducedLog> {
-    map_segments(measurement, segments, |measurement, _, segment| {
-        reduce(measurement, segment, noise)
+    measurement.map(segments, |measurement, segment| {
+        reduce(measurement, *segment, noise)
     })
 }
 
@@ -344,8 +329,8 @@ pub(crate) fn segment_residuals(
     noise: &NoiseModel,
     d: &DVector<f64>,
 ) -> Vec<Residuals> {
-    map_segments(measurement, segments, |measurement, _, segment| {
-        residuals(measurement, segment, noise, std::slice::from_ref(d))
+    measurement.map(segments, |measurement, segment| {
+        residuals(measurement, *segment, noise, std::slice::from_ref(d))
     })
 }
 
@@ -391,14 +376,13 @@ pub(crate) fn sample<'a>(
     let mut sampled: Vec<LogSegment<'a>> = taken.map(|segment| stretch(segment, 0)).collect();
     // How often each channel occurs, up to `MIN_FOLD`: without any sample of it, its noise would be
     // estimated as zero.
-    let mut rows = MeasurementRows::new(measurement.unknowns());
     let mut measurement = measurement.clone();
     let mut appears = vec![0; measurement.unknowns().channels()];
     let mut count_channels = |instant: &Annotated, appears: &mut [usize]| -> bool {
-        let made = measurement.compute_rows(instant, &mut rows).is_ok();
+        let rows = measurement.rows(instant);
         let mut lacked = false;
         for (channel, appears) in appears.iter_mut().enumerate() {
-            if made && rows.has(channel) {
+            if rows.has(channel) {
                 lacked |= *appears < MIN_FOLD;
                 *appears += 1;
             }

@@ -42,7 +42,7 @@ use crate::online::bank::hypothesis::MotionReading;
 use crate::prior::{MapEstimate, Posterior};
 use crate::report::outcome::TimeOffset;
 use crate::robot::Robot;
-use crate::training::{PreparedLog, map_segments};
+use crate::training::PreparedLog;
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::model::{Joint, JointKind};
 use std::f64::consts::FRAC_1_SQRT_2;
@@ -215,35 +215,27 @@ struct SegmentColumns<'a> {
     /// Per instant, the rate of change of each channel.
     rates: Vec<Vec<f64>>,
     d: &'a [f64],
-    /// Buffer for the rows with another zero.
-    moved: MeasurementRows,
 }
 
 impl SegmentColumns<'_> {
-    /// Writes the columns of an instant's rows, row by row.
-    fn write(
-        &mut self,
+    /// The columns of an instant's rows, row by row.
+    fn of_rows(
+        &self,
         measurement: &mut MeasurementModel<'_>,
         number: usize,
         rows: &MeasurementRows,
-        out: &mut [f64],
-    ) {
-        let Self {
-            dofs,
-            instants,
-            rates,
-            d,
-            moved,
-        } = self;
-        let (joints, rates) = (dofs.len(), &rates[number]);
+    ) -> Vec<f64> {
+        let (joints, rates, d) = (self.dofs.len(), &self.rates[number], self.d);
         let sensors = measurement.unknowns().sensors.len();
         let width = joints + sensors + measurement.unknowns().joints.len();
-        for (joint, &dof) in dofs.iter().enumerate() {
+        let mut out = vec![0.0; width * rows.count];
+        for (joint, &dof) in self.dofs.iter().enumerate() {
             // The row holds at the true position: the measured one minus the error. The small
             // change of the offset terms is ignored.
             let step = MotionReading::Encoder(dof, [STEP, 0.0]);
-            let instant = instants[number].clone().map(|own| own.seen(step));
-            if measurement.compute_rows(&instant, moved).is_ok() && moved.count == rows.count {
+            let instant = self.instants[number].clone().map(|own| own.seen(step));
+            let moved = measurement.rows(&instant);
+            if moved.count == rows.count {
                 for row in 0..rows.count {
                     let change = moved.without_bodies(row, d) - rows.without_bodies(row, d);
                     out[row * width + joint] = change / STEP;
@@ -256,10 +248,11 @@ impl SegmentColumns<'_> {
                 let six = 6 * sensor..6 * sensor + 6;
                 out[joints + sensor] = -dot(&rows.g(row)[six.clone()], &rates[six]);
             }
-            if let Some(joint) = rows.joint(row, 6 * sensors) {
+            if let Some(joint) = rows.joint(row) {
                 out[joints + sensors + joint] = -rates[6 * sensors + joint];
             }
         }
+        out
     }
 }
 
@@ -293,28 +286,19 @@ impl<'a> Search<'a> {
         let mut sum = Information::new(first + streams + parameters);
         let stretches = stretches(training, ENOUGH);
         for (number, segments) in stretches.iter().enumerate() {
-            let reduced = map_segments(measurement, segments, |measurement, _, segment| {
-                let mut columns = SegmentColumns {
+            let reduced = measurement.map(segments, |measurement, segment| {
+                let columns = SegmentColumns {
                     dofs: &dofs,
                     instants: segment.instants,
-                    rates: rates(measurement, segment, identified),
+                    rates: rates(measurement, *segment, identified),
                     d: identified.fit.x.as_slice(),
-                    moved: MeasurementRows::new(unknowns),
                 };
-                let mut write = |measurement: &mut MeasurementModel<'_>,
-                                 number: usize,
-                                 rows: &MeasurementRows,
-                                 out: &mut [f64]| {
-                    columns.write(measurement, number, rows, out);
-                };
-                reduce_with(
-                    measurement,
-                    segment,
-                    &identified.noise,
-                    &[],
-                    width,
-                    &mut write,
-                )
+                let of_rows =
+                    |measurement: &mut MeasurementModel<'_>, number, rows: &MeasurementRows| {
+                        columns.of_rows(measurement, number, rows)
+                    };
+                let noise = &identified.noise;
+                reduce_with(measurement, *segment, noise, &[], width, &of_rows)
             });
             let own = added(&reduced, parameters + width);
             let own_columns = (first + streams..first + streams + parameters)
@@ -595,7 +579,7 @@ fn rates(
     let exact = |channel: usize, i: usize| {
         let measured = match unknowns.sensors.get(channel / 6) {
             Some(&sensor) => instants[i].readings[sensor].torque_first()[channel % 6],
-            None => instants[i].torque[unknowns.joints[channel - 6 * unknowns.sensors.len()]],
+            None => instants[i].torque[unknowns.joints[channel - unknowns.wrenches()]],
         };
         measured - noise[0][channel][i]
     };

@@ -39,7 +39,7 @@ pub(crate) fn estimate_noise(
             .iter()
             .map(|segment| segment.noise[set][channel].clone())
             .collect();
-        let walk = (channel < 6 * unknowns.sensors.len()).then(|| {
+        let walk = (channel < unknowns.wrenches()).then(|| {
             for (segment, left) in segments.iter().zip(&mut left) {
                 let drift = segment.offset_drift(unknowns, set, channel);
                 for (range, offset) in segment.ranges.iter().zip(drift) {
@@ -140,7 +140,7 @@ fn remove_random_walk(
 /// each channel has at least half the mean noise of these channels, relative to the stated noise.
 fn alike(unknowns: &Unknowns, segments: &[Residuals], model: &NoiseModel) -> Vec<f64> {
     const MIN_SHARE: f64 = 0.5;
-    let wrenches = 6 * unknowns.sensors.len();
+    let wrenches = unknowns.wrenches();
     let relative =
         |c: usize| (model.square[c] * model.time[c]).max(model.block[c]) / model.least[c];
     let mut least = model.least.clone();

@@ -115,7 +115,7 @@ impl NoiseModel {
         let (own, others) = (self.inflated(), other.inflated());
         let of_seconds = (other.seconds.mean() / self.seconds.mean()).ln();
         let of_channel = |&c: &usize| {
-            let varies = c < 6 * unknowns.sensors.len();
+            let varies = c < unknowns.wrenches();
             (others[c] / own[c]).ln() + if varies { of_seconds } else { 0.0 }
         };
         let sum: f64 = channels.iter().map(of_channel).sum();
@@ -159,12 +159,12 @@ impl NoiseModel {
         unknowns: &Unknowns,
         variances: &[f64],
         (log, t): (Option<usize>, Nanos),
-        out: &mut Vec<f64>,
-    ) {
-        let (factor, channels) = (self.seconds.factor(log, t), 6 * unknowns.sensors.len());
-        out.clear();
-        out.extend_from_slice(variances);
-        out[..channels].iter_mut().for_each(|x| *x *= factor);
+    ) -> Vec<f64> {
+        let (mut own, factor) = (variances.to_vec(), self.seconds.factor(log, t));
+        own[..unknowns.wrenches()]
+            .iter_mut()
+            .for_each(|x| *x *= factor);
+        own
     }
 }
 

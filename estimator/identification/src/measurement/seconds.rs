@@ -39,7 +39,7 @@ impl Seconds {
         residuals: &[Residuals],
         set: usize,
     ) -> Self {
-        let channels = 6 * unknowns.sensors.len();
+        let channels = unknowns.wrenches();
         // Per second and channel: sum of squares, number of readings.
         let mut sums: BTreeMap<(usize, i64), Vec<(f64, f64)>> = BTreeMap::new();
         for (segment, residuals) in segments.iter().zip(residuals) {
@@ -67,7 +67,7 @@ impl Seconds {
         segments: &[LogSegment<'_>],
         residuals: &mut [Residuals],
     ) {
-        let channels = 6 * unknowns.sensors.len();
+        let channels = unknowns.wrenches();
         for (segment, residuals) in segments.iter().zip(residuals) {
             for (i, instant) in segment.instants.iter().enumerate() {
                 let root = self.factor(segment.log, instant.t).sqrt();

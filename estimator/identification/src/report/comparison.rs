@@ -9,7 +9,6 @@ use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::{OFFSET_VARIANCE, Residuals};
 use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::Unknowns;
-use crate::parallel;
 use crate::report::outcome::ModelComparison;
 use crate::report::prediction::{self, JudgedParameters};
 use crate::robot::Robot;
@@ -63,9 +62,6 @@ pub(crate) struct TorqueSeries {
 
 /// An offset with this variance or more has not been observed.
 pub(crate) const UNREAD: f64 = 0.9 * OFFSET_VARIANCE;
-
-/// Blocks of instants that one thread takes at a time.
-pub(crate) const BLOCKS_PER_TASK: usize = 64;
 
 pub(crate) fn three<T: Copy>(values: [T; 3]) -> ModelComparison<T> {
     ModelComparison {
@@ -138,33 +134,27 @@ impl SensorComparison {
         let configured = configured_nuisance(measurement.robot(), &unknowns);
         let variances = identified.noise.offset_tracking_variances();
         let (sensors, ranges) = (unknowns.sensors.len(), &residuals.ranges);
-        let parts = parallel::map_with(
-            ranges.len().div_ceil(BLOCKS_PER_TASK),
-            || (measurement.clone(), MeasurementRows::new(&unknowns)),
-            |(measurement, rows), part| {
-                let end = ranges.len().min((part + 1) * BLOCKS_PER_TASK);
-                let mut out = Vec::new();
-                for block in part * BLOCKS_PER_TASK..end {
-                    let cases = cases(sets, &configured, &residuals.nuisance[block]);
-                    for instant in &instants[ranges[block].clone()] {
-                        let start = out.len();
-                        out.resize(start + 6 * sensors, ComparedReading::NONE);
-                        if sensors > 0 && measurement.compute_rows(instant, rows).is_ok() {
-                            let sensors = &unknowns.sensors;
-                            compare(
-                                instant,
-                                sensors,
-                                rows,
-                                &variances,
-                                &cases,
-                                &mut out[start..],
-                            );
-                        }
-                    }
+        let blocks = ranges.iter().zip(&residuals.nuisance);
+        let parts = measurement.map(blocks, |measurement, (range, block)| {
+            let cases = cases(sets, &configured, block);
+            let mut out = Vec::new();
+            for instant in &instants[range.clone()] {
+                let start = out.len();
+                out.resize(start + 6 * sensors, ComparedReading::NONE);
+                if sensors > 0 {
+                    let (sensors, rows) = (&unknowns.sensors, measurement.rows(instant));
+                    compare(
+                        instant,
+                        sensors,
+                        &rows,
+                        &variances,
+                        &cases,
+                        &mut out[start..],
+                    );
                 }
-                out
-            },
-        );
+            }
+            out
+        });
         let empty = || vec![vec![f64::NAN; instants.len()]; 6 * sensors];
         let mut comparison = Self {
             load: empty(),
@@ -243,16 +233,13 @@ pub(crate) fn predicted_deviations(
     root: &DMatrix<f64>,
 ) -> Vec<f64> {
     let unknowns = measurement.unknowns().clone();
-    let mut rows = MeasurementRows::new(&unknowns);
+    let rows = measurement.rows(instant);
     let mut out = vec![f64::NAN; unknowns.channels()];
-    if measurement.compute_rows(instant, &mut rows).is_err() {
-        return out;
-    }
     let a = DMatrix::from_fn(rows.count, unknowns.parameters(), |i, j| rows.a(i)[j]) * root;
     let noise = DMatrix::from_fn(rows.count, unknowns.channels(), |i, c| {
         rows.n(i)[c] * identified.noise.square[c].sqrt()
     });
-    let wrenches = 6 * unknowns.sensors.len();
+    let wrenches = unknowns.wrenches();
     let sensors = (0..unknowns.sensors.len()).map(|index| 6 * index..6 * index + 6);
     for channels in sensors.chain((wrenches..unknowns.channels()).map(|c| c..c + 1)) {
         let Some(map) = attribute_to(

@@ -20,7 +20,7 @@ pub(crate) fn curves(
 ) -> Vec<Curve> {
     let robot = measurement.robot();
     let unknowns = measurement.unknowns().clone();
-    let wrenches = 6 * unknowns.sensors.len();
+    let wrenches = unknowns.wrenches();
     let points: Vec<usize> = (0..instants.len())
         .step_by(instants.len().div_ceil(POINTS).max(1))
         .collect();

@@ -7,7 +7,6 @@ use crate::fit::Identified;
 use crate::measurement::channels::{channel_of, sensor_name};
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::{LogSegment, Residuals, reduce, residuals};
-use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::{FRICTION, Unknowns, friction_row};
 use crate::report::comparison::{
     Judged, STILL, SensorComparison, TorqueSeries, cases, configured_nuisance, covered, three,
@@ -54,7 +53,7 @@ pub(crate) fn with_friction_of_training(
     (set, friction): (usize, &[[f64; FRICTION]]),
     index: usize,
 ) -> Vec<f64> {
-    let wrenches = 6 * unknowns.sensors.len();
+    let wrenches = unknowns.wrenches();
     let mut errors = residuals.noise[set][wrenches + index].clone();
     for (range, block) in residuals.ranges.iter().zip(&residuals.nuisance) {
         for i in range.clone() {
@@ -84,7 +83,7 @@ pub(crate) fn log_outcome(
     let residuals = residuals(measurement, segment, &identified.noise, sets);
     let times = instants.iter().map(|i| (i.t - log.span.0).seconds());
     let times: Vec<f64> = times.collect();
-    let wrenches = 6 * unknowns.sensors.len();
+    let wrenches = unknowns.wrenches();
     let compared = SensorComparison::new(measurement, instants, &residuals, identified, sets);
     let torques = residuals.noise[1].iter().skip(wrenches);
     let errors: Vec<&[f64]> = compared.errors[2]
@@ -163,7 +162,7 @@ fn input_torques(
 ) -> Vec<TorqueSeries> {
     let unknowns = &judged.identified.unknowns;
     let series = |(index, &dof): (usize, &usize)| {
-        let channel = 6 * unknowns.sensors.len() + index;
+        let channel = unknowns.wrenches() + index;
         let raw = residuals.measured[channel]
             .iter()
             .zip(&residuals.predicted[channel])
@@ -237,7 +236,7 @@ fn joint_outcomes(
 ) -> Vec<JointOutcome> {
     let outcome = |own: &TorqueSeries| {
         let index = unknowns.joints.binary_search(&own.dof).ok();
-        let channel = index.map(|index| 6 * unknowns.sensors.len() + index);
+        let channel = index.map(|index| unknowns.wrenches() + index);
         JointOutcome {
             name: robot.model.dof_name(own.dof).to_owned(),
             rms_nm: three([0, 1, 2].map(|set| rms(own.errors[set].iter().copied()))),
@@ -398,13 +397,13 @@ pub(crate) fn two_route(
     let dofs = robot.model.dof_count();
     let configured = configured_nuisance(robot, &unknowns);
     let mut series = vec![[const { Vec::new() }; 3]; dofs];
-    let mut rows = MeasurementRows::new(&unknowns);
     for (range, block) in residuals.ranges.iter().zip(&residuals.nuisance) {
         let cases = cases(sets, &configured, block);
         for instant in &instants[range.clone()] {
-            if unknowns.sensors.len() < 2 || measurement.compute_rows(instant, &mut rows).is_err() {
+            if unknowns.sensors.len() < 2 {
                 continue;
             }
+            let rows = measurement.rows(instant);
             for (dof, along) in measurement.two_routes(&rows) {
                 for (series, (d, nuisance)) in series[dof].iter_mut().zip(cases) {
                     let weights = along.iter().enumerate();
@@ -485,7 +484,7 @@ pub(crate) fn friction(
     let Some(last) = residuals.nuisance.last() else {
         return Vec::new();
     };
-    let first = 6 * unknowns.sensors.len();
+    let first = unknowns.wrenches();
     let value = |index: usize, k: usize| last.x[(first + FRICTION * index + k, 1)];
     unknowns
         .joints

@@ -353,7 +353,7 @@ pub(crate) fn covariance(
     root: &DMatrix<f64>,
 ) -> CovarianceRoot {
     let (links, p) = (unknowns.inertial(), unknowns.parameters());
-    let s = 6 * unknowns.sensors.len();
+    let s = unknowns.wrenches();
     let of_links = unknowns.links.iter().flat_map(|&link| {
         (0..LINK_PARAMETERS).map(move |parameter| ParameterColumn::Inertial { link, parameter })
     });
