@@ -30,7 +30,7 @@ use crate::finding::{Finding, FindingCode};
 use crate::fit::{
     Identified, IdentifyError, LOAD_VARIANCE_RATIO, NoiseAndMap, OffsetDrift, added,
     alternate_noise_and_map, negative_rotors, parameters_without_cad, per_column, posterior,
-    unsettled, walk_limits, without_negative_rotors,
+    unsettled, without_negative_rotors,
 };
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::{NoiseModel, Seconds};
@@ -113,13 +113,12 @@ pub fn identify(
             &mut progress,
         )?;
     }
-    let measurement = measurement;
     let (undeclared, not_converged) = (clean.undeclared, clean.not_converged);
     undeclared.report(&measurement, &mut logs, &clean.estimate);
 
     // 5. Cross-validation.
     let mut identified = cross_validated_fit(
-        &measurement,
+        measurement,
         &training_logs(&logs),
         inputs,
         calibrated,
@@ -131,16 +130,16 @@ pub fn identify(
     identified.findings.extend(notes);
 
     // 6. Disturbances in validation logs, encoder errors, delays.
-    undeclared::report_validation(&measurement, &mut logs, &identified);
+    undeclared::report_validation(&mut logs, &identified);
     progress("figures".into(), 0.88);
     let (found, time_offsets) = if signs.is_empty() {
-        Search::new(&measurement, &training_logs(&logs), &identified).findings()
+        Search::new(&training_logs(&logs), &identified).findings()
     } else {
         (signs, Vec::new())
     };
 
     // 7. Figures.
-    let outcome = assemble::outcome(&measurement, &logs, &identified, (found, time_offsets));
+    let outcome = assemble::outcome(&logs, &identified, (found, time_offsets));
     progress("done".into(), 1.0);
     Ok(outcome)
 }
@@ -304,8 +303,8 @@ impl Exclusion<'_, '_> {
     /// offset drifts faster than the limit, it does not.
     fn limit_drift(&mut self, noise: &NoiseModel) -> bool {
         self.drift = OffsetDrift::AsStated;
-        let rates = walk_limits(self.measurement, self.drift).rates;
-        let mut pairs = noise.drift.iter().zip(&rates);
+        let fastest = self.drift.fastest(self.measurement);
+        let mut pairs = noise.drift.iter().zip(&fastest);
         pairs.any(|(found, most)| found > most)
     }
 }
@@ -394,42 +393,42 @@ fn with_gains(
 
 /// Cross-validates an estimate and fits all instants with the noise that this shows; the change
 /// from CAD is shrunk to the retained fraction.
-fn cross_validated_fit(
-    measurement: &MeasurementModel<'_>,
+fn cross_validated_fit<'a>(
+    measurement: MeasurementModel<'a>,
     training: &[&PreparedLog],
     inputs: Vec<IdentificationInput>,
     calibrated: Kind,
     estimate: NoiseAndMap,
     progress: &mut dyn FnMut(String, f64),
-) -> Result<Identified, IdentifyError> {
-    let unknowns = measurement.unknowns().clone();
+) -> Result<Identified<'a>, IdentifyError> {
+    let unknowns = measurement.unknowns();
     let segments = segments_of(training, SEGMENT_INSTANTS);
     let (prior, noise) = (estimate.prior, estimate.noise);
     progress("cross-validation".into(), 0.69);
-    let sampled = sample(measurement, training);
+    let sampled = sample(&measurement, training);
     let tau = estimate.fit.tau;
-    let mut retention = cross_validation::held_out(measurement, &prior, &sampled, &noise, tau)?;
+    let mut retention = cross_validation::held_out(&measurement, &prior, &sampled, &noise, tau)?;
     retention.findings.extend(unsettled(estimate.change));
     // The fit has absorbed a part of the noise of its own data, most of all noise that is as slow
     // as the motion.
-    let walk_limits = walk_limits(measurement, OffsetDrift::AsStated);
-    let mut noise = retention.noise(measurement, &sampled, noise, &walk_limits);
+    let fastest = OffsetDrift::AsStated.fastest(&measurement);
+    let mut noise = retention.noise(&measurement, &sampled, noise, &fastest);
     // Of the seconds that were not sampled, too.
-    let left = segment_residuals(measurement, &segments, &noise, &estimate.fit.x);
-    noise.seconds = Seconds::of(&unknowns, &segments, &left, 0);
-    let reduced = reduced_segments(measurement, &segments, &noise);
+    let left = segment_residuals(&measurement, &segments, &noise, &estimate.fit.x);
+    noise.seconds = Seconds::of(unknowns, &segments, &left);
+    let reduced = reduced_segments(&measurement, &segments, &noise);
     let information = added(&reduced, unknowns.parameters());
-    let fit = posterior(&prior, &unknowns, &information)?.maximise_evidence()?;
-    let rotors = negative_rotors(measurement.robot(), &unknowns, &fit);
+    let fit = posterior(&prior, unknowns, &information)?.maximise_evidence()?;
+    let rotors = negative_rotors(measurement.robot(), unknowns, &fit);
     retention.findings.extend(rotors);
-    let cad = parameters_without_cad(&unknowns, &information);
-    let mut d = without_negative_rotors(&prior, &unknowns, &information, &fit)?;
-    let shares = per_column(&unknowns, &retention.share);
+    let cad = parameters_without_cad(unknowns, &information);
+    let mut d = without_negative_rotors(&prior, unknowns, &information, &fit)?;
+    let shares = per_column(unknowns, &retention.share);
     for (column, share) in shares.into_iter().enumerate() {
         d[column] = cad[column] + share * (d[column] - cad[column]);
     }
     Ok(Identified {
-        unknowns,
+        measurement,
         inputs,
         calibrated,
         prior,

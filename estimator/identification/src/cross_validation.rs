@@ -23,7 +23,7 @@ use crate::fit::{
 use crate::linear::information::Information;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_estimate::estimate_noise;
-use crate::measurement::noise_model::{DriftLimits, NoiseModel};
+use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::reduction::{LogSegment, Residuals, reduce_with, residuals};
 use crate::measurement::unknowns::Unknowns;
 use crate::prior::Prior;
@@ -56,7 +56,7 @@ impl Retention {
         measurement: &MeasurementModel<'_>,
         segments: &[LogSegment<'_>],
         noise: NoiseModel,
-        walk_limits: &DriftLimits,
+        fastest: &[f64],
     ) -> NoiseModel {
         if self.sets.is_empty() {
             return noise;
@@ -74,8 +74,7 @@ impl Retention {
         noise.cross_validated_noise(&estimate_noise(
             unknowns,
             &own_residuals,
-            0,
-            walk_limits,
+            fastest,
             &noise.least,
         ))
     }

@@ -258,9 +258,8 @@ impl SegmentColumns<'_> {
 
 /// The search for errors that are estimated.
 pub(crate) struct Search<'a> {
-    measurement: &'a MeasurementModel<'a>,
     training: &'a [&'a PreparedLog],
-    identified: &'a Identified,
+    identified: &'a Identified<'a>,
     /// The tested joints.
     dofs: Vec<usize>,
     /// Triangle of the information about the zeros, log by log, then the delays, then the
@@ -273,12 +272,8 @@ pub(crate) struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    pub(crate) fn new(
-        measurement: &'a MeasurementModel<'a>,
-        training: &'a [&'a PreparedLog],
-        identified: &'a Identified,
-    ) -> Self {
-        let unknowns = &identified.unknowns;
+    pub(crate) fn new(training: &'a [&'a PreparedLog], identified: &'a Identified<'a>) -> Self {
+        let (measurement, unknowns) = (&identified.measurement, identified.unknowns());
         let dofs = turning(measurement.robot());
         let (logs, joints, parameters) = (training.len(), dofs.len(), unknowns.parameters());
         let streams = unknowns.sensors.len() + unknowns.joints.len();
@@ -290,7 +285,7 @@ impl<'a> Search<'a> {
                 let columns = SegmentColumns {
                     dofs: &dofs,
                     instants: segment.instants,
-                    rates: rates(measurement, *segment, identified),
+                    rates: rates(*segment, identified),
                     d: identified.fit.x.as_slice(),
                 };
                 let of_rows =
@@ -313,7 +308,6 @@ impl<'a> Search<'a> {
             .chain(each)
             .flat_map(|log| (0..joints).map(move |joint| SetupError::Zero { joint, log }));
         let mut search = Self {
-            measurement,
             training,
             identified,
             r,
@@ -329,7 +323,7 @@ impl<'a> Search<'a> {
 
     /// The delay of each F/T sensor, and that of all joint torques.
     fn streams(&self) -> Vec<SetupError> {
-        let unknowns = &self.identified.unknowns;
+        let unknowns = self.identified.unknowns();
         let (sensors, joints) = (unknowns.sensors.len(), unknowns.joints.len());
         let torques = Some(sensors..sensors + joints).filter(|_| joints > 0);
         let single = (0..sensors).map(|own| own..own + 1);
@@ -351,7 +345,7 @@ impl<'a> Search<'a> {
     /// The parameters' columns, then those of these errors. (Other errors are zero: their columns
     /// are omitted.)
     fn columns(&self, errors: &[SetupError]) -> DMatrix<f64> {
-        let parameters = self.identified.unknowns.parameters();
+        let parameters = self.identified.unknowns().parameters();
         let columns = self.r.columns(self.r.ncols() - parameters, parameters);
         let mut columns =
             (columns.into_owned()).resize_horizontally(parameters + errors.len(), 0.0);
@@ -363,7 +357,7 @@ impl<'a> Search<'a> {
 
     /// The MAP parameters and these errors, and their cost.
     fn fit(&self, errors: &[SetupError]) -> Option<(f64, MapEstimate)> {
-        let (unknowns, prior) = (&self.identified.unknowns, &self.identified.prior);
+        let (unknowns, prior) = (self.identified.unknowns(), &self.identified.prior);
         let mut precision = unknowns.precision.clone();
         precision.extend(errors.iter().map(SetupError::precision));
         let columns = self.columns(errors);
@@ -375,7 +369,10 @@ impl<'a> Search<'a> {
     /// These errors, all of them estimated together, with their deviations.
     fn estimates(&self, errors: &[SetupError]) -> Option<Vec<Estimate>> {
         let (_, fit) = self.fit(errors)?;
-        let (root, first) = (fit.covariance_root(), self.identified.unknowns.parameters());
+        let (root, first) = (
+            fit.covariance_root(),
+            self.identified.unknowns().parameters(),
+        );
         let estimates = (first..first + errors.len()).map(|k| (fit.x[k], root.row(k).norm()));
         Some(estimates.collect())
     }
@@ -454,7 +451,7 @@ impl<'a> Search<'a> {
         let (of_zeros, of_streams) = together.split_at(count);
         let mut findings = self.about_zeros(&zeros, of_zeros);
 
-        let (robot, unknowns) = (self.measurement.robot(), &self.identified.unknowns);
+        let (robot, unknowns) = (self.identified.robot(), self.identified.unknowns());
         let (sensors, torques) = (unknowns.sensors.len(), unknowns.joints.len());
         let significance = deviations(sensors + torques + 1);
         let is_long = |(seconds, deviation): Estimate| {
@@ -499,7 +496,7 @@ impl<'a> Search<'a> {
     }
 
     fn about_zeros(&self, zeros: &[SetupError], estimates: &[Estimate]) -> Vec<Finding> {
-        let (robot, unknowns) = (self.measurement.robot(), &self.identified.unknowns);
+        let (robot, unknowns) = (self.identified.robot(), self.identified.unknowns());
         let file = |log: usize| self.training[log].file.as_str();
         let mut findings = Vec::new();
         for (number, &dof) in self.dofs.iter().enumerate() {
@@ -568,14 +565,10 @@ fn is_known((_, deviation): &Estimate) -> bool {
 }
 
 /// Per instant, the rate of change of each channel without noise; 0 where it is not known.
-fn rates(
-    measurement: &MeasurementModel<'_>,
-    segment: LogSegment<'_>,
-    identified: &Identified,
-) -> Vec<Vec<f64>> {
-    let (unknowns, instants) = (&identified.unknowns, segment.instants);
+fn rates(segment: LogSegment<'_>, identified: &Identified<'_>) -> Vec<Vec<f64>> {
+    let (unknowns, instants) = (identified.unknowns(), segment.instants);
     let d = std::slice::from_ref(&identified.d);
-    let noise = residuals(measurement, segment, &identified.noise, d).noise;
+    let noise = residuals(&identified.measurement, segment, &identified.noise, d).noise;
     let exact = |channel: usize, i: usize| {
         let measured = match unknowns.sensors.get(channel / 6) {
             Some(&sensor) => instants[i].readings[sensor].torque_first()[channel % 6],

@@ -313,13 +313,9 @@ fn suspected(
 /// Reports undeclared disturbances of the validation logs, stores them in
 /// [`PreparedLog::disturbed`]. The figures of these logs still include all rows: validation data
 /// must not be selected by the model that they validate.
-pub(crate) fn report_validation(
-    measurement: &MeasurementModel<'_>,
-    logs: &mut [PreparedLog],
-    identified: &Identified,
-) {
+pub(crate) fn report_validation(logs: &mut [PreparedLog], identified: &Identified<'_>) {
     let is_checked = |log: &&mut PreparedLog| log.role == LogRole::Validate && !log.refused;
-    let robot = measurement.robot();
+    let (measurement, robot) = (&identified.measurement, identified.robot());
     let mut undeclared = Undeclared::none(logs.iter_mut().filter(is_checked));
     let converges = (0..ROUNDS).any(|_| {
         let checked = logs.iter_mut().filter(is_checked);

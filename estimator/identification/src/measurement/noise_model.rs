@@ -4,15 +4,6 @@ use crate::measurement::unknowns::Unknowns;
 use proprio_topics::Nanos;
 use std::collections::BTreeMap;
 
-/// Upper limits of the drift rates of offsets (random walk).
-#[derive(Clone, Debug)]
-pub(crate) struct DriftLimits {
-    /// The greatest variance of a step between blocks, relative to that of a block's noise.
-    pub relative: f64,
-    /// Per channel of F/T sensors, the greatest rate [unit^2/s].
-    pub rates: Vec<f64>,
-}
-
 /// The noise of all channels.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct NoiseModel {

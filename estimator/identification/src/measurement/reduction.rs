@@ -167,10 +167,10 @@ impl Residuals {
         self.measured[channel].iter().any(|x| x.is_finite())
     }
 
-    /// The drift of a channel's offset about its mean, per block. Drifts of several sensors that
+    /// The drift of a channel's offset about its mean, per block, for the first set. Drifts of several sensors that
     /// rows mix are shared as their noise is. (Otherwise the sensor with the greatest assumed drift
     /// rate would get all of it.)
-    pub(crate) fn offset_drift(&self, unknowns: &Unknowns, set: usize, channel: usize) -> Vec<f64> {
+    pub(crate) fn offset_drift(&self, unknowns: &Unknowns, channel: usize) -> Vec<f64> {
         let mut sum = vec![0.0; self.nuisance.len()];
         for other in 0..unknowns.wrenches() {
             let share = self.shares[(channel, other)];
@@ -178,7 +178,7 @@ impl Residuals {
                 continue;
             }
             let unknown = unknowns.offset_of(other);
-            let values = self.nuisance.iter().map(|block| block.x[(unknown, set)]);
+            let values = self.nuisance.iter().map(|block| block.x[(unknown, 0)]);
             let mean = values.clone().sum::<f64>() / self.nuisance.len() as f64;
             for (sum, value) in sum.iter_mut().zip(values) {
                 *sum += share * (value - mean);
@@ -373,7 +373,6 @@ pub(crate) mod tests {
     use crate::arithmetic::normals;
     use crate::dataset::observation::Observation;
     use crate::measurement::noise_estimate::estimate_noise;
-    use crate::measurement::noise_model::DriftLimits;
     use crate::measurement::noise_model::Seconds;
     use crate::robot::{IdentificationInput, Robot};
     use nalgebra::{Matrix6, Vector6};
@@ -563,13 +562,10 @@ pub(crate) mod tests {
         let mut noise = NoiseModel::unknown(least.clone());
         let segment = LogSegment::alone(instants);
         let zero = DVector::zeros(unknowns.parameters());
-        let walks = DriftLimits {
-            relative: 0.01,
-            rates: vec![f64::INFINITY; 12],
-        };
+        let fastest = [f64::INFINITY; 12];
         for _ in 0..rounds {
             let left = residuals(&measurement, segment, &noise, std::slice::from_ref(&zero));
-            noise = estimate_noise(&unknowns, std::slice::from_ref(&left), 0, &walks, &least);
+            noise = estimate_noise(&unknowns, std::slice::from_ref(&left), &fastest, &least);
         }
         noise
     }

@@ -37,7 +37,6 @@ impl Seconds {
         unknowns: &Unknowns,
         segments: &[LogSegment<'_>],
         residuals: &[Residuals],
-        set: usize,
     ) -> Self {
         let channels = unknowns.wrenches();
         // Per second and channel: sum of squares, number of readings.
@@ -47,7 +46,7 @@ impl Seconds {
             for (i, instant) in segment.instants.iter().enumerate() {
                 let own = sums.entry((log, second(instant.t)));
                 let own = own.or_insert_with(|| vec![(0.0, 0.0); channels]);
-                for (sum, noise) in own.iter_mut().zip(&residuals.noise[set]) {
+                for (sum, noise) in own.iter_mut().zip(&residuals.noise[0]) {
                     if noise[i].is_finite() {
                         *sum = (sum.0 + noise[i] * noise[i], sum.1 + 1.0);
                     }

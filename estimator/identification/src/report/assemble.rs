@@ -3,7 +3,6 @@
 
 use crate::finding::{Finding, FindingCode};
 use crate::fit::{Identified, per_column};
-use crate::measurement::model::MeasurementModel;
 use crate::measurement::unknowns::Unknowns;
 use crate::report::calibration::{calibrations, channels};
 use crate::report::comparison::Judged;
@@ -50,12 +49,11 @@ pub(crate) fn nothing(robot: &Robot, logs: &[PreparedLog], reason: String) -> Ou
 /// The whole outcome; with what the search for errors of the set-up `found`, and the time offset of
 /// every stream.
 pub(crate) fn outcome(
-    measurement: &MeasurementModel<'_>,
     logs: &[PreparedLog],
-    identified: &Identified,
+    identified: &Identified<'_>,
     (found, time_offsets): (Vec<Finding>, Vec<TimeOffset>),
 ) -> Outcome {
-    let (robot, unknowns) = (measurement.robot(), &identified.unknowns);
+    let (robot, unknowns) = (identified.robot(), identified.unknowns());
     let training = training_logs(logs);
     let narrow = identified.fit.covariance_root();
     let (scaled, spread) = scaled_information(identified);
@@ -67,33 +65,29 @@ pub(crate) fn outcome(
         shrunk(&narrow, &cad_root(unknowns, &r, &spread), &kept)
     };
     let spectrum = Spectrum::new(robot, unknowns, scaled, &spread);
-    let subspace = subspace(robot, &training, identified);
+    let subspace = subspace(&training, identified);
     let (base_parameters, mut not_separable, structural_rank) =
-        base_parameters(robot, identified, &root, subspace.as_ref());
-    let sums = rotors_not_separable(robot, identified, &spread);
+        base_parameters(identified, &root, subspace.as_ref());
+    let sums = rotors_not_separable(identified, &spread);
     let structural_rank = structural_rank.saturating_sub(sums.len());
     not_separable.extend(sums);
-    let mut findings = inertia_findings(robot, identified);
+    let mut findings = inertia_findings(identified);
     findings.extend(found);
     findings.extend(identified.findings.iter().cloned());
-    let (calibrations, calibration_findings) = calibrations(robot, measurement, identified, &root);
+    let (calibrations, calibration_findings) = calibrations(identified, &root);
     findings.extend(calibration_findings);
-    let judged = Judged::new(measurement, logs, identified, &root);
-    let mut measurement = measurement.clone();
-    let outcomes = logs
-        .iter()
-        .map(|log| log_outcome(&mut measurement, log, &judged));
+    let judged = Judged::new(logs, identified, &root);
     Outcome {
         robot: robot.name.clone(),
         verdict: verdict(identified),
-        links: links(robot, identified, &narrow, &root, &spread),
+        links: links(identified, &narrow, &root, &spread),
         covariance: covariance(unknowns, &identified.reduced, &root),
         tau: identified.fit.tau,
         least_retained_fraction: identified.retained[..unknowns.links.len()]
             .iter()
             .copied()
             .fold(1.0, f64::min),
-        rotors: rotors(robot, identified, &root),
+        rotors: rotors(identified, &root),
         calibrations,
         unknowns: unknowns.inertial(),
         rank: spectrum.rank,
@@ -104,19 +98,19 @@ pub(crate) fn outcome(
         weakest: spectrum.weakest,
         not_separable,
         base_parameters,
-        channels: channels(robot, identified, &training),
+        channels: channels(identified, &training),
         time_offsets,
-        logs: outcomes.collect(),
+        logs: logs.iter().map(|log| log_outcome(log, &judged)).collect(),
         findings,
     }
 }
 
 /// Notes of the seen links whose inertia in CAD is that of no body.
-fn inertia_findings(robot: &Robot, identified: &Identified) -> Vec<Finding> {
+fn inertia_findings(identified: &Identified<'_>) -> Vec<Finding> {
     let floors = identified.prior.floors().iter();
-    let seen = floors.filter(|floor| identified.unknowns.links.contains(&floor.link));
+    let seen = floors.filter(|floor| identified.unknowns().links.contains(&floor.link));
     seen.map(|floor| {
-        let name = robot.model.link_name(floor.link);
+        let name = identified.robot().model.link_name(floor.link);
         let text = floor.describe(name);
         Finding::note(FindingCode::InertiaRegularised, name, text)
     })
@@ -178,7 +172,7 @@ impl Spectrum {
 }
 
 /// The verdict after cross-validation.
-fn verdict(identified: &Identified) -> Verdict {
+fn verdict(identified: &Identified<'_>) -> Verdict {
     if identified.retained.iter().any(|kept| *kept > 0.0) {
         Verdict::Identified
     } else {
