@@ -65,10 +65,10 @@ pub(crate) struct PreparedLog {
     pub excluded: Vec<Excluded>,
     pub findings: Vec<Finding>,
     pub refused: bool,
-    /// Of a validation log: the sub-trees on which an undeclared disturbance acts, per instant;
-    /// empty if none was looked for. [`Annotated::disturbed`] stays empty there, because figures of
-    /// such a log include all of its instants.
-    pub disturbed: Vec<SubtreeSet>,
+    /// Per instant, the sub-trees on which an undeclared contact acts. In the end
+    /// [`Annotated::disturbed`] is empty in a validation log, because figures of such a log include
+    /// all of its instants.
+    pub contacts: Vec<SubtreeSet>,
 }
 
 impl PreparedLog {
@@ -199,12 +199,22 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> PreparedLog {
         (Some(first), Some(last)) => (first.t, last.t),
         _ => (Nanos::ZERO, Nanos::ZERO),
     };
-    let mut reasons = ExclusionReasons::default();
+    let mut reasons: BTreeMap<String, Excluded> = BTreeMap::new();
+    let mut exclude = |reason: String, t: Nanos| {
+        let entry = reasons.entry(reason.clone()).or_insert(Excluded {
+            reason,
+            instants: 0,
+            first: t,
+            last: t,
+        });
+        entry.instants += 1;
+        entry.last = t;
+    };
     let mut instants = Vec::new();
     for instant in all {
         let t = instant.t;
         if !instant.knows_motion(&robot.channels) {
-            reasons.add(without_motion(robot, &instant), t);
+            exclude(without_motion(robot, &instant), t);
             continue;
         }
         let mut excluded = Vec::new();
@@ -212,21 +222,21 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> PreparedLog {
             if let ChannelRole::Sensor(sensor) = channel.role
                 && *fault != Reason::None
             {
-                reasons.add(format!("{} of {}", fault.word(), channel.name), t);
+                exclude(format!("{} of {}", fault.word(), channel.name), t);
                 excluded.push(sensor);
             }
         }
         for contact in instant.active.difference(&robot.always).iter() {
             let name = robot.contacts.get(contact).map_or("", |c| c.name.as_str());
             let reason = format!("contact declared: {name} (the links that it touches)");
-            reasons.add(reason, t);
+            exclude(reason, t);
         }
         let read = excluded
             .into_iter()
             .fold(instant, Observation::without_reading);
         instants.push(Annotated::from(read));
     }
-    let excluded: Vec<Excluded> = reasons.0.into_values().collect();
+    let excluded: Vec<Excluded> = reasons.into_values().collect();
     let is_short = folds(instants.iter().map(|instant| instant.t)) < 1;
     if is_short && !refused {
         let text = too_few(instants.len(), apart, &excluded, &findings);
@@ -237,27 +247,10 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> PreparedLog {
         role,
         span,
         refused: refused || is_short,
+        contacts: vec![SubtreeSet::default(); instants.len()],
         instants,
         excluded,
         findings,
-        disturbed: Vec::new(),
-    }
-}
-
-/// What is excluded, by reason.
-#[derive(Default)]
-struct ExclusionReasons(BTreeMap<String, Excluded>);
-
-impl ExclusionReasons {
-    fn add(&mut self, reason: String, t: Nanos) {
-        let entry = self.0.entry(reason.clone()).or_insert(Excluded {
-            reason,
-            instants: 0,
-            first: t,
-            last: t,
-        });
-        entry.instants += 1;
-        entry.last = t;
     }
 }
 

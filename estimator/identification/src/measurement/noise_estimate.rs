@@ -17,7 +17,7 @@ const INDEPENDENT: f64 = 8.0;
 const LONGEST: usize = 10;
 
 /// Lower limit of a channel's share of noise, for channels mixed with others.
-const LEAST_SHARE: f64 = 1e-3;
+pub(crate) const LEAST_SHARE: f64 = 1e-3;
 
 /// The noise of every channel, from the residuals of all segments for one set of parameters. Per
 /// channel of F/T sensors the drift of its offset is at most that of `fastest`, the rate of a random
@@ -53,7 +53,7 @@ pub(crate) fn estimate_noise(
             }
             remove_random_walk(segments, &mut left, fastest[channel])
         });
-        let (square, time) = autocorrelation_time(&left);
+        let (square, time) = noise::autocorrelation_time(&left);
         let seen: f64 = segments.iter().map(|segment| segment.seen[channel]).sum();
         let shown: f64 = segments
             .iter()
@@ -72,11 +72,6 @@ pub(crate) fn estimate_noise(
     }
     model.least = alike(unknowns, segments, &model);
     model
-}
-
-fn autocorrelation_time(segments: &[Vec<f64>]) -> (f64, f64) {
-    let slices: Vec<&[f64]> = segments.iter().map(Vec::as_slice).collect();
-    noise::autocorrelation_time(&slices)
 }
 
 /// Removes the random walk of a channel's offset from the sums of offset and noise. Returns the
@@ -129,7 +124,7 @@ fn remove_random_walk(segments: &[Residuals], left: &mut [Vec<f64>], fastest: f6
                 }
             }
         }
-        let (_, time) = autocorrelation_time(left);
+        let (_, time) = noise::autocorrelation_time(left);
         merged = ((INDEPENDENT * time / per_block).round() as usize).clamp(1, LONGEST);
     }
     (step, variance * per_block)

@@ -17,8 +17,13 @@ use crate::robot::Robot;
 use crate::training::{PreparedLog, training_logs};
 use nalgebra::DMatrix;
 
-/// The outcome without identified parameters: CAD's, and the reason.
-pub(crate) fn nothing(robot: &Robot, logs: &[PreparedLog], reason: String) -> Outcome {
+/// The outcome without identified parameters: CAD's, and the reason, with what was found.
+pub(crate) fn nothing(
+    robot: &Robot,
+    logs: &[PreparedLog],
+    reason: String,
+    found: Vec<Finding>,
+) -> Outcome {
     let logs = logs.iter().map(|log| LogOutcome {
         file: log.file.clone(),
         role: log.role,
@@ -40,7 +45,7 @@ pub(crate) fn nothing(robot: &Robot, logs: &[PreparedLog], reason: String) -> Ou
         tau: f64::NAN,
         condition: f64::NAN,
         logs: logs.collect(),
-        findings: vec![finding],
+        findings: std::iter::once(finding).chain(found).collect(),
         verdict: Verdict::Nothing(reason),
         ..Outcome::default()
     }
@@ -64,7 +69,6 @@ pub(crate) fn outcome(
         let (r, _) = identified.information.to_triangle();
         shrunk(&narrow, &cad_root(unknowns, &r, &spread), &kept)
     };
-    let spectrum = Spectrum::new(robot, unknowns, scaled, &spread);
     let subspace = subspace(&training, identified);
     let (base_parameters, mut not_separable, structural_rank) =
         base_parameters(identified, &root, subspace.as_ref());
@@ -90,18 +94,15 @@ pub(crate) fn outcome(
         rotors: rotors(identified, &root),
         calibrations,
         unknowns: unknowns.inertial(),
-        rank: spectrum.rank,
         structural_rank,
         effective: identified.fit.effective,
-        condition: spectrum.condition(),
-        singular_values: spectrum.singular_values,
-        weakest: spectrum.weakest,
         not_separable,
         base_parameters,
         channels: channels(identified, &training),
         time_offsets,
         logs: logs.iter().map(|log| log_outcome(log, &judged)).collect(),
         findings,
+        ..spectrum(robot, unknowns, scaled, &spread)
     }
 }
 
@@ -117,57 +118,44 @@ fn inertia_findings(identified: &Identified<'_>) -> Vec<Finding> {
     .collect()
 }
 
-/// What the logs tell of the links' parameters in units of the prior's spread.
-struct Spectrum {
-    /// Descending.
-    singular_values: Vec<f64>,
-    rank: usize,
-    weakest: Vec<WeakDirection>,
-}
-
-impl Spectrum {
+/// What the logs tell of the links' parameters in units of the prior's spread: the figures of an
+/// outcome about that, without all others.
+fn spectrum(
+    robot: &Robot,
+    unknowns: &Unknowns,
+    scaled: DMatrix<f64>,
+    spread: &[DMatrix<f64>],
+) -> Outcome {
     /// Most weak directions that are named.
     const WEAKEST: usize = 5;
-
-    fn new(
-        robot: &Robot,
-        unknowns: &Unknowns,
-        scaled: DMatrix<f64>,
-        spread: &[DMatrix<f64>],
-    ) -> Self {
-        let svd = scaled.svd(false, true);
-        let mut order: Vec<usize> = (0..svd.singular_values.len()).collect();
-        order.sort_by(|&a, &b| svd.singular_values[b].total_cmp(&svd.singular_values[a]));
-        let singular_values: Vec<f64> = order.iter().map(|&i| svd.singular_values[i]).collect();
-        let greatest = singular_values.first().copied().unwrap_or(0.0);
-        let is_seen = |s: &&f64| **s > 1e-8 * greatest && greatest > 0.0;
-        let rank = singular_values.iter().filter(is_seen).count();
-        let directions = svd
-            .v_t
-            .unwrap_or_else(|| DMatrix::zeros(0, unknowns.inertial()));
-        let weakest = order[..rank].iter().rev().take(Self::WEAKEST).map(|&i| {
-            let direction = directions.row(i).transpose();
-            let value = svd.singular_values[i];
-            let (expression, links) = expression(robot, unknowns, spread, &direction);
-            WeakDirection {
-                expression,
-                links,
-                relative: value / greatest,
-                prior_share: 1.0 / (1.0 + value * value),
-            }
-        });
-        Self {
-            weakest: weakest.collect(),
-            singular_values,
-            rank,
+    let svd = scaled.svd(false, true);
+    let mut order: Vec<usize> = (0..svd.singular_values.len()).collect();
+    order.sort_by(|&a, &b| svd.singular_values[b].total_cmp(&svd.singular_values[a]));
+    let singular_values: Vec<f64> = order.iter().map(|&i| svd.singular_values[i]).collect();
+    let greatest = singular_values.first().copied().unwrap_or(0.0);
+    let is_seen = |s: &&f64| **s > 1e-8 * greatest && greatest > 0.0;
+    let rank = singular_values.iter().filter(is_seen).count();
+    let directions = svd
+        .v_t
+        .unwrap_or_else(|| DMatrix::zeros(0, unknowns.inertial()));
+    let weakest = order[..rank].iter().rev().take(WEAKEST).map(|&i| {
+        let direction = directions.row(i).transpose();
+        let value = svd.singular_values[i];
+        let (expression, links) = expression(robot, unknowns, spread, &direction);
+        WeakDirection {
+            expression,
+            links,
+            relative: value / greatest,
+            prior_share: 1.0 / (1.0 + value * value),
         }
-    }
-
-    fn condition(&self) -> f64 {
-        match self.rank.checked_sub(1) {
-            Some(last) => self.singular_values[0] / self.singular_values[last],
-            None => f64::NAN,
-        }
+    });
+    let least = rank.checked_sub(1).map(|last| singular_values[last]);
+    Outcome {
+        rank,
+        condition: least.map_or(f64::NAN, |least| greatest / least),
+        weakest: weakest.collect(),
+        singular_values,
+        ..Outcome::default()
     }
 }
 

@@ -1,6 +1,7 @@
 //! The figures of one log: residuals, prediction errors, coverage, offsets, friction, findings.
 
 use crate::arithmetic::{dot, mean, rms};
+use crate::dataset::LogRole;
 use crate::dataset::observation::{Annotated, SubtreeSet};
 use crate::finding::{Finding, FindingCode};
 use crate::fit::Identified;
@@ -256,11 +257,11 @@ fn sensor_outcomes(
 /// A validation log compared as a training log: without undeclared disturbances and their effect on
 /// the offsets. None if no disturbance was found, because the comparison is then the same.
 fn undisturbed(judged: &Judged<'_>, log: &PreparedLog) -> Option<SensorComparison> {
-    if log.disturbed.iter().all(SubtreeSet::is_empty) {
+    if log.role == LogRole::Train || log.contacts.iter().all(SubtreeSet::is_empty) {
         return None;
     }
     let mut instants = log.instants.clone();
-    for (instant, subtrees) in instants.iter_mut().zip(&log.disturbed) {
+    for (instant, subtrees) in instants.iter_mut().zip(&log.contacts) {
         instant.disturbed = *subtrees;
     }
     let residuals = judged.residuals(&instants);
