@@ -19,9 +19,9 @@ const LONGEST: usize = 10;
 /// Lower limit of a channel's share of noise, for channels mixed with others.
 pub(crate) const LEAST_SHARE: f64 = 1e-3;
 
-/// The noise of every channel, from the residuals of all segments for one set of parameters. Per
-/// channel of F/T sensors the drift of its offset is at most that of `fastest`, the rate of a random
-/// walk [unit^2/s]; and per channel, the variance is at least that of `least`.
+/// The noise of every channel, from the residuals of all segments for one set of parameters. The
+/// drift of an F/T channel's offset is at most that of `fastest`, the rate of a random walk
+/// [unit^2/s]; the variance of a channel is at least that of `least`.
 ///
 /// Where rows mix channels (a sub-tree between two sensors shows the sum of both), the residual is
 /// the *most likely* noise of each channel. It varies less than the noise: its variance is the

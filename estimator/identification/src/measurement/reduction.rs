@@ -84,7 +84,8 @@ pub(crate) fn reduce(
     reduce_with(measurement, segment, noise, &[], 0, &|_, _, _| Vec::new())
 }
 
-/// Extra columns of an observation's rows, row by row, given its number in the segment and its rows.
+/// Extra columns of an observation's rows, row by row, given its number in the segment and the
+/// rows.
 type ExtraColumns<'a> = dyn Fn(&mut MeasurementModel<'_>, usize, &MeasurementRows) -> Vec<f64> + 'a;
 
 /// As [`reduce`], without the observations flagged in `excluded` (all are used if it is empty), and
@@ -167,9 +168,9 @@ impl Residuals {
         self.measured[channel].iter().any(|x| x.is_finite())
     }
 
-    /// The drift of a channel's offset about its mean, per block, for the first set. Drifts of several sensors that
-    /// rows mix are shared as their noise is. (Otherwise the sensor with the greatest assumed drift
-    /// rate would get all of it.)
+    /// The drift of a channel's offset about its mean, per block, for the first set. Drifts of
+    /// several sensors that rows mix are shared as their noise is. (Otherwise the sensor with the
+    /// greatest assumed drift rate would get all of it.)
     pub(crate) fn offset_drift(&self, unknowns: &Unknowns, channel: usize) -> Vec<f64> {
         let mut sum = vec![0.0; self.nuisance.len()];
         for other in 0..unknowns.wrenches() {
