@@ -24,13 +24,13 @@ use crate::cross_validation;
 use crate::dataset::{Dataset, LogRole};
 use crate::diagnose::load::LoadChange;
 use crate::diagnose::search::{Search, wrong_signs};
-use crate::diagnose::undeclared::{self, Undeclared};
+use crate::diagnose::undeclared;
 use crate::diagnose::{configuration, load};
 use crate::finding::{Finding, FindingCode};
 use crate::fit::{
     Identified, IdentifyError, LOAD_VARIANCE_RATIO, NoiseAndMap, OffsetDrift, added,
     alternate_noise_and_map, negative_rotors, parameters_without_cad, per_column, posterior,
-    unsettled, walk_limits, without_negative_rotors,
+    unsettled, without_negative_rotors,
 };
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::{NoiseModel, Seconds};
@@ -89,7 +89,9 @@ pub fn identify(
     // 2. Measurement model, plausibility of units and frames.
     let mut measurement = match plausible_model(robot, &inputs, &mut logs)? {
         ControlFlow::Continue(measurement) => measurement,
-        ControlFlow::Break(outcome) => return Ok(*outcome),
+        ControlFlow::Break((reason, findings)) => {
+            return Ok(assemble::nothing(robot, &logs, reason, findings));
+        }
     };
     let temperature_only = Kind {
         gain: Gain::None,
@@ -113,34 +115,32 @@ pub fn identify(
             &mut progress,
         )?;
     }
-    let measurement = measurement;
-    let (undeclared, not_converged) = (clean.undeclared, clean.not_converged);
-    undeclared.report(&measurement, &mut logs, &clean.estimate);
+    undeclared::report(&measurement, &mut logs, &clean.loads, &clean.estimate);
 
     // 5. Cross-validation.
     let mut identified = cross_validated_fit(
-        &measurement,
+        measurement,
         &training_logs(&logs),
         inputs,
         calibrated,
         clean.estimate,
         &mut progress,
     )?;
-    identified.findings.extend(not_converged);
+    identified.findings.extend(clean.not_converged);
     let notes = not_available(robot, &identified.inputs);
     identified.findings.extend(notes);
 
     // 6. Disturbances in validation logs, encoder errors, delays.
-    undeclared::report_validation(&measurement, &mut logs, &identified);
+    undeclared::report_validation(&mut logs, &identified);
     progress("figures".into(), 0.88);
     let (found, time_offsets) = if signs.is_empty() {
-        Search::new(&measurement, &training_logs(&logs), &identified).findings()
+        Search::new(&training_logs(&logs), &identified).findings()
     } else {
         (signs, Vec::new())
     };
 
     // 7. Figures.
-    let outcome = assemble::outcome(&measurement, &logs, &identified, (found, time_offsets));
+    let outcome = assemble::outcome(&logs, &identified, (found, time_offsets));
     progress("done".into(), 1.0);
     Ok(outcome)
 }
@@ -181,23 +181,18 @@ pub(crate) fn prepare_logs(robot: &Robot, datasets: Vec<Dataset>) -> Vec<Prepare
 }
 
 /// The measurement model of the training logs that do not contradict the configuration. Breaks off
-/// with an outcome without parameters if all of them together do, or no row contains a link.
+/// with a reason and findings if all of them together do, or no row contains a link.
 pub(crate) fn plausible_model<'a>(
     robot: &'a Robot,
     inputs: &[IdentificationInput],
     logs: &mut [PreparedLog],
-) -> Result<ControlFlow<Box<Outcome>, MeasurementModel<'a>>, IdentifyError> {
-    let nothing = |logs: &[PreparedLog], reason: String, findings: Vec<Finding>| {
-        let mut outcome = assemble::nothing(robot, logs, reason);
-        outcome.findings.extend(findings);
-        Ok(ControlFlow::Break(Box::new(outcome)))
-    };
-    if let ControlFlow::Break((reason, findings)) = configuration::check(robot, inputs, logs)? {
-        return nothing(logs, reason, findings);
+) -> Result<ControlFlow<(String, Vec<Finding>), MeasurementModel<'a>>, IdentifyError> {
+    if let ControlFlow::Break(found) = configuration::check(robot, inputs, logs)? {
+        return Ok(ControlFlow::Break(found));
     }
     let training = training_logs(logs);
     if training.is_empty() {
-        return nothing(logs, no_log(logs), Vec::new());
+        return Ok(ControlFlow::Break((no_log(logs), Vec::new())));
     }
     let all = training.iter().flat_map(|log| log.instants.iter());
     let measurement = MeasurementModel::for_observations(robot, inputs, all)?;
@@ -217,7 +212,7 @@ pub(crate) fn plausible_model<'a>(
             }
         };
         let reason = format!("no measurement contains the links' parameters: {what}");
-        return nothing(logs, reason, Vec::new());
+        return Ok(ControlFlow::Break((reason, Vec::new())));
     }
     Ok(ControlFlow::Continue(measurement))
 }
@@ -256,7 +251,7 @@ fn not_available(robot: &Robot, inputs: &[IdentificationInput]) -> Vec<Finding> 
 /// An estimate from which undeclared disturbances are excluded.
 pub(crate) struct CleanFit {
     pub(crate) estimate: NoiseAndMap,
-    pub(crate) undeclared: Undeclared,
+    pub(crate) loads: Vec<LoadChange>,
     /// Present if the excluded disturbances did not converge.
     not_converged: Option<Finding>,
 }
@@ -265,7 +260,7 @@ pub(crate) struct CleanFit {
 struct Exclusion<'a, 'r> {
     measurement: &'a MeasurementModel<'r>,
     logs: &'a mut [PreparedLog],
-    undeclared: Undeclared,
+    loads: Vec<LoadChange>,
     drift: OffsetDrift,
     progress: &'a mut dyn FnMut(String, f64),
 }
@@ -284,10 +279,10 @@ impl Exclusion<'_, '_> {
         load: LoadChange,
         estimate: &NoiseAndMap,
     ) -> Result<Option<NoiseAndMap>, IdentifyError> {
-        let before = self.undeclared.loads.clone();
+        let before = self.loads.clone();
         let channels = self.measurement.channels_of(&load.subtrees);
-        self.undeclared.add_load(load);
-        self.undeclared.mark(training_logs_mut(self.logs));
+        undeclared::add_load(&mut self.loads, load);
+        undeclared::mark(training_logs_mut(self.logs), &self.loads);
         let without = self.fit(Some(estimate.noise.clone()))?;
         let unknowns = self.measurement.unknowns();
         let (with, noise) = (&estimate.noise, &without.noise);
@@ -295,8 +290,8 @@ impl Exclusion<'_, '_> {
         if ratio > LOAD_VARIANCE_RATIO {
             return Ok(Some(without));
         }
-        self.undeclared.loads = before;
-        self.undeclared.mark(training_logs_mut(self.logs));
+        self.loads = before;
+        undeclared::mark(training_logs_mut(self.logs), &self.loads);
         Ok(None)
     }
 
@@ -304,8 +299,8 @@ impl Exclusion<'_, '_> {
     /// offset drifts faster than the limit, it does not.
     fn limit_drift(&mut self, noise: &NoiseModel) -> bool {
         self.drift = OffsetDrift::AsStated;
-        let rates = walk_limits(self.measurement, self.drift).rates;
-        let mut pairs = noise.drift.iter().zip(&rates);
+        let fastest = self.drift.fastest(self.measurement);
+        let mut pairs = noise.drift.iter().zip(&fastest);
         pairs.any(|(found, most)| found > most)
     }
 }
@@ -324,7 +319,7 @@ pub(crate) fn exclude_disturbed(
     let mut estimate = alternate_noise_and_map(measurement, &training, drift, None, progress)?;
     let mut exclusion = Exclusion {
         measurement,
-        undeclared: Undeclared::none(training_logs_mut(logs)),
+        loads: Vec::new(),
         logs,
         drift,
         // Rounds start again with each fit: their fraction done is not shown.
@@ -334,8 +329,7 @@ pub(crate) fn exclude_disturbed(
     let mut converged = false;
     for _ in 0..EXCLUSION_ROUNDS {
         (exclusion.progress)("undeclared contacts".into(), 0.62);
-        let may_be_more =
-            rejected_loads < MAX_REJECTED_LOADS && exclusion.undeclared.loads.len() < MAX_LOADS;
+        let may_be_more = rejected_loads < MAX_REJECTED_LOADS && exclusion.loads.len() < MAX_LOADS;
         if may_be_more
             && let Some(load) = load::find(measurement, &training_logs(exclusion.logs), &estimate)
         {
@@ -354,7 +348,7 @@ pub(crate) fn exclude_disturbed(
         }
         let NoiseAndMap { noise, fit, .. } = &estimate;
         let training = training_logs_mut(exclusion.logs);
-        converged = (exclusion.undeclared).update(measurement, training, noise, &fit.x);
+        converged = undeclared::update(measurement, training, &exclusion.loads, noise, &fit.x);
         if converged {
             break;
         }
@@ -362,7 +356,7 @@ pub(crate) fn exclude_disturbed(
     }
     Ok(CleanFit {
         estimate,
-        undeclared: exclusion.undeclared,
+        loads: exclusion.loads,
         not_converged: (!converged).then(|| undeclared::not_converged(EXCLUSION_ROUNDS)),
     })
 }
@@ -383,7 +377,7 @@ fn with_gains(
     for _ in 0..GAIN_ROUNDS {
         let NoiseAndMap { noise, fit, .. } = &clean.estimate;
         let training = training_logs_mut(logs);
-        if (clean.undeclared).update(measurement, training, noise, &fit.x) {
+        if undeclared::update(measurement, training, &clean.loads, noise, &fit.x) {
             clean.not_converged = None;
             break;
         }
@@ -394,42 +388,42 @@ fn with_gains(
 
 /// Cross-validates an estimate and fits all instants with the noise that this shows; the change
 /// from CAD is shrunk to the retained fraction.
-fn cross_validated_fit(
-    measurement: &MeasurementModel<'_>,
+fn cross_validated_fit<'a>(
+    measurement: MeasurementModel<'a>,
     training: &[&PreparedLog],
     inputs: Vec<IdentificationInput>,
     calibrated: Kind,
     estimate: NoiseAndMap,
     progress: &mut dyn FnMut(String, f64),
-) -> Result<Identified, IdentifyError> {
-    let unknowns = measurement.unknowns().clone();
+) -> Result<Identified<'a>, IdentifyError> {
+    let unknowns = measurement.unknowns();
     let segments = segments_of(training, SEGMENT_INSTANTS);
     let (prior, noise) = (estimate.prior, estimate.noise);
     progress("cross-validation".into(), 0.69);
-    let sampled = sample(measurement, training);
+    let sampled = sample(&measurement, training);
     let tau = estimate.fit.tau;
-    let mut retention = cross_validation::held_out(measurement, &prior, &sampled, &noise, tau)?;
+    let mut retention = cross_validation::held_out(&measurement, &prior, &sampled, &noise, tau)?;
     retention.findings.extend(unsettled(estimate.change));
     // The fit has absorbed a part of the noise of its own data, most of all noise that is as slow
     // as the motion.
-    let walk_limits = walk_limits(measurement, OffsetDrift::AsStated);
-    let mut noise = retention.noise(measurement, &sampled, noise, &walk_limits);
+    let fastest = OffsetDrift::AsStated.fastest(&measurement);
+    let mut noise = retention.noise(&measurement, &sampled, noise, &fastest);
     // Of the seconds that were not sampled, too.
-    let left = segment_residuals(measurement, &segments, &noise, &estimate.fit.x);
-    noise.seconds = Seconds::of(&unknowns, &segments, &left, 0);
-    let reduced = reduced_segments(measurement, &segments, &noise);
+    let left = segment_residuals(&measurement, &segments, &noise, &estimate.fit.x);
+    noise.seconds = Seconds::of(unknowns, &segments, &left);
+    let reduced = reduced_segments(&measurement, &segments, &noise);
     let information = added(&reduced, unknowns.parameters());
-    let fit = posterior(&prior, &unknowns, &information)?.maximise_evidence()?;
-    let rotors = negative_rotors(measurement.robot(), &unknowns, &fit);
+    let fit = posterior(&prior, unknowns, &information)?.maximise_evidence()?;
+    let rotors = negative_rotors(measurement.robot(), unknowns, &fit);
     retention.findings.extend(rotors);
-    let cad = parameters_without_cad(&unknowns, &information);
-    let mut d = without_negative_rotors(&prior, &unknowns, &information, &fit)?;
-    let shares = per_column(&unknowns, &retention.share);
+    let cad = parameters_without_cad(unknowns, &information);
+    let mut d = without_negative_rotors(&prior, unknowns, &information, &fit)?;
+    let shares = per_column(unknowns, &retention.share);
     for (column, share) in shares.into_iter().enumerate() {
         d[column] = cad[column] + share * (d[column] - cad[column]);
     }
     Ok(Identified {
-        unknowns,
+        measurement,
         inputs,
         calibrated,
         prior,
@@ -463,7 +457,7 @@ mod tests {
             excluded: Vec::new(),
             findings: Vec::new(),
             refused: false,
-            disturbed: Vec::new(),
+            contacts: vec![SubtreeSet::default(); instants.len()],
         }
     }
 

@@ -23,13 +23,12 @@ use crate::fit::{
 use crate::linear::information::Information;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_estimate::estimate_noise;
-use crate::measurement::noise_model::{DriftLimits, NoiseModel};
+use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::reduction::{LogSegment, Residuals, reduce_with, residuals};
 use crate::measurement::unknowns::Unknowns;
-use crate::parallel;
 use crate::prior::Prior;
 use crate::report::prediction::{self, JudgedParameters, PredictionError, PredictionErrors};
-use crate::training::{MIN_FOLD, MIN_SECONDS, folds, map_segments};
+use crate::training::{MIN_FOLD, MIN_SECONDS, folds};
 use nalgebra::DVector;
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -57,24 +56,25 @@ impl Retention {
         measurement: &MeasurementModel<'_>,
         segments: &[LogSegment<'_>],
         noise: NoiseModel,
-        walk_limits: &DriftLimits,
+        fastest: &[f64],
     ) -> NoiseModel {
         if self.sets.is_empty() {
             return noise;
         }
-        let mut own_residuals: Vec<Residuals> =
-            map_segments(measurement, segments, |measurement, number, segment| {
+        let mut own_residuals: Vec<Residuals> = measurement.map(
+            segments.iter().enumerate(),
+            |measurement, (number, segment)| {
                 let blocks = self.blocks.iter().filter(|block| block.segment == number);
-                residuals_of_folds(residuals(measurement, segment, &noise, &self.sets), blocks)
-            });
+                residuals_of_folds(residuals(measurement, *segment, &noise, &self.sets), blocks)
+            },
+        );
         let unknowns = measurement.unknowns();
         let seconds = &noise.seconds;
         seconds.standardise(unknowns, segments, &mut own_residuals);
         noise.cross_validated_noise(&estimate_noise(
             unknowns,
             &own_residuals,
-            0,
-            walk_limits,
+            fastest,
             &noise.least,
         ))
     }
@@ -116,20 +116,22 @@ pub(crate) fn held_out(
         });
     }
     let blocks = blocks(segments, count);
-    let reduced = parallel::map_with(
-        count * segments.len(),
-        || measurement.clone(),
-        |measurement, number| {
-            let (fold, segment) = (number / segments.len(), number % segments.len());
-            let mut held = vec![false; segments[segment].instants.len()];
-            let is_held = |block: &&FoldBlock| block.fold == fold && block.segment == segment;
-            for block in blocks.iter().filter(is_held) {
-                held[block.range.clone()].fill(true);
-            }
-            let segment = segments[segment];
-            reduce_with(measurement, segment, noise, &held, 0, &mut |_, _, _, _| ())
-        },
-    );
+    let each = (0..count).flat_map(|fold| (0..segments.len()).map(move |own| (fold, own)));
+    let reduced = measurement.map(each, |measurement, (fold, segment)| {
+        let mut held = vec![false; segments[segment].instants.len()];
+        let is_held = |block: &&FoldBlock| block.fold == fold && block.segment == segment;
+        for block in blocks.iter().filter(is_held) {
+            held[block.range.clone()].fill(true);
+        }
+        reduce_with(
+            measurement,
+            segments[segment],
+            noise,
+            &held,
+            0,
+            &|_, _, _| Vec::new(),
+        )
+    });
     let (mut sets, mut candidates) = (Vec::new(), Vec::new());
     // Per fold, CAD and the parameters from the others.
     let mut pairs: Vec<[usize; 2]> = Vec::new();
@@ -189,7 +191,7 @@ struct HeldOutErrors<'a> {
 impl HeldOutErrors<'_> {
     /// Of a channel, the sums of `e0 (e0 - e1)` and `(e0 - e1)^2`.
     fn sums(&self, unknowns: &Unknowns, channel: usize) -> (f64, f64) {
-        let is_wrench = channel < 6 * unknowns.sensors.len();
+        let is_wrench = channel < unknowns.wrenches();
         let (mut cross, mut square) = (0.0, 0.0);
         for block in self.blocks {
             let [e0, e1] = self.pairs[block.fold].map(|candidate| {

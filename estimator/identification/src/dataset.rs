@@ -96,7 +96,7 @@ impl Dataset {
             name: name.to_owned(),
             role,
             instants: recording.observations(robot),
-            apart: (recording.is_stamped() && spacing > robot.max_silence).then_some(spacing),
+            apart: (recording.stamped && spacing > robot.max_silence).then_some(spacing),
             findings: recording.findings,
         })
     }

@@ -6,8 +6,8 @@ use crate::hypothesis;
 use crate::linear::information::Information;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_estimate::estimate_noise;
+use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::noise_model::Seconds;
-use crate::measurement::noise_model::{DriftLimits, NoiseModel};
 use crate::measurement::reduction::ReducedLog;
 use crate::measurement::unknowns::{ExtraParameter, Unknowns};
 use crate::prior::{MapEstimate, Posterior, Prior, PriorError};
@@ -34,10 +34,6 @@ pub enum IdentifyError {
     MapEstimate(#[from] PriorError),
 }
 
-/// Time constant of the fastest random walk of an offset \[s\]: the motion that excites the
-/// parameters is faster.
-pub(crate) const DRIFT_TIME: f64 = 1.0;
-
 /// A load is accepted if, without its side of the log, the noise variances of its part of the robot
 /// are smaller by this factor (geometric mean over the channels there).
 pub(crate) const LOAD_VARIANCE_RATIO: f64 = 2.0;
@@ -50,8 +46,8 @@ const ROUNDS: usize = 14;
 const CONVERGED: f64 = 0.1;
 
 /// The identified parameters, noise and information, from which the report is made.
-pub(crate) struct Identified {
-    pub unknowns: Unknowns,
+pub(crate) struct Identified<'a> {
+    pub measurement: MeasurementModel<'a>,
     pub inputs: Vec<IdentificationInput>,
     /// The calibration parameters that were identified, too.
     pub calibrated: Kind,
@@ -69,6 +65,17 @@ pub(crate) struct Identified {
     pub findings: Vec<Finding>,
     /// Per segment of the training logs, in order.
     pub reduced: Vec<ReducedLog>,
+}
+
+impl<'a> Identified<'a> {
+    pub(crate) fn robot(&self) -> &'a Robot {
+        self.measurement.robot()
+    }
+
+    /// The meaning of all columns.
+    pub(crate) fn unknowns(&self) -> &Unknowns {
+        self.measurement.unknowns()
+    }
 }
 
 /// Lower bounds of the variances. Standard deviations: a hundredth of the configured one for an F/T
@@ -247,16 +254,16 @@ pub(crate) fn alternate_noise_and_map(
     let (robot, mut unknowns) = (measurement.robot(), measurement.unknowns().clone());
     let prior = Prior::new(robot.model.inertias())?.with_roughly(robot.urdf_relative_std);
     let least = least_variances(robot, &unknowns);
-    let limits = walk_limits(measurement, drift);
+    let fastest = drift.fastest(measurement);
     let sampled = sample(measurement, training);
     let noise_of_residuals = |noise: &NoiseModel, d: &DVector<f64>| {
         let mut residuals = segment_residuals(measurement, &sampled, noise, d);
         let unknowns = measurement.unknowns();
-        let seconds = Seconds::of(unknowns, &sampled, &residuals, 0);
+        let seconds = Seconds::of(unknowns, &sampled, &residuals);
         seconds.standardise(unknowns, &sampled, &mut residuals);
         NoiseModel {
             seconds,
-            ..estimate_noise(unknowns, &residuals, 0, &limits, &least)
+            ..estimate_noise(unknowns, &residuals, &fastest, &least)
         }
     };
     let has_cad = unknowns.parameters_without_cad().is_empty();
@@ -347,7 +354,8 @@ fn gain_precision(robot: &Robot, unknowns: &Unknowns, fit: &MapEstimate) -> Vec<
 /// How fast an offset may drift (random walk).
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum OffsetDrift {
-    /// As fast as [`DRIFT_TIME`] allows: the residual then shows undeclared disturbances.
+    /// As fast as the time constant of a walk allows ([`estimate_noise`]): the residual then shows
+    /// undeclared disturbances.
     Free,
     /// At most by the sensor's stated noise per square root of a second. Other slow changes are
     /// model error and count as noise: parameters that are fitted together with offsets that follow
@@ -355,15 +363,14 @@ pub(crate) enum OffsetDrift {
     AsStated,
 }
 
-pub(crate) fn walk_limits(measurement: &MeasurementModel<'_>, drift: OffsetDrift) -> DriftLimits {
-    let stated = measurement.unknowns().stated(measurement.robot());
-    let rates = match drift {
-        OffsetDrift::Free => stated.map(|_| f64::INFINITY).collect(),
-        OffsetDrift::AsStated => stated.map(|x| x * x).collect(),
-    };
-    DriftLimits {
-        relative: (crate::measurement::reduction::BLOCK / DRIFT_TIME).powi(2),
-        rates,
+impl OffsetDrift {
+    /// Per channel of F/T sensors, the greatest rate [unit^2/s].
+    pub(crate) fn fastest(self, measurement: &MeasurementModel<'_>) -> Vec<f64> {
+        let stated = measurement.unknowns().stated(measurement.robot());
+        match self {
+            Self::Free => stated.map(|_| f64::INFINITY).collect(),
+            Self::AsStated => stated.map(|x| x * x).collect(),
+        }
     }
 }
 

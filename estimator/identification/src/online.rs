@@ -280,7 +280,6 @@ impl Online {
             component.waits = false;
             part.has_new_zero = component.is_outdated;
             part.is_disturbed = component.is_disturbed;
-            part.is_moving = part.learnt.is_moving() || part.rejected_rows.is_moving();
             part.cosines.copy_from_slice(&component.cosines);
             part.whitened.copy_from_slice(&component.whitened);
             component.whitened.copy_from_slice(&component.variances);
@@ -330,7 +329,7 @@ impl Online {
                 component.last_change = Some(*change);
                 std::mem::swap(information, &mut component.information);
                 // The limbs' information is from before the change too.
-                for limb in &mut component.limbs {
+                for limb in component.limbs.iter_mut().flatten() {
                     limb.information.clear();
                 }
                 // The solution in use precedes the change; the next one includes it.
@@ -517,14 +516,8 @@ mod tests {
         observe(&robot, 1, &mut [&mut online]);
         let component = &mut online.components[0];
         // Unknowns that explain the observation, except for an offset.
-        let (unknowns, mut a, mut y) =
-            (component.layout.columns.unknowns(), Vec::new(), Vec::new());
-        for (kind, rows) in component
-            .layout
-            .columns
-            .iter()
-            .zip(component.gathered.iter())
-        {
+        let (unknowns, mut a, mut y) = (component.layout.reference.len(), Vec::new(), Vec::new());
+        for (kind, rows) in component.layout.kinds.iter().zip(component.gathered.iter()) {
             for row in rows.values().chunks_exact(kind.columns.len() + 1) {
                 let mut whole = vec![0.0; unknowns];
                 for (&column, value) in kind.columns.iter().zip(row) {
@@ -618,16 +611,20 @@ mod tests {
         let robot = robot();
         let [mut apart, mut together] = [(); 2].map(|()| online(&robot));
         assert_eq!(
-            (apart.components.len(), apart.components[0].limbs.len()),
+            (
+                apart.components.len(),
+                apart.components[0].limbs.iter().flatten().count()
+            ),
             (1, 5)
         );
-        together.components[0].limbs.clear();
+        together.components[0].limbs.fill(None);
         observe(&robot, 260, &mut [&mut apart, &mut together]);
         // Thirty of the 36 rows of an observation, since the last full second.
         let component = &mut apart.components[0];
         let by_limbs: u64 = component
             .limbs
             .iter()
+            .flatten()
             .map(|limb| limb.information.rows())
             .sum();
         let (all, rows) = (
@@ -643,6 +640,7 @@ mod tests {
             component
                 .limbs
                 .iter()
+                .flatten()
                 .all(|limb| limb.information.rows() == 0)
         );
         let (found, expected) = (&component.information, &together.components[0].information);

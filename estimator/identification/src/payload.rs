@@ -13,9 +13,10 @@
 use crate::batch::{self, exclude_disturbed, plausible_model, prepare_logs};
 use crate::dataset::Dataset;
 use crate::diagnose::load::{Normal, body};
+use crate::diagnose::undeclared;
 use crate::finding::Finding;
 use crate::fit::IdentifyError;
-use crate::report::outcome::{Outcome, Verdict};
+
 use crate::robot::{IdentificationInput, Robot};
 use crate::training::training_instants;
 use nalgebra::{DMatrix, SMatrix, SVector};
@@ -91,19 +92,18 @@ pub fn payload(
     let mut logs = prepare_logs(robot, datasets);
     let measurement = match plausible_model(robot, &inputs, &mut logs)? {
         ControlFlow::Continue(measurement) => measurement,
-        ControlFlow::Break(outcome) => return Err(PayloadError::Unusable(reason(*outcome))),
+        ControlFlow::Break((reason, _)) => return Err(PayloadError::Unusable(reason)),
     };
     let unknowns = measurement.unknowns();
     let index = unknowns.links.iter().position(|link| *link == frame.link);
     let index = index.ok_or_else(|| PayloadError::Unseen(name()))?;
     let clean = exclude_disturbed(&measurement, &mut logs, &mut |_, _| ())?;
     let estimate = clean.estimate;
-    clean.undeclared.report(&measurement, &mut logs, &estimate);
+    undeclared::report(&measurement, &mut logs, &clean.loads, &estimate);
 
     let mut some = Normal::new(unknowns.parameters());
     some.add(&estimate.information);
-    let mut all = Normal::new(unknowns.parameters());
-    all.add(&estimate.information);
+    let mut all = some.clone();
     let is_known = |link| known.links.contains(&link);
     // The scale of CAD's errors follows from links that are known, and says nothing of the others.
     let tau = estimate.fit.tau.max(estimate.prior.expected_tau());
@@ -149,14 +149,6 @@ pub fn payload(
         instants: training_instants(&logs).count(),
         findings: logs.into_iter().flat_map(|log| log.findings).collect(),
     })
-}
-
-/// Why an outcome has no parameters.
-fn reason(outcome: Outcome) -> String {
-    match outcome.verdict {
-        Verdict::Nothing(reason) => reason,
-        _ => "nothing was identified".into(),
-    }
 }
 
 /// The inverse of the covariance of these links' parameters; zero for those that are not known.

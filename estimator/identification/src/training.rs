@@ -7,8 +7,6 @@ use crate::finding::{Finding, FindingCode, Severity};
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::reduction::{LogSegment, ReducedLog, Residuals, reduce, residuals};
-use crate::measurement::rows::MeasurementRows;
-use crate::parallel;
 use crate::robot::{ChannelRole, Robot};
 use nalgebra::DVector;
 use proprio_dynamics::spatial::Wrench;
@@ -67,10 +65,10 @@ pub(crate) struct PreparedLog {
     pub excluded: Vec<Excluded>,
     pub findings: Vec<Finding>,
     pub refused: bool,
-    /// Of a validation log: the sub-trees on which an undeclared disturbance acts, per instant;
-    /// empty if none was looked for. [`Annotated::disturbed`] stays empty there, because figures of
-    /// such a log include all of its instants.
-    pub disturbed: Vec<SubtreeSet>,
+    /// Per instant, the sub-trees on which an undeclared contact acts. In the end
+    /// [`Annotated::disturbed`] is empty in a validation log, because figures of such a log include
+    /// all of its instants.
+    pub contacts: Vec<SubtreeSet>,
 }
 
 impl PreparedLog {
@@ -201,12 +199,22 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> PreparedLog {
         (Some(first), Some(last)) => (first.t, last.t),
         _ => (Nanos::ZERO, Nanos::ZERO),
     };
-    let mut reasons = ExclusionReasons::default();
+    let mut reasons: BTreeMap<String, Excluded> = BTreeMap::new();
+    let mut exclude = |reason: String, t: Nanos| {
+        let entry = reasons.entry(reason.clone()).or_insert(Excluded {
+            reason,
+            instants: 0,
+            first: t,
+            last: t,
+        });
+        entry.instants += 1;
+        entry.last = t;
+    };
     let mut instants = Vec::new();
     for instant in all {
         let t = instant.t;
         if !instant.knows_motion(&robot.channels) {
-            reasons.add(without_motion(robot, &instant), t);
+            exclude(without_motion(robot, &instant), t);
             continue;
         }
         let mut excluded = Vec::new();
@@ -214,21 +222,21 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> PreparedLog {
             if let ChannelRole::Sensor(sensor) = channel.role
                 && *fault != Reason::None
             {
-                reasons.add(format!("{} of {}", fault.word(), channel.name), t);
+                exclude(format!("{} of {}", fault.word(), channel.name), t);
                 excluded.push(sensor);
             }
         }
         for contact in instant.active.difference(&robot.always).iter() {
             let name = robot.contacts.get(contact).map_or("", |c| c.name.as_str());
             let reason = format!("contact declared: {name} (the links that it touches)");
-            reasons.add(reason, t);
+            exclude(reason, t);
         }
         let read = excluded
             .into_iter()
             .fold(instant, Observation::without_reading);
         instants.push(Annotated::from(read));
     }
-    let excluded: Vec<Excluded> = reasons.0.into_values().collect();
+    let excluded: Vec<Excluded> = reasons.into_values().collect();
     let is_short = folds(instants.iter().map(|instant| instant.t)) < 1;
     if is_short && !refused {
         let text = too_few(instants.len(), apart, &excluded, &findings);
@@ -239,27 +247,10 @@ pub(crate) fn prepare(robot: &Robot, dataset: Dataset) -> PreparedLog {
         role,
         span,
         refused: refused || is_short,
+        contacts: vec![SubtreeSet::default(); instants.len()],
         instants,
         excluded,
         findings,
-        disturbed: Vec::new(),
-    }
-}
-
-/// What is excluded, by reason.
-#[derive(Default)]
-struct ExclusionReasons(BTreeMap<String, Excluded>);
-
-impl ExclusionReasons {
-    fn add(&mut self, reason: String, t: Nanos) {
-        let entry = self.0.entry(reason.clone()).or_insert(Excluded {
-            reason,
-            instants: 0,
-            first: t,
-            last: t,
-        });
-        entry.instants += 1;
-        entry.last = t;
     }
 }
 
@@ -313,27 +304,14 @@ fn too_few(
     format!("usable instants: {count}, so nothing is identified from this log: {why}")
 }
 
-/// Results of a pass over each segment, on all cores, in the order of the segments.
-pub(crate) fn map_segments<'a, T: Send>(
-    measurement: &MeasurementModel<'_>,
-    segments: &[LogSegment<'a>],
-    pass: impl Fn(&mut MeasurementModel<'_>, usize, LogSegment<'a>) -> T + Sync,
-) -> Vec<T> {
-    parallel::map_with(
-        segments.len(),
-        || measurement.clone(),
-        |measurement, number| pass(measurement, number, segments[number]),
-    )
-}
-
 /// The information of each segment.
 pub(crate) fn reduced_segments(
     measurement: &MeasurementModel<'_>,
     segments: &[LogSegment<'_>],
     noise: &NoiseModel,
 ) -> Vec<ReducedLog> {
-    map_segments(measurement, segments, |measurement, _, segment| {
-        reduce(measurement, segment, noise)
+    measurement.map(segments, |measurement, segment| {
+        reduce(measurement, *segment, noise)
     })
 }
 
@@ -344,8 +322,8 @@ pub(crate) fn segment_residuals(
     noise: &NoiseModel,
     d: &DVector<f64>,
 ) -> Vec<Residuals> {
-    map_segments(measurement, segments, |measurement, _, segment| {
-        residuals(measurement, segment, noise, std::slice::from_ref(d))
+    measurement.map(segments, |measurement, segment| {
+        residuals(measurement, *segment, noise, std::slice::from_ref(d))
     })
 }
 
@@ -391,14 +369,13 @@ pub(crate) fn sample<'a>(
     let mut sampled: Vec<LogSegment<'a>> = taken.map(|segment| stretch(segment, 0)).collect();
     // How often each channel occurs, up to `MIN_FOLD`: without any sample of it, its noise would be
     // estimated as zero.
-    let mut rows = MeasurementRows::new(measurement.unknowns());
     let mut measurement = measurement.clone();
     let mut appears = vec![0; measurement.unknowns().channels()];
     let mut count_channels = |instant: &Annotated, appears: &mut [usize]| -> bool {
-        let made = measurement.compute_rows(instant, &mut rows).is_ok();
+        let rows = measurement.rows(instant);
         let mut lacked = false;
         for (channel, appears) in appears.iter_mut().enumerate() {
-            if made && rows.has(channel) {
+            if rows.has(channel) {
                 lacked |= *appears < MIN_FOLD;
                 *appears += 1;
             }

@@ -252,7 +252,7 @@ fn against_causal(
             causal[0].push(estimate.first[0] - truth[1]);
             causal[1].push(estimate.second[0] - truth[2]);
         }
-        if let Some(estimate) = smoother.at(*t, 1..=2, 0.3, &mut scratch) {
+        if let Some(estimate) = smoother.at(*t, 1..=2, &mut scratch) {
             ours[0].push(estimate[1] - truth[1]);
             ours[1].push(estimate[2] - truth[2]);
         }
@@ -352,21 +352,18 @@ fn a_quintic_is_reproduced_on_any_stamps() {
     let scratch = &mut Scratch::default();
     for i in 0..20 {
         let t = Nanos::from_seconds(0.5 + 0.07 * f64::from(i));
-        let estimates = smoother.at(t, 0..=2, 0.3, scratch).unwrap();
+        let estimates = smoother.at(t, 0..=2, scratch).unwrap();
         for (m, tolerance) in [(0, 1e-9), (1, 1e-7), (2, 1e-5)] {
             let (estimate, exact) = (estimates[m], exact_at(t.seconds())[m]);
             // Alone as well as with the others.
-            assert_eq!(smoother.at(t, m..=m, 0.3, scratch).unwrap()[m], estimate);
+            assert_eq!(smoother.at(t, m..=m, scratch).unwrap()[m], estimate);
             assert!(
                 (estimate - exact).abs() < tolerance,
                 "derivative {m} at {t}: {estimate} instead of {exact}"
             );
         }
     }
-    assert_eq!(
-        smoother.at(Nanos::from_seconds(0.02), 2..=2, 0.3, scratch),
-        None
-    );
+    assert_eq!(smoother.at(Nanos::from_seconds(0.02), 2..=2, scratch), None);
 }
 
 #[test]

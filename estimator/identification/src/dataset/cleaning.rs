@@ -3,7 +3,7 @@
 //! Everything removed is reported as a finding.
 
 use crate::dataset::recording::Recording;
-use crate::dataset::repeats::{ChannelRepeats, RepeatedReadings};
+use crate::dataset::repeats::ChannelRepeats;
 use crate::dataset::smooth::quantum;
 use crate::dataset::stream::{JointTrack, MOTION, SampleStream};
 use crate::finding::{Finding, FindingCode};
@@ -52,20 +52,14 @@ impl Recording {
     fn streams(&mut self, role: ChannelRole) -> Vec<&mut dyn AnyStream> {
         match role {
             ChannelRole::Joint(dof) => {
-                let track = &mut self.joints[dof];
-                vec![
-                    &mut track.position,
-                    &mut track.velocity,
-                    &mut track.acceleration,
-                    &mut track.torque,
-                ]
+                let streams = self.joints[dof].all();
+                streams.map(|own| own as &mut dyn AnyStream).into()
             }
             ChannelRole::Sensor(number) => vec![&mut self.sensors[number]],
-            ChannelRole::Base => vec![
-                &mut self.imu.proper_acceleration,
-                &mut self.imu.angular_velocity,
-                &mut self.imu.angular_acceleration,
-            ],
+            ChannelRole::Base => {
+                let streams = self.imu.all();
+                streams.map(|own| own as &mut dyn AnyStream).into()
+            }
         }
     }
 }
@@ -164,11 +158,11 @@ impl<const D: usize> SampleStream<D> {
 /// measured derivatives, joint torques and gyroscopes.
 pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
     let channels = recording.channels.clone();
-    let mut repeats = std::mem::replace(&mut recording.repeats, RepeatedReadings::new(0));
+    let repeats = std::mem::take(&mut recording.repeats);
     let max_silence = robot.max_silence;
     let mut found = Vec::new();
     let mut disorders = Vec::new();
-    for (channel, repeat) in channels.iter().zip(&repeats.channels) {
+    for (channel, repeat) in channels.iter().zip(&repeats) {
         let mut worst = Disorder::default();
         for stream in recording.streams(channel.role) {
             let order = stream.order();
@@ -193,14 +187,16 @@ pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
             }
         }
     }
-    repeated(recording, &channels, &mut repeats, &mut found);
+    repeated(recording, &channels, repeats, &mut found);
     for channel in &channels {
         // Removed samples can leave gaps. The spacing of the channel is not measured again.
         if let ChannelRole::Joint(dof) = channel.role {
             let name = label(channel);
             if let Some((from, to)) = stopped(&recording.joints[dof].position) {
                 recording.frozen.push((name.clone(), from, to));
-                recording.joints[dof].each(|s| s.retain(|_, t| t <= from || t > to));
+                for stream in recording.joints[dof].all() {
+                    stream.retain(|_, t| t <= from || t > to);
+                }
             }
             for (from, to) in dead(&recording.joints[dof]) {
                 recording.frozen.push((format!("{name}/torque"), from, to));
@@ -208,15 +204,11 @@ pub(crate) fn clean(recording: &mut Recording, robot: &Robot) {
                 let torque = &mut recording.joints[dof].torque;
                 torque.retain(|_, t| !(from..=to).contains(&t));
             }
-            let track = &mut recording.joints[dof];
             // A deviation within the configured position noise is no spike.
-            let noise = robot.position_noise;
-            for (axis, stream, least) in [
-                ("position", &mut track.position, noise),
-                ("velocity", &mut track.velocity, 1e-9),
-                ("acceleration", &mut track.acceleration, 1e-9),
-                ("torque", &mut track.torque, 1e-9),
-            ] {
+            let least = [robot.position_noise, 1e-9, 1e-9, 1e-9];
+            let axes = ["position", "velocity", "acceleration", "torque"].into_iter();
+            let streams = recording.joints[dof].all().into_iter().zip(least);
+            for (axis, (stream, least)) in axes.zip(streams) {
                 let spikes = stream.despike(0, least);
                 found.extend(spikes.map(|own| outliers(&name, axis, own)));
             }
@@ -321,10 +313,10 @@ fn remove_repeats(recording: &mut Recording, channel: &Channel, repeat: &mut Cha
 fn repeated(
     recording: &mut Recording,
     channels: &[Channel],
-    repeats: &mut RepeatedReadings,
+    mut repeats: Vec<ChannelRepeats>,
     found: &mut Vec<Finding>,
 ) {
-    for (channel, repeat) in channels.iter().zip(&mut repeats.channels) {
+    for (channel, repeat) in channels.iter().zip(&mut repeats) {
         remove_repeats(recording, channel, repeat);
     }
     let of_rows = |r: &ChannelRepeats| {
@@ -332,7 +324,7 @@ fn repeated(
         all.sort_unstable();
         all
     };
-    let seen: Vec<&ChannelRepeats> = repeats.channels.iter().filter(|r| r.readings > 0).collect();
+    let seen: Vec<&ChannelRepeats> = repeats.iter().filter(|r| r.readings > 0).collect();
     let rows = seen.first().map(|r| of_rows(r)).unwrap_or_default();
     let is_of_all = seen.len() > 1 && seen.iter().all(|r| of_rows(r) == rows);
     if let (Some(first), true) = (rows.first(), is_of_all) {
@@ -348,7 +340,7 @@ fn repeated(
         return;
     }
     let mut found_repeats = Vec::new();
-    for (channel, repeat) in channels.iter().zip(&repeats.channels) {
+    for (channel, repeat) in channels.iter().zip(&repeats) {
         let name = label(channel);
         let in_frozen = |(other, from, to): &(String, Nanos, Nanos)| {
             let is_within = |t: &&Nanos| *other == name && *t > from && *t <= to;

@@ -294,7 +294,6 @@ fn wrong_derivative(
     given: &SampleStream<1>,
     order: usize,
 ) -> Option<Wrong> {
-    const EDGE: f64 = 0.3;
     const MOST: usize = 2000;
     const NOTICEABLE: f64 = 0.1;
     if given.t.len() < LEAST_COMPARED || range(reference.value.iter().map(|[v]| *v)) < 0.05 {
@@ -305,7 +304,7 @@ fn wrong_derivative(
     // Squares and product of the given one and that of the positions.
     let (mut uu, mut uv, mut vv, mut count) = (0.0, 0.0, 0.0, 0.0);
     for i in (0..given.t.len()).step_by(given.t.len().div_ceil(MOST)) {
-        if let Some(own) = smooth.at(given.t[i], order..=order, EDGE, &mut scratch) {
+        if let Some(own) = smooth.at(given.t[i], order..=order, &mut scratch) {
             let (u, v) = (given.value[i][0], own[order]);
             (uu, uv, vv, count) = (uu + u * u, uv + u * v, vv + v * v, count + 1.0);
         }

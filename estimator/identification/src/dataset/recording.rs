@@ -1,6 +1,6 @@
 //! Samples of a log, channel by channel, as they were recorded.
 
-use crate::dataset::repeats::RepeatedReadings;
+use crate::dataset::repeats::ChannelRepeats;
 use crate::dataset::stream::{ImuTrack, JointTrack, MOTION, SampleStream};
 use crate::finding::Finding;
 use crate::robot::{Channel, ChannelRole, Robot};
@@ -24,13 +24,15 @@ pub struct Recording {
     pub(crate) imu: ImuTrack,
     /// Per contact, from which time on it is declared present or absent.
     pub(crate) declared: Vec<Vec<(Nanos, bool)>>,
+    /// Whether the log has stamps.
     pub(crate) stamped: bool,
     pub(crate) max_silence: Nanos,
     pub(crate) first: Nanos,
     pub(crate) last: Nanos,
     pub(crate) rows: u64,
     pub(crate) skipped: Option<SkippedRows>,
-    pub(crate) repeats: RepeatedReadings,
+    /// Per channel.
+    pub(crate) repeats: Vec<ChannelRepeats>,
     /// Channels that do not change while the robot moves, from and to when.
     pub(crate) frozen: Vec<(String, Nanos, Nanos)>,
     /// The most samples of a channel whose stamps go backward, and when first.
@@ -66,7 +68,7 @@ impl Recording {
             last: Nanos::MIN,
             rows: 0,
             skipped: None,
-            repeats: RepeatedReadings::new(robot.channels.len()),
+            repeats: vec![ChannelRepeats::default(); robot.channels.len()],
             frozen: Vec::new(),
             backward: None,
             findings: Vec::new(),
@@ -78,7 +80,9 @@ impl Recording {
     /// that their device or quality bits mark as faulty are excluded and reported. Readings of
     /// another channel's kind are ignored.
     pub fn push(&mut self, channel: usize, t: Nanos, reading: &Reading, quality: Quality) {
-        self.repeats.see(channel, t, reading);
+        if let Some(repeats) = self.repeats.get_mut(channel) {
+            repeats.see(t, reading);
+        }
         let Some(role) = self.channels.get(channel).map(|c| c.role) else {
             return;
         };
@@ -142,22 +146,19 @@ impl Recording {
     }
 
     /// Appends the samples that follow these.
-    pub fn append(&mut self, next: Self) {
-        self.repeats.append(next.repeats);
-        for (own, next) in self.joints.iter_mut().zip(next.joints) {
-            own.position.append(next.position);
-            own.velocity.append(next.velocity);
-            own.acceleration.append(next.acceleration);
-            own.torque.append(next.torque);
+    pub fn append(&mut self, mut next: Self) {
+        let repeats = self.repeats.iter_mut().zip(next.repeats);
+        repeats.for_each(|(own, next)| own.append(next));
+        for (own, next) in self.joints.iter_mut().zip(&mut next.joints) {
+            let streams = own.all().into_iter().zip(next.all());
+            streams.for_each(|(own, next)| own.append(next));
         }
-        let sensors = self.sensors.iter_mut().zip(next.sensors);
+        let sensors = self.sensors.iter_mut().zip(&mut next.sensors);
         sensors.for_each(|(own, next)| own.append(next));
         let temperatures = self.temperatures.iter_mut().zip(next.temperatures);
         temperatures.for_each(|(own, next)| own.extend(next));
-        let (imu, next_imu) = (&mut self.imu, next.imu);
-        (imu.proper_acceleration).append(next_imu.proper_acceleration);
-        imu.angular_velocity.append(next_imu.angular_velocity);
-        (imu.angular_acceleration).append(next_imu.angular_acceleration);
+        let imu = self.imu.all().into_iter().zip(next.imu.all());
+        imu.for_each(|(own, next)| own.append(next));
         let declared = self.declared.iter_mut().zip(next.declared);
         declared.for_each(|(own, next)| own.extend(next));
         self.stamped &= next.stamped;
@@ -185,11 +186,6 @@ impl Recording {
         let all = joints.chain([self.imu.angular_velocity.spacing]);
         let least = all.filter(|spacing| *spacing > Nanos::ZERO).min();
         least.unwrap_or(Nanos::ZERO)
-    }
-
-    /// Whether the log has stamps.
-    pub(crate) fn is_stamped(&self) -> bool {
-        self.stamped
     }
 }
 

@@ -3,12 +3,7 @@
 
 use proprio_topics::{Nanos, Reading};
 
-/// Finds readings that repeat the previous one, as they are read.
-#[derive(Debug, Clone)]
-pub(crate) struct RepeatedReadings {
-    pub(crate) channels: Vec<ChannelRepeats>,
-}
-
+/// Finds readings of a channel that repeat the previous one, as they are read.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct ChannelRepeats {
     first: Option<ReadingBits>,
@@ -42,19 +37,8 @@ impl ChannelRepeats {
             }
         }
     }
-}
 
-impl RepeatedReadings {
-    pub(crate) fn new(channels: usize) -> Self {
-        Self {
-            channels: vec![ChannelRepeats::default(); channels],
-        }
-    }
-
-    pub(crate) fn see(&mut self, channel: usize, t: Nanos, reading: &Reading) {
-        let Some(repeat) = self.channels.get_mut(channel) else {
-            return;
-        };
+    pub(crate) fn see(&mut self, t: Nanos, reading: &Reading) {
         let mut numbers = [0.0; 9];
         // A position alone may repeat, since encoders are coarse.
         let is_noisy = match reading {
@@ -80,23 +64,21 @@ impl RepeatedReadings {
             bits: numbers.map(f64::to_bits),
             is_noisy,
         };
-        repeat.readings += 1;
-        repeat.compare(snapshot);
-        repeat.first.get_or_insert(snapshot);
-        repeat.last = Some(snapshot);
+        self.readings += 1;
+        self.compare(snapshot);
+        self.first.get_or_insert(snapshot);
+        self.last = Some(snapshot);
     }
 
     /// Appends the repeats that follow these.
-    pub(crate) fn append(&mut self, next: Self) {
-        for (own, mut next) in self.channels.iter_mut().zip(next.channels) {
-            if let Some(first) = next.first {
-                own.compare(first);
-            }
-            own.readings += next.readings;
-            own.later.append(&mut next.later);
-            own.same_stamp.append(&mut next.same_stamp);
-            own.first = own.first.or(next.first);
-            own.last = next.last.or(own.last);
+    pub(crate) fn append(&mut self, mut next: Self) {
+        if let Some(first) = next.first {
+            self.compare(first);
         }
+        self.readings += next.readings;
+        self.later.append(&mut next.later);
+        self.same_stamp.append(&mut next.same_stamp);
+        self.first = self.first.or(next.first);
+        self.last = next.last.or(self.last);
     }
 }

@@ -24,7 +24,7 @@
 use crate::dataset::observation::Observation;
 use crate::dataset::recording::Recording;
 use crate::dataset::smooth::{Scratch, Smoother};
-use crate::dataset::stream::{ImuTrack, JointAt, is_dense};
+use crate::dataset::stream::{ImuTrack, is_dense};
 use crate::parallel;
 use crate::robot::{BaseMotion, Channel, ChannelRole, Robot};
 use proprio_dynamics::spatial::{Vec3, Wrench};
@@ -34,17 +34,16 @@ use proprio_topics::{Nanos, Reason};
 /// Greatest number of observations per second \[Hz\]. A slower log keeps its own stamps.
 pub(crate) const RATE: f64 = 100.0;
 
-/// Length of signal required on either side of a time for its derivatives, unless the window is
-/// narrower \[ns\].
-const EDGE: Nanos = Nanos::from_millis(300);
+/// The time between observations at that rate.
+pub(crate) const PERIOD: Nanos = Nanos::from_millis(10);
 
 impl Recording {
     /// The observations of the log.
     pub(crate) fn observations(&self, robot: &Robot) -> Vec<Observation> {
-        let period = Nanos::from_seconds(1.0 / RATE);
-        let times = self.times(robot, period);
-        let joints = self.joint_columns(&times, period);
-        let imu = self.imu_column(robot, &times, period);
+        let times = self.times(robot);
+        // Joints are independent, so they run on all cores.
+        let joints = parallel::map(self.joints.len(), |dof| self.joints[dof].at_all(&times));
+        let imu = self.imu_column(robot, &times);
         let dofs = robot.model.dof_count();
         let at_rest = robot.position_without_samples();
         let at = |number: usize| {
@@ -84,7 +83,7 @@ impl Recording {
                         observation.torque[dof] = state.torque;
                         state.fault
                     }
-                    ChannelRole::Sensor(sensor) => match self.sensors[sensor].mean(t, period) {
+                    ChannelRole::Sensor(sensor) => match self.sensors[sensor].mean(t) {
                         Ok([fx, fy, fz, tx, ty, tz]) => {
                             observation.readings[sensor] = robot.calibrations[sensor].apply(
                                 &Wrench::from_parts([fx, fy, fz], [tx, ty, tz]),
@@ -106,23 +105,23 @@ impl Recording {
     }
 
     /// The times of the observations.
-    fn times(&self, robot: &Robot, period: Nanos) -> Vec<Nanos> {
+    fn times(&self, robot: &Robot) -> Vec<Nanos> {
         let stamps = |channel: &Channel| self.stamps(channel.role);
         let trigger = self.channels.get(robot.trigger).map(stamps);
         let mut all = trigger.into_iter().chain(self.channels.iter().map(stamps));
         let Some((stamps, _, spacing)) = all.find(|(t, ..)| !t.is_empty()) else {
             return Vec::new();
         };
-        if !is_dense(spacing, period) {
+        if !is_dense(spacing) {
             return stamps.to_vec();
         }
         let (first, mut times) = (stamps.first().copied().unwrap_or_default(), Vec::new());
         let mut block = -1;
         for t in stamps {
-            let number = (*t - first).0 / period.0;
+            let number = (*t - first).0 / PERIOD.0;
             if number > block {
                 block = number;
-                times.push(first + Nanos(number * period.0 + period.0 / 2));
+                times.push(first + Nanos(number * PERIOD.0 + PERIOD.0 / 2));
             }
         }
         times
@@ -137,19 +136,7 @@ impl Recording {
         })
     }
 
-    /// Per degree of freedom and time. Joints are independent, so they run on all cores.
-    fn joint_columns(&self, times: &[Nanos], period: Nanos) -> Vec<Vec<JointAt>> {
-        parallel::map(self.joints.len(), |dof| {
-            self.joints[dof].at_all(times, period, EDGE.seconds())
-        })
-    }
-
-    fn imu_column(
-        &self,
-        robot: &Robot,
-        times: &[Nanos],
-        period: Nanos,
-    ) -> Vec<(FrameMotion, Reason)> {
+    fn imu_column(&self, robot: &Robot, times: &[Nanos]) -> Vec<(FrameMotion, Reason)> {
         let BaseMotion::Imu(pose) = &robot.base else {
             return Vec::new();
         };
@@ -166,15 +153,12 @@ impl Recording {
         let mut scratch = Scratch::default();
         let mut at = |t: Nanos| -> Result<FrameMotion, Reason> {
             let (omega, alpha) = if smoothers.is_empty() {
-                (
-                    angular_velocity.mean(t, period)?,
-                    angular_acceleration.mean(t, period)?,
-                )
+                (angular_velocity.mean(t)?, angular_acceleration.mean(t)?)
             } else {
-                angular_velocity.mean(t, period)?;
+                angular_velocity.mean(t)?;
                 let (mut omega, mut alpha) = ([0.0; 3], [0.0; 3]);
                 for (axis, smoother) in smoothers.iter().enumerate() {
-                    let both = smoother.at(t, 0..=1, EDGE.seconds(), &mut scratch);
+                    let both = smoother.at(t, 0..=1, &mut scratch);
                     [omega[axis], alpha[axis], _] = both.ok_or(Reason::Starting)?;
                 }
                 (omega, alpha)
@@ -182,7 +166,7 @@ impl Recording {
             let measured = FrameMotion {
                 angular_velocity: Vec3::from(omega),
                 angular_acceleration: Vec3::from(alpha),
-                proper_acceleration: Vec3::from(proper_acceleration.mean(t, period)?),
+                proper_acceleration: Vec3::from(proper_acceleration.mean(t)?),
             };
             Ok(FrameMotion::of_link_from_imu(&measured, pose))
         };

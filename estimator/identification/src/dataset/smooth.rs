@@ -59,6 +59,9 @@ const KNOT_SPACING: f64 = 0.05;
 const AVERAGED: usize = 10;
 /// Samples closer together than this are averaged to one \[s\]: motion has no content there.
 const DENSE: f64 = 0.005;
+/// Length of signal required on either side of a time for its derivatives, unless the window is
+/// narrower \[s\].
+const EDGE: f64 = Nanos::from_millis(300).seconds();
 /// Number of neighbours whose scatter about a quintic gives the noise.
 const NEIGHBOURS: usize = 16;
 
@@ -160,13 +163,12 @@ impl Smoother {
     }
 
     /// The requested `derivatives` (of 0, 1, 2) of the signal at `t`, the others 0. None outside
-    /// the samples, in a gap, or with less than `edge` \[s\] of samples on either side (or less
-    /// than the window, if that is narrower).
+    /// the samples, in a gap, or with less than 0.3 s of samples on either side (or less than the
+    /// window, if that is narrower).
     pub fn at(
         &self,
         t: Nanos,
         derivatives: RangeInclusive<usize>,
-        edge: f64,
         scratch: &mut Scratch,
     ) -> Option<[f64; 3]> {
         let time = (t - self.origin).seconds();
@@ -180,10 +182,10 @@ impl Smoother {
             return None;
         }
         let room = (time - first).min(last - time);
-        // Near an end, the choice at the nearest place with `edge` on both sides.
+        // Near an end, the choice at the nearest place with [`EDGE`] on both sides.
         let whole = last - first;
-        let place = if whole > 2.0 * edge {
-            (time - first).clamp(edge, whole - edge)
+        let place = if whole > 2.0 * EDGE {
+            (time - first).clamp(EDGE, whole - EDGE)
         } else {
             0.5 * whole
         };
@@ -207,7 +209,7 @@ impl Smoother {
         }
         for (window, degree, fit) in fits.iter_mut().flatten() {
             let width = *self.widths.get(*window)?;
-            if room < edge.min(width) {
+            if room < EDGE.min(width) {
                 return None;
             }
             // Near an end the window is as wide as the samples to both sides allow.

@@ -1,6 +1,7 @@
 //! The samples of one channel, and its value at any time.
 
 use crate::arithmetic::add_multiple;
+use crate::dataset::resampling::PERIOD;
 use crate::dataset::smooth::{Scratch, Smoother};
 use proprio_topics::{Nanos, Reason};
 
@@ -43,7 +44,8 @@ pub(crate) struct JointAt {
 }
 
 impl JointTrack {
-    pub(crate) fn at_all(&self, times: &[Nanos], period: Nanos, edge: f64) -> Vec<JointAt> {
+    /// At each of these times.
+    pub(crate) fn at_all(&self, times: &[Nanos]) -> Vec<JointAt> {
         if self.position.t.is_empty() {
             return Vec::new();
         }
@@ -53,12 +55,11 @@ impl JointTrack {
         let of_velocity = (has_velocity && !is_given).then(|| self.velocity.smoother(0));
         let mut scratch = Scratch::default();
         let mut derivatives = |smoother: &Smoother, t, orders| {
-            smoother
-                .at(t, orders, edge, &mut scratch)
-                .ok_or(Reason::Starting)
+            let own = smoother.at(t, orders, &mut scratch);
+            own.ok_or(Reason::Starting)
         };
         let mut motion = |t: Nanos| -> Result<[f64; 3], Reason> {
-            let [mut position] = self.position.mean(t, period)?;
+            let [mut position] = self.position.mean(t)?;
             let (velocity, mut acceleration) = if let Some(smoother) = &of_position {
                 let orders = if is_given || of_velocity.is_some() {
                     0..=1
@@ -69,17 +70,17 @@ impl JointTrack {
                 position = of_0;
                 (of_1, of_2)
             } else {
-                (self.velocity.mean(t, period)?[0], 0.0)
+                (self.velocity.mean(t)?[0], 0.0)
             };
             if is_given {
-                acceleration = self.acceleration.mean(t, period)?[0];
+                acceleration = self.acceleration.mean(t)?[0];
             } else if let Some(smoother) = &of_velocity {
                 acceleration = derivatives(smoother, t, 1..=1)?[1];
             }
             Ok([position, velocity, acceleration])
         };
         let mut at = |&t: &Nanos| {
-            let torque = self.torque.mean(t, period);
+            let torque = self.torque.mean(t);
             let (motion, fault) = match motion(t) {
                 Ok(motion) => (motion, Reason::None),
                 Err(fault) => ([self.position.nearest(t)[0], 0.0, 0.0], fault),
@@ -94,9 +95,9 @@ impl JointTrack {
     }
 }
 
-/// Whether a channel sampled every `spacing` is averaged over blocks of `period`.
-pub(crate) fn is_dense(spacing: Nanos, period: Nanos) -> bool {
-    spacing > Nanos::ZERO && spacing.0 < period.0 / 4 * 3
+/// Whether a channel sampled every `spacing` is averaged over blocks of [`PERIOD`].
+pub(crate) fn is_dense(spacing: Nanos) -> bool {
+    spacing > Nanos::ZERO && spacing.0 < PERIOD.0 / 4 * 3
 }
 
 impl<const D: usize> SampleStream<D> {
@@ -169,9 +170,9 @@ impl<const D: usize> SampleStream<D> {
         next.map(|(_, reason)| *reason)
     }
 
-    /// The value at `t`: the mean over `period` for a faster channel, else a sample or an
+    /// The value at `t`: the mean over [`PERIOD`] for a faster channel, else a sample or an
     /// interpolation.
-    pub(crate) fn mean(&self, t: Nanos, period: Nanos) -> Result<Values<D>, Reason> {
+    pub(crate) fn mean(&self, t: Nanos) -> Result<Values<D>, Reason> {
         let (Some(first), Some(last)) = (self.t.first(), self.t.last()) else {
             let first = self.faulty.first();
             return Err(first.map_or(Reason::NeverSeen, |(_, reason)| *reason));
@@ -183,8 +184,8 @@ impl<const D: usize> SampleStream<D> {
         }
         // `after` is at least 1: the first sample is not later than t.
         let before = after - 1;
-        let half = if is_dense(self.spacing, period) {
-            Nanos(period.0 / 2).min(t - *first).min(*last - t)
+        let half = if is_dense(self.spacing) {
+            Nanos(PERIOD.0 / 2).min(t - *first).min(*last - t)
         } else {
             Nanos::ZERO
         };
@@ -284,7 +285,7 @@ fn cubic(x: [f64; 4], t: f64) -> [f64; 4] {
 
 impl<const D: usize> SampleStream<D> {
     /// Appends the samples that follow these.
-    pub(crate) fn append(&mut self, mut next: Self) {
+    pub(crate) fn append(&mut self, next: &mut Self) {
         self.t.append(&mut next.t);
         self.value.append(&mut next.value);
         self.faulty.append(&mut next.faulty);
@@ -301,16 +302,26 @@ pub(crate) fn range(values: impl Iterator<Item = f64>) -> f64 {
     (high - low).max(0.0)
 }
 
+impl ImuTrack {
+    /// Proper acceleration, angular velocity, angular acceleration.
+    pub(crate) fn all(&mut self) -> [&mut SampleStream<3>; 3] {
+        [
+            &mut self.proper_acceleration,
+            &mut self.angular_velocity,
+            &mut self.angular_acceleration,
+        ]
+    }
+}
+
 impl JointTrack {
-    pub(crate) fn each(&mut self, mut f: impl FnMut(&mut SampleStream<1>)) {
+    /// Position, velocity, acceleration, torque.
+    pub(crate) fn all(&mut self) -> [&mut SampleStream<1>; 4] {
         [
             &mut self.position,
             &mut self.velocity,
             &mut self.acceleration,
             &mut self.torque,
         ]
-        .into_iter()
-        .for_each(&mut f);
     }
 
     /// The range of positions from `from` to `to`.

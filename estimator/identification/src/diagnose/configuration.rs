@@ -50,7 +50,6 @@ use crate::measurement::reduction::nuisance_prior;
 use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::Unknowns;
 use crate::online::bank::hypothesis::{GRAVITY, MotionReading};
-use crate::parallel;
 use crate::robot::{BaseMotion, IdentificationInput, Robot};
 use crate::training::PreparedLog;
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
@@ -239,19 +238,14 @@ impl ConfigurationEvidence {
         let stands = matches!(robot.base, BaseMotion::Standing(_))
             && some.iter().all(|instant| base(instant) == base(first));
         self.base = stands.then(|| (first.base_link, first.base.proper_acceleration));
-        let stretches: Vec<&[&Annotated]> = some.chunks(STRETCH).collect();
-        let parts = parallel::map_with(
-            stretches.len(),
-            || measurement.clone(),
-            |measurement, number| {
-                let mut part = Self {
-                    base: self.base,
-                    ..Self::new(robot)
-                };
-                part.add_stretch(measurement, stretches[number]);
-                part
-            },
-        );
+        let parts = measurement.map(some.chunks(STRETCH), |measurement, stretch| {
+            let mut part = Self {
+                base: self.base,
+                ..Self::new(robot)
+            };
+            part.add_stretch(measurement, stretch);
+            part
+        });
         parts.iter().for_each(|part| self.add(part));
         Ok(())
     }
@@ -270,18 +264,12 @@ impl ConfigurationEvidence {
         for torque in (0..unknowns.sensors.len()).flat_map(|index| 6 * index..6 * index + 3) {
             variances[torque] = Structure::LENGTH_SCALE.powi(2);
         }
-        let [mut rows, mut moved] = [
-            MeasurementRows::new(&unknowns),
-            MeasurementRows::new(&unknowns),
-        ];
         for instant in stretch {
-            if measurement.compute_rows(instant, &mut rows).is_err() {
-                continue;
-            }
+            let mut rows = measurement.rows(instant);
             self.instants += 1;
             let mut lines = DMatrix::zeros(rows.count, last + 1);
             if self.base.is_some() {
-                gravity_columns(measurement, instant, &mut moved, &mut lines);
+                gravity_columns(measurement, instant, &mut lines);
             }
             reading_columns(&unknowns, instant, &rows, &mut lines);
             let g = |rows: &MeasurementRows| {
@@ -311,7 +299,7 @@ impl ConfigurationEvidence {
             rows.whiten_with(&variances, lines.as_mut_slice(), last + 1);
             let all = g(&rows);
             for row in 0..rows.count {
-                let joint = rows.joint(row, 6 * unknowns.sensors.len());
+                let joint = rows.joint(row);
                 let group = joint.map_or(0, |joint| self.joint(unknowns.joints[joint]));
                 let line = lines.column(row);
                 self.groups[group].add(&mut nuisance, all.row(row).iter(), line.iter());
@@ -495,14 +483,13 @@ impl ConfigurationEvidence {
 fn gravity_columns(
     measurement: &mut MeasurementModel<'_>,
     instant: &Annotated,
-    rows: &mut MeasurementRows,
     lines: &mut DMatrix<f64>,
 ) {
     let mut right = |axis: Vec3| {
         let upright = MotionReading::Upright(axis);
         let other = instant.clone().map(|own| own.seen(upright));
-        let is_made = measurement.compute_rows(&other, rows).is_ok() && rows.count == lines.nrows();
-        is_made.then(|| DVector::from_column_slice(&rows.r))
+        let rows = measurement.rows(&other);
+        (rows.count == lines.nrows()).then(|| DVector::from_vec(rows.r))
     };
     let without = right(Vec3::zeros());
     let with = [0, 1, 2].map(|axis| right(Vec3::ith(axis, 1.0)));
@@ -530,7 +517,7 @@ fn reading_columns(
                 }
             }
         }
-        if let Some(joint) = rows.joint(row, 6 * unknowns.sensors.len()) {
+        if let Some(joint) = rows.joint(row) {
             lines[(row, last - 1)] = instant.torque[unknowns.joints[joint]];
         }
         lines[(row, last)] = rows.r(row);

@@ -20,10 +20,9 @@ use crate::diagnose::load::LoadChange;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::reduction::{LogSegment, residuals};
-use crate::measurement::rows::MeasurementRows;
 use crate::statistics::chi_square;
 use crate::statistics::quantile;
-use crate::training::{PreparedLog, SEGMENT_INSTANTS, map_segments};
+use crate::training::{PreparedLog, SEGMENT_INSTANTS};
 use nalgebra::DVector;
 
 /// Normal deviate beyond which a block's square is outlying: one block in three million by chance.
@@ -70,7 +69,7 @@ pub(crate) fn contacts(
 ) -> Vec<Vec<SubtreeSet>> {
     // Long logs in parts, so that all cores have work; of at least a minute, so that a contact does
     // not last for most of it.
-    let (mut segments, mut logs) = (Vec::new(), Vec::new());
+    let mut segments = Vec::new();
     for (number, log) in all.iter().enumerate() {
         let minutes = ((log.span.1 - log.span.0).seconds() / 60.0) as usize;
         let count = log.instants.len().div_ceil(SEGMENT_INSTANTS);
@@ -78,20 +77,16 @@ pub(crate) fn contacts(
         let at = |part: usize| log.instants.len() * part / count;
         for part in 0..count {
             let instants = &log.instants[at(part)..at(part + 1)];
-            segments.push(LogSegment::alone(instants));
-            logs.push(number);
+            segments.push((number, LogSegment::alone(instants)));
         }
     }
-    let found = map_segments(measurement, &segments, |measurement, number, segment| {
-        let log_loads: Vec<&LoadChange> = loads
-            .iter()
-            .filter(|load| load.log == logs[number])
-            .collect();
-        of_segment(measurement, segment, &log_loads, noise, d)
+    let found = measurement.map(&segments, |measurement, (log, segment)| {
+        let log_loads: Vec<&LoadChange> = loads.iter().filter(|load| load.log == *log).collect();
+        of_segment(measurement, *segment, &log_loads, noise, d)
     });
     let mut out = vec![Vec::new(); all.len()];
-    for (log, found) in logs.into_iter().zip(found) {
-        out[log].extend(found);
+    for ((log, _), found) in segments.iter().zip(found) {
+        out[*log].extend(found);
     }
     out
 }
@@ -169,30 +164,22 @@ impl SubtreePass<'_> {
         instants: &[Annotated],
     ) -> Vec<Vec<f64>> {
         let channels = self.variances.len();
-        let mut rows = MeasurementRows::new(measurement.unknowns());
-        let mut own_rows = rows.clone();
-        let (mut white, mut noise) = (Vec::new(), vec![0.0; channels]);
         let mut sums = vec![vec![(0.0, 0.0); channels]; self.subtrees.len()];
         for instant in instants {
-            if measurement.compute_rows(instant, &mut rows).is_err() {
-                continue;
-            }
+            let rows = measurement.rows(instant);
             for (&subtree, sums) in self.subtrees.iter().zip(&mut sums) {
                 let carries =
                     |load: &&LoadChange| load.subtrees.contains(subtree) && load.has(instant.t);
                 if self.loads.iter().any(carries) {
                     continue;
                 }
-                rows.copy_unit(subtree, &mut own_rows);
-                if own_rows.count == 0 {
-                    continue;
-                }
+                let mut rows = rows.of_unit(subtree);
                 let (d, nuisance) = (self.d.as_slice(), self.nuisance.as_slice());
-                white.clear();
-                white.extend((0..own_rows.count).map(|row| own_rows.residual(row, d, nuisance)));
-                own_rows.whiten_with(&self.variances, &mut white, 1);
-                own_rows.channel_noise(&self.variances, &mut white, &mut noise);
-                for channel in (0..channels).filter(|&channel| own_rows.has(channel)) {
+                let residuals = (0..rows.count).map(|row| rows.residual(row, d, nuisance));
+                let mut white: Vec<f64> = residuals.collect();
+                rows.whiten_with(&self.variances, &mut white, 1);
+                let noise = rows.channel_noise(&self.variances, white);
+                for channel in (0..channels).filter(|&channel| rows.has(channel)) {
                     sums[channel].0 += noise[channel];
                     sums[channel].1 += 1.0;
                 }

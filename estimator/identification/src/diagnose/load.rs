@@ -83,8 +83,8 @@ impl Normal {
     }
 
     /// Of these segments together.
-    fn of(unknowns: &Unknowns, reduced: &[ReducedLog]) -> Self {
-        let mut sum = Self::new(unknowns.parameters());
+    fn of(unknowns: usize, reduced: &[ReducedLog]) -> Self {
+        let mut sum = Self::new(unknowns);
         reduced.iter().for_each(|own| sum.add(&own.information));
         sum
     }
@@ -290,7 +290,7 @@ impl<'a> LoadSearch<'a> {
     ) -> Option<Self> {
         let (unknowns, prior) = (measurement.unknowns(), &estimate.prior);
         let reduced = reduced_segments(measurement, segments, &estimate.noise);
-        let mut all = Normal::of(unknowns, &reduced);
+        let mut all = Normal::of(unknowns.parameters(), &reduced);
         all.add_prior(prior, unknowns, estimate.fit.tau, &|_| false);
         let factor = all.matrix.cholesky()?;
         Some(Self {
@@ -313,8 +313,7 @@ impl<'a> LoadSearch<'a> {
     ) {
         let reduced = &self.reduced[range.clone()];
         let mut before = Normal::new(self.x.len());
-        let mut whole = Normal::new(self.x.len());
-        reduced.iter().for_each(|own| whole.add(&own.information));
+        let whole = Normal::of(self.x.len(), reduced);
         if is_one_of_several {
             self.test((log, range.start), &before, &whole, true, best);
         }
@@ -391,7 +390,7 @@ pub(crate) fn added_body(
     };
     let reduced = reduce(&mut measurement, segment, &estimate.noise);
     let (unknowns, prior) = (measurement.unknowns(), &estimate.prior);
-    let some = Normal::of(unknowns, std::slice::from_ref(&reduced));
+    let some = Normal::of(unknowns.parameters(), std::slice::from_ref(&reduced));
     let mut all = some.clone();
     all.add(&estimate.information);
     all.add_prior(prior, unknowns, estimate.fit.tau, &|_| false);

@@ -42,7 +42,7 @@ use crate::online::bank::hypothesis::MotionReading;
 use crate::prior::{MapEstimate, Posterior};
 use crate::report::outcome::TimeOffset;
 use crate::robot::Robot;
-use crate::training::{PreparedLog, map_segments};
+use crate::training::PreparedLog;
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::model::{Joint, JointKind};
 use std::f64::consts::FRAC_1_SQRT_2;
@@ -215,35 +215,27 @@ struct SegmentColumns<'a> {
     /// Per instant, the rate of change of each channel.
     rates: Vec<Vec<f64>>,
     d: &'a [f64],
-    /// Buffer for the rows with another zero.
-    moved: MeasurementRows,
 }
 
 impl SegmentColumns<'_> {
-    /// Writes the columns of an instant's rows, row by row.
-    fn write(
-        &mut self,
+    /// The columns of an instant's rows, row by row.
+    fn of_rows(
+        &self,
         measurement: &mut MeasurementModel<'_>,
         number: usize,
         rows: &MeasurementRows,
-        out: &mut [f64],
-    ) {
-        let Self {
-            dofs,
-            instants,
-            rates,
-            d,
-            moved,
-        } = self;
-        let (joints, rates) = (dofs.len(), &rates[number]);
+    ) -> Vec<f64> {
+        let (joints, rates, d) = (self.dofs.len(), &self.rates[number], self.d);
         let sensors = measurement.unknowns().sensors.len();
         let width = joints + sensors + measurement.unknowns().joints.len();
-        for (joint, &dof) in dofs.iter().enumerate() {
+        let mut out = vec![0.0; width * rows.count];
+        for (joint, &dof) in self.dofs.iter().enumerate() {
             // The row holds at the true position: the measured one minus the error. The small
             // change of the offset terms is ignored.
             let step = MotionReading::Encoder(dof, [STEP, 0.0]);
-            let instant = instants[number].clone().map(|own| own.seen(step));
-            if measurement.compute_rows(&instant, moved).is_ok() && moved.count == rows.count {
+            let instant = self.instants[number].clone().map(|own| own.seen(step));
+            let moved = measurement.rows(&instant);
+            if moved.count == rows.count {
                 for row in 0..rows.count {
                     let change = moved.without_bodies(row, d) - rows.without_bodies(row, d);
                     out[row * width + joint] = change / STEP;
@@ -256,18 +248,18 @@ impl SegmentColumns<'_> {
                 let six = 6 * sensor..6 * sensor + 6;
                 out[joints + sensor] = -dot(&rows.g(row)[six.clone()], &rates[six]);
             }
-            if let Some(joint) = rows.joint(row, 6 * sensors) {
+            if let Some(joint) = rows.joint(row) {
                 out[joints + sensors + joint] = -rates[6 * sensors + joint];
             }
         }
+        out
     }
 }
 
 /// The search for errors that are estimated.
 pub(crate) struct Search<'a> {
-    measurement: &'a MeasurementModel<'a>,
     training: &'a [&'a PreparedLog],
-    identified: &'a Identified,
+    identified: &'a Identified<'a>,
     /// The tested joints.
     dofs: Vec<usize>,
     /// Triangle of the information about the zeros, log by log, then the delays, then the
@@ -280,12 +272,8 @@ pub(crate) struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    pub(crate) fn new(
-        measurement: &'a MeasurementModel<'a>,
-        training: &'a [&'a PreparedLog],
-        identified: &'a Identified,
-    ) -> Self {
-        let unknowns = &identified.unknowns;
+    pub(crate) fn new(training: &'a [&'a PreparedLog], identified: &'a Identified<'a>) -> Self {
+        let (measurement, unknowns) = (&identified.measurement, identified.unknowns());
         let dofs = turning(measurement.robot());
         let (logs, joints, parameters) = (training.len(), dofs.len(), unknowns.parameters());
         let streams = unknowns.sensors.len() + unknowns.joints.len();
@@ -293,28 +281,19 @@ impl<'a> Search<'a> {
         let mut sum = Information::new(first + streams + parameters);
         let stretches = stretches(training, ENOUGH);
         for (number, segments) in stretches.iter().enumerate() {
-            let reduced = map_segments(measurement, segments, |measurement, _, segment| {
-                let mut columns = SegmentColumns {
+            let reduced = measurement.map(segments, |measurement, segment| {
+                let columns = SegmentColumns {
                     dofs: &dofs,
                     instants: segment.instants,
-                    rates: rates(measurement, segment, identified),
+                    rates: rates(*segment, identified),
                     d: identified.fit.x.as_slice(),
-                    moved: MeasurementRows::new(unknowns),
                 };
-                let mut write = |measurement: &mut MeasurementModel<'_>,
-                                 number: usize,
-                                 rows: &MeasurementRows,
-                                 out: &mut [f64]| {
-                    columns.write(measurement, number, rows, out);
-                };
-                reduce_with(
-                    measurement,
-                    segment,
-                    &identified.noise,
-                    &[],
-                    width,
-                    &mut write,
-                )
+                let of_rows =
+                    |measurement: &mut MeasurementModel<'_>, number, rows: &MeasurementRows| {
+                        columns.of_rows(measurement, number, rows)
+                    };
+                let noise = &identified.noise;
+                reduce_with(measurement, *segment, noise, &[], width, &of_rows)
             });
             let own = added(&reduced, parameters + width);
             let own_columns = (first + streams..first + streams + parameters)
@@ -329,7 +308,6 @@ impl<'a> Search<'a> {
             .chain(each)
             .flat_map(|log| (0..joints).map(move |joint| SetupError::Zero { joint, log }));
         let mut search = Self {
-            measurement,
             training,
             identified,
             r,
@@ -345,7 +323,7 @@ impl<'a> Search<'a> {
 
     /// The delay of each F/T sensor, and that of all joint torques.
     fn streams(&self) -> Vec<SetupError> {
-        let unknowns = &self.identified.unknowns;
+        let unknowns = self.identified.unknowns();
         let (sensors, joints) = (unknowns.sensors.len(), unknowns.joints.len());
         let torques = Some(sensors..sensors + joints).filter(|_| joints > 0);
         let single = (0..sensors).map(|own| own..own + 1);
@@ -367,7 +345,7 @@ impl<'a> Search<'a> {
     /// The parameters' columns, then those of these errors. (Other errors are zero: their columns
     /// are omitted.)
     fn columns(&self, errors: &[SetupError]) -> DMatrix<f64> {
-        let parameters = self.identified.unknowns.parameters();
+        let parameters = self.identified.unknowns().parameters();
         let columns = self.r.columns(self.r.ncols() - parameters, parameters);
         let mut columns =
             (columns.into_owned()).resize_horizontally(parameters + errors.len(), 0.0);
@@ -379,7 +357,7 @@ impl<'a> Search<'a> {
 
     /// The MAP parameters and these errors, and their cost.
     fn fit(&self, errors: &[SetupError]) -> Option<(f64, MapEstimate)> {
-        let (unknowns, prior) = (&self.identified.unknowns, &self.identified.prior);
+        let (unknowns, prior) = (self.identified.unknowns(), &self.identified.prior);
         let mut precision = unknowns.precision.clone();
         precision.extend(errors.iter().map(SetupError::precision));
         let columns = self.columns(errors);
@@ -391,7 +369,10 @@ impl<'a> Search<'a> {
     /// These errors, all of them estimated together, with their deviations.
     fn estimates(&self, errors: &[SetupError]) -> Option<Vec<Estimate>> {
         let (_, fit) = self.fit(errors)?;
-        let (root, first) = (fit.covariance_root(), self.identified.unknowns.parameters());
+        let (root, first) = (
+            fit.covariance_root(),
+            self.identified.unknowns().parameters(),
+        );
         let estimates = (first..first + errors.len()).map(|k| (fit.x[k], root.row(k).norm()));
         Some(estimates.collect())
     }
@@ -470,7 +451,7 @@ impl<'a> Search<'a> {
         let (of_zeros, of_streams) = together.split_at(count);
         let mut findings = self.about_zeros(&zeros, of_zeros);
 
-        let (robot, unknowns) = (self.measurement.robot(), &self.identified.unknowns);
+        let (robot, unknowns) = (self.identified.robot(), self.identified.unknowns());
         let (sensors, torques) = (unknowns.sensors.len(), unknowns.joints.len());
         let significance = deviations(sensors + torques + 1);
         let is_long = |(seconds, deviation): Estimate| {
@@ -515,7 +496,7 @@ impl<'a> Search<'a> {
     }
 
     fn about_zeros(&self, zeros: &[SetupError], estimates: &[Estimate]) -> Vec<Finding> {
-        let (robot, unknowns) = (self.measurement.robot(), &self.identified.unknowns);
+        let (robot, unknowns) = (self.identified.robot(), self.identified.unknowns());
         let file = |log: usize| self.training[log].file.as_str();
         let mut findings = Vec::new();
         for (number, &dof) in self.dofs.iter().enumerate() {
@@ -584,18 +565,14 @@ fn is_known((_, deviation): &Estimate) -> bool {
 }
 
 /// Per instant, the rate of change of each channel without noise; 0 where it is not known.
-fn rates(
-    measurement: &MeasurementModel<'_>,
-    segment: LogSegment<'_>,
-    identified: &Identified,
-) -> Vec<Vec<f64>> {
-    let (unknowns, instants) = (&identified.unknowns, segment.instants);
+fn rates(segment: LogSegment<'_>, identified: &Identified<'_>) -> Vec<Vec<f64>> {
+    let (unknowns, instants) = (identified.unknowns(), segment.instants);
     let d = std::slice::from_ref(&identified.d);
-    let noise = residuals(measurement, segment, &identified.noise, d).noise;
+    let noise = residuals(&identified.measurement, segment, &identified.noise, d).noise;
     let exact = |channel: usize, i: usize| {
         let measured = match unknowns.sensors.get(channel / 6) {
             Some(&sensor) => instants[i].readings[sensor].torque_first()[channel % 6],
-            None => instants[i].torque[unknowns.joints[channel - 6 * unknowns.sensors.len()]],
+            None => instants[i].torque[unknowns.joints[channel - unknowns.wrenches()]],
         };
         measured - noise[0][channel][i]
     };

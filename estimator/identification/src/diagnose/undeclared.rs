@@ -27,109 +27,92 @@ const LONGEST_HANDOVER: f64 = 3.0;
 /// Most rounds of disturbances of validation logs, for a given fit.
 const ROUNDS: usize = 4;
 
-/// Undeclared disturbances of some logs.
-pub(crate) struct Undeclared {
-    pub loads: Vec<LoadChange>,
-    /// Per log and instant.
-    contacts: Vec<Vec<SubtreeSet>>,
+/// Adds a load. One that differs from another only by a slightly different time of change is
+/// merged with it: that time is known only to a segment of the log.
+pub(crate) fn add_load(loads: &mut Vec<LoadChange>, load: LoadChange) {
+    let edge = |load: &LoadChange| {
+        let (first, last) = load.span;
+        if load.is_after { first } else { last }
+    };
+    let is_same = |other: &&mut LoadChange| {
+        let apart = (edge(other) - edge(&load)).seconds().abs();
+        (other.log, other.index, other.is_after) == (load.log, load.index, load.is_after)
+            && apart <= LONGEST_HANDOVER.max(1.5 * load.within)
+    };
+    match loads.iter_mut().find(is_same) {
+        Some(other) => {
+            other.span = (other.span.0.min(load.span.0), other.span.1.max(load.span.1));
+            other.clear = (
+                other.clear.0.max(load.clear.0),
+                other.clear.1.min(load.clear.1),
+            );
+        }
+        None => loads.push(load),
+    }
 }
 
-impl Undeclared {
-    /// No disturbances, yet, of these logs.
-    pub(crate) fn none<'a>(logs: impl Iterator<Item = &'a mut PreparedLog>) -> Self {
-        let contacts = logs.map(|log| vec![SubtreeSet::default(); log.instants.len()]);
-        Self {
-            loads: Vec::new(),
-            contacts: contacts.collect(),
+/// Updates the contacts of the logs from the residuals of a fit, and marks the logs; true if
+/// nothing changed.
+pub(crate) fn update<'a>(
+    measurement: &MeasurementModel<'_>,
+    logs: impl Iterator<Item = &'a mut PreparedLog>,
+    loads: &[LoadChange],
+    noise: &NoiseModel,
+    d: &DVector<f64>,
+) -> bool {
+    let mut logs: Vec<&mut PreparedLog> = logs.collect();
+    let seen: Vec<&PreparedLog> = logs.iter().map(|log| &**log).collect();
+    let contacts = disturbance::contacts(measurement, &seen, loads, noise, d);
+    let mut unchanged = true;
+    for (log, contacts) in logs.iter_mut().zip(contacts) {
+        unchanged &= log.contacts == contacts;
+        log.contacts = contacts;
+    }
+    if !unchanged {
+        mark(logs.into_iter(), loads);
+    }
+    unchanged
+}
+
+/// Marks the disturbed instants of the logs.
+pub(crate) fn mark<'a>(logs: impl Iterator<Item = &'a mut PreparedLog>, loads: &[LoadChange]) {
+    for (number, log) in logs.enumerate() {
+        for (instant, contact) in log.instants.iter_mut().zip(&log.contacts) {
+            let carries = |load: &&LoadChange| load.log == number && load.has(instant.t);
+            let loads = loads.iter().filter(carries);
+            instant.disturbed = loads.fold(*contact, |set, load| set.union(&load.subtrees));
         }
     }
+}
 
-    /// Adds a load. One that differs from another only by a slightly different time of change is
-    /// merged with it: that time is known only to a segment of the log.
-    pub(crate) fn add_load(&mut self, load: LoadChange) {
-        let edge = |load: &LoadChange| {
-            let (first, last) = load.span;
-            if load.is_after { first } else { last }
-        };
-        let is_same = |other: &&mut LoadChange| {
-            let apart = (edge(other) - edge(&load)).seconds().abs();
-            (other.log, other.index, other.is_after) == (load.log, load.index, load.is_after)
-                && apart <= LONGEST_HANDOVER.max(1.5 * load.within)
-        };
-        match self.loads.iter_mut().find(is_same) {
-            Some(other) => {
-                other.span = (other.span.0.min(load.span.0), other.span.1.max(load.span.1));
-                other.clear = (
-                    other.clear.0.max(load.clear.0),
-                    other.clear.1.min(load.clear.1),
-                );
-            }
-            None => self.loads.push(load),
+/// Reports in the logs what was excluded because of undeclared disturbances.
+pub(crate) fn report(
+    measurement: &MeasurementModel<'_>,
+    logs: &mut [PreparedLog],
+    loads: &[LoadChange],
+    estimate: &NoiseAndMap,
+) {
+    let robot = measurement.robot();
+    let training = training_logs(logs);
+    let body = |load: &LoadChange| load::added_body(measurement, &training, load, estimate);
+    let bodies: Vec<Option<(usize, load::AddedBody)>> = loads.iter().map(body).collect();
+    for (number, log) in training_logs_mut(logs).enumerate() {
+        let log_loads = loads.iter().zip(&bodies);
+        let log_loads = log_loads.filter(|(load, _)| load.log == number);
+        let loads: Vec<&LoadChange> = log_loads.clone().map(|(load, _)| load).collect();
+        let apparent = apparent_contacts(log, &loads);
+        for (part, excluded, when) in suspected(robot, log, &apparent) {
+            log.excluded.push(excluded);
+            let text = format!(
+                "{part}: undeclared disturbance (contact, load or a jump of a sensor's offset) \
+                 {when}. These instants were excluded; declare contacts where they occur"
+            );
+            log.findings
+                .push(Finding::warning(FindingCode::Disturbance, part, text));
         }
-    }
-
-    /// Updates contacts from the residuals of a fit, and marks the logs; true if
-    /// nothing changed.
-    pub(crate) fn update<'a>(
-        &mut self,
-        measurement: &MeasurementModel<'_>,
-        logs: impl Iterator<Item = &'a mut PreparedLog>,
-        noise: &NoiseModel,
-        d: &DVector<f64>,
-    ) -> bool {
-        let logs: Vec<&mut PreparedLog> = logs.collect();
-        let seen: Vec<&PreparedLog> = logs.iter().map(|log| &**log).collect();
-        let contacts = disturbance::contacts(measurement, &seen, &self.loads, noise, d);
-        let unchanged = contacts == self.contacts;
-        if !unchanged {
-            self.contacts = contacts;
-            self.mark(logs.into_iter());
-        }
-        unchanged
-    }
-
-    /// Marks the disturbed instants of the logs.
-    pub(crate) fn mark<'a>(&self, logs: impl Iterator<Item = &'a mut PreparedLog>) {
-        for (number, (log, contacts)) in logs.zip(&self.contacts).enumerate() {
-            for (instant, contact) in log.instants.iter_mut().zip(contacts) {
-                let carries = |load: &&LoadChange| load.log == number && load.has(instant.t);
-                let loads = self.loads.iter().filter(carries);
-                instant.disturbed = loads.fold(*contact, |set, load| set.union(&load.subtrees));
-            }
-        }
-    }
-
-    /// Reports in the logs what was excluded because of undeclared disturbances.
-    pub(crate) fn report(
-        &self,
-        measurement: &MeasurementModel<'_>,
-        logs: &mut [PreparedLog],
-        estimate: &NoiseAndMap,
-    ) {
-        let (loads, contacts) = (&self.loads, &self.contacts);
-        let robot = measurement.robot();
-        let training = training_logs(logs);
-        let body = |load: &LoadChange| load::added_body(measurement, &training, load, estimate);
-        let bodies: Vec<Option<(usize, load::AddedBody)>> = loads.iter().map(body).collect();
-        let training = training_logs_mut(logs);
-        for (number, (log, contacts)) in training.zip(contacts).enumerate() {
-            let log_loads = loads.iter().zip(&bodies);
-            let log_loads = log_loads.filter(|(load, _)| load.log == number);
-            let loads: Vec<&LoadChange> = log_loads.clone().map(|(load, _)| load).collect();
-            let apparent = apparent_contacts(log, contacts, &loads);
-            for (part, excluded, when) in suspected(robot, log, &apparent) {
-                log.excluded.push(excluded);
-                let text = format!(
-                    "{part}: undeclared disturbance (contact, load or a jump of a sensor's offset) \
-                     {when}. These instants were excluded; declare contacts where they occur"
-                );
-                log.findings
-                    .push(Finding::warning(FindingCode::Disturbance, part, text));
-            }
-            for (index, (load, body)) in log_loads.enumerate() {
-                let handovers = apparent.iter().filter(|own| own.load == Some(index));
-                report_load(measurement, log, load, body.as_ref(), handovers);
-            }
+        for (index, (load, body)) in log_loads.enumerate() {
+            let handovers = apparent.iter().filter(|own| own.load == Some(index));
+            report_load(measurement, log, load, body.as_ref(), handovers);
         }
     }
 }
@@ -240,11 +223,8 @@ fn subtrees(contacts: &[SubtreeSet]) -> SubtreeSet {
 }
 
 /// The apparent contacts of a log with their causes; `loads`: loads whose hands may be one.
-fn apparent_contacts(
-    log: &PreparedLog,
-    contacts: &[SubtreeSet],
-    loads: &[&LoadChange],
-) -> Vec<ApparentContact> {
+fn apparent_contacts(log: &PreparedLog, loads: &[&LoadChange]) -> Vec<ApparentContact> {
+    let contacts = &log.contacts;
     let mut apparent_contacts = Vec::new();
     for subtree in subtrees(contacts).iter() {
         let mut begin = 0;
@@ -310,24 +290,17 @@ fn suspected(
     subtrees.map(of_subtree).collect()
 }
 
-/// Reports undeclared disturbances of the validation logs, stores them in
-/// [`PreparedLog::disturbed`]. The figures of these logs still include all rows: validation data
-/// must not be selected by the model that they validate.
-pub(crate) fn report_validation(
-    measurement: &MeasurementModel<'_>,
-    logs: &mut [PreparedLog],
-    identified: &Identified,
-) {
+/// Reports undeclared disturbances of the validation logs. The figures of these logs still include
+/// all rows: validation data must not be selected by the model that they validate.
+pub(crate) fn report_validation(logs: &mut [PreparedLog], identified: &Identified<'_>) {
     let is_checked = |log: &&mut PreparedLog| log.role == LogRole::Validate && !log.refused;
-    let robot = measurement.robot();
-    let mut undeclared = Undeclared::none(logs.iter_mut().filter(is_checked));
+    let (measurement, robot) = (&identified.measurement, identified.robot());
     let converges = (0..ROUNDS).any(|_| {
         let checked = logs.iter_mut().filter(is_checked);
-        undeclared.update(measurement, checked, &identified.noise, &identified.d)
+        update(measurement, checked, &[], &identified.noise, &identified.d)
     });
-    let checked = logs.iter_mut().filter(is_checked);
-    for (log, contacts) in checked.zip(undeclared.contacts) {
-        let apparent = apparent_contacts(log, &contacts, &[]);
+    for log in logs.iter_mut().filter(is_checked) {
+        let apparent = apparent_contacts(log, &[]);
         for (part, _, when) in suspected(robot, log, &apparent) {
             let text = format!(
                 "{part}: residuals as of an undeclared disturbance (contact, load or a jump of a \
@@ -349,7 +322,6 @@ pub(crate) fn report_validation(
         for instant in &mut log.instants {
             instant.disturbed = SubtreeSet::default();
         }
-        log.disturbed = contacts;
     }
 }
 
@@ -374,12 +346,10 @@ mod tests {
     #[test]
     fn two_findings_of_one_load_change_are_merged() {
         let merged = |loads: &[LoadChange]| {
-            let mut undeclared = Undeclared::none(std::iter::empty());
-            loads
-                .iter()
-                .cloned()
-                .for_each(|load| undeclared.add_load(load));
-            undeclared.loads
+            let mut merged = Vec::new();
+            let each = loads.iter().cloned();
+            each.for_each(|load| add_load(&mut merged, load));
+            merged
         };
         let first = load(0, 3, 23, 1.0);
         for sooner in [22, 24] {

@@ -56,13 +56,14 @@
 //!   below that unit, after 1e15 equal rows.
 
 mod panel;
-mod triangle;
 
 pub use panel::{InformationError, Panel};
 
+use crate::arithmetic::dot;
 use nalgebra::{DMatrix, DVector};
+use panel::Reflect;
 pub(crate) use panel::check_size;
-use triangle::Triangle;
+use pulp::Arch;
 
 /// A compensated sum (Neumaier 1974) of a quantity that is not negative.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -91,7 +92,9 @@ impl Sum {
 /// of the residuals.
 #[derive(Clone, Debug)]
 pub struct Information {
-    triangle: Triangle,
+    unknowns: usize,
+    /// `[R | z]`, row by row; zeros below the diagonal.
+    values: Vec<f64>,
     residual: Sum,
     rows: u64,
     /// Work space of [`Information::drift`]: one row.
@@ -102,7 +105,8 @@ impl Information {
     /// No information, about this many unknowns.
     pub fn new(unknowns: usize) -> Self {
         Self {
-            triangle: Triangle::new(unknowns),
+            unknowns,
+            values: vec![0.0; unknowns * (unknowns + 1)],
             residual: Sum::default(),
             rows: 0,
             work_row: vec![0.0; unknowns + 1],
@@ -111,7 +115,7 @@ impl Information {
 
     /// Number of unknowns.
     pub fn unknowns(&self) -> usize {
-        self.triangle.unknowns
+        self.unknowns
     }
 
     /// Number of absorbed rows.
@@ -127,14 +131,18 @@ impl Information {
 
     /// Row `k` of `[R | z]`, from its diagonal on: `R_kk` ... `R_kn`, then `z_k`.
     pub fn row(&self, k: usize) -> &[f64] {
-        self.triangle.row(k)
+        let width = self.unknowns + 1;
+        &self.values[k * width + k..(k + 1) * width]
     }
 
     /// `R` and `z`, copied: `R` upper triangular, `n x n`.
     pub fn to_triangle(&self) -> (DMatrix<f64>, DVector<f64>) {
-        let (n, values) = (self.unknowns(), &self.triangle.values);
-        let root = DMatrix::from_fn(n, n, |i, j| values[i * (n + 1) + j]);
-        (root, DVector::from_iterator(n, self.triangle.right_sides()))
+        let n = self.unknowns;
+        let at = |i: usize, j: usize| self.values[i * (n + 1) + j];
+        (
+            DMatrix::from_fn(n, n, at),
+            DVector::from_fn(n, |i, _| at(i, n)),
+        )
     }
 
     /// Becomes a copy of `other`. Does not allocate.
@@ -144,7 +152,7 @@ impl Information {
     pub fn copy_from(&mut self, other: &Self) -> Result<(), InformationError> {
         let what = "unknowns of the other information";
         check_size(what, other.unknowns(), self.unknowns())?;
-        self.triangle.values.copy_from_slice(&other.triangle.values);
+        self.values.copy_from_slice(&other.values);
         (self.residual, self.rows) = (other.residual, other.rows);
         Ok(())
     }
@@ -156,8 +164,36 @@ impl Information {
     pub fn absorb(&mut self, panel: &mut Panel) -> Result<(), InformationError> {
         check_size("unknowns of the panel", panel.unknowns, self.unknowns())?;
         self.rows += panel.rows as u64;
-        self.residual.add(self.triangle.absorb(panel));
+        let residual = self.reflect(panel);
+        self.residual.add(residual);
         Ok(())
+    }
+
+    /// Reflects the panel's rows into the triangle and empties the panel. Returns the increase of
+    /// the residual's square sum.
+    fn reflect(&mut self, panel: &mut Panel) -> f64 {
+        let rows = panel.pad();
+        if rows == 0 {
+            return 0.0;
+        }
+        let Panel {
+            stride,
+            values,
+            filled,
+            ..
+        } = &mut *panel;
+        Arch::new().dispatch(Reflect {
+            unknowns: self.unknowns,
+            triangle: &mut self.values,
+            rows,
+            stride: *stride,
+            panel: values,
+            filled,
+        });
+        let right = &panel.values[self.unknowns * panel.stride..][..rows];
+        let residual = dot(right, right);
+        panel.clear();
+        residual
     }
 
     /// Absorbs the information of `other`, as if its rows had been absorbed here. Its unknown `i`
@@ -206,7 +242,23 @@ impl Information {
         check_columns(columns, self.unknowns())?;
         check_size("unknowns of the panel", work.unknowns, self.unknowns())?;
         check_size("numbers of a row", row.len(), self.unknowns())?;
-        let residual = self.triangle.add(&other.triangle, columns, work, row);
+        let mut residual = 0.0;
+        for k in 0..other.unknowns {
+            let from = other.row(k);
+            if from.iter().all(|&value| value == 0.0) {
+                continue;
+            }
+            row.fill(0.0);
+            for (&column, &value) in columns[k..].iter().zip(from) {
+                row[column] = value;
+            }
+            if work.push_row(row, from[from.len() - 1]).is_err() {
+                residual += self.reflect(work);
+                // There is room now, and the numbers of a triangle are finite.
+                let _ = work.push_row(row, from[from.len() - 1]);
+            }
+        }
+        residual += self.reflect(work);
         self.residual.add(residual);
         self.residual.add(other.residual.get());
         self.rows += other.rows;
@@ -215,7 +267,7 @@ impl Information {
 
     /// Removes all information.
     pub(crate) fn clear(&mut self) {
-        self.triangle.values.fill(0.0);
+        self.values.fill(0.0);
         (self.residual, self.rows) = (Sum::default(), 0);
     }
 
@@ -237,7 +289,7 @@ impl Information {
             return Err(InformationError::Range { what, value });
         }
         for (&column, &deviation) in columns.iter().zip(deviation) {
-            self.triangle.drift(column, deviation, &mut self.work_row);
+            self.walk(column, deviation);
         }
         Ok(())
     }
@@ -251,10 +303,44 @@ impl Information {
     pub fn marginalise(&mut self, columns: &[usize]) -> Result<(), InformationError> {
         check_columns(columns, self.unknowns())?;
         for &column in columns {
-            self.triangle
-                .drift(column, f64::INFINITY, &mut self.work_row);
+            self.walk(column, f64::INFINITY);
         }
         Ok(())
+    }
+
+    /// A step of a random walk of unknown `c`: `x_c + w`, `w` of this standard deviation, infinite
+    /// for a free unknown.
+    ///
+    /// In the new unknown, each row has an additional term `-R_ic w`, and `w / deviation = 0` is an
+    /// additional row. Rotations of that row with rows c to 0, in this order, remove `w` from these
+    /// and keep them triangular. The remaining row is about `w` and dropped (Bierman 1977, sect.
+    /// VII.2).
+    fn walk(&mut self, c: usize, deviation: f64) {
+        let (width, work_row) = (self.unknowns + 1, &mut self.work_row);
+        work_row.fill(0.0);
+        let mut pivot = 1.0 / deviation;
+        if pivot.is_infinite() {
+            return; // less than any rounding
+        }
+        for i in (0..=c).rev() {
+            let row = &mut self.values[i * width + i..(i + 1) * width];
+            let entry = -row[c - i];
+            if entry == 0.0 {
+                continue;
+            }
+            let hypotenuse = pivot.hypot(entry);
+            let (cosine, sine) = (pivot / hypotenuse, entry / hypotenuse);
+            for (work_row, row) in work_row[i..].iter_mut().zip(&mut *row) {
+                (*work_row, *row) = (
+                    cosine * *work_row + sine * *row,
+                    cosine * *row - sine * *work_row,
+                );
+            }
+            pivot = hypotenuse;
+            if deviation == f64::INFINITY {
+                row[c - i] = 0.0; // exactly
+            }
+        }
     }
 
     /// The marginal information about the unknowns from `first` on: a corner of the triangle,
@@ -262,7 +348,7 @@ impl Information {
     pub fn trailing(&self, first: usize) -> Self {
         let n = self.unknowns().saturating_sub(first);
         let mut trailing = Self::new(n);
-        for (k, to) in trailing.triangle.values.chunks_exact_mut(n + 1).enumerate() {
+        for (k, to) in trailing.values.chunks_exact_mut(n + 1).enumerate() {
             to[k..].copy_from_slice(self.row(first + k));
         }
         trailing.residual = self.residual;

@@ -7,10 +7,11 @@
 /// least 1, summed until the window is six times the sum (Sokal 1997, "Monte Carlo methods in
 /// statistical mechanics"). NaN marks a missing sample. Several segments are pooled without
 /// correlation across them.
-pub(crate) fn autocorrelation_time(segments: &[&[f64]]) -> (f64, f64) {
+pub(crate) fn autocorrelation_time<S: AsRef<[f64]>>(segments: &[S]) -> (f64, f64) {
     const WINDOW: f64 = 6.0;
     let (mut square, mut count, mut longest) = (0.0, 0.0, 0);
-    for segment in segments {
+    let segments = || segments.iter().map(AsRef::as_ref);
+    for segment in segments() {
         longest = longest.max(segment.len());
         for value in segment.iter().filter(|value| value.is_finite()) {
             square += value * value;
@@ -27,7 +28,7 @@ pub(crate) fn autocorrelation_time(segments: &[&[f64]]) -> (f64, f64) {
             break;
         }
         let (mut sum, mut pairs) = (0.0, 0.0);
-        for segment in segments.iter().filter(|segment| segment.len() > lag) {
+        for segment in segments().filter(|segment| segment.len() > lag) {
             for (x, y) in segment.iter().zip(&segment[lag..]) {
                 let product = x * y;
                 if product.is_finite() {

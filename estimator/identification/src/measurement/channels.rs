@@ -21,7 +21,7 @@ pub(crate) fn channel_name(
     unknowns: &Unknowns,
     channel: usize,
 ) -> (String, &'static str) {
-    let wrenches = 6 * unknowns.sensors.len();
+    let wrenches = unknowns.wrenches();
     if channel < wrenches {
         let axis = (channel % 6 + 3) % 6;
         let name = sensor_name(robot, unknowns.sensors[channel / 6]);

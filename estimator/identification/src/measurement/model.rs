@@ -32,6 +32,7 @@ use crate::dataset::observation::{Annotated, Observation, SubtreeSet};
 use crate::dataset::stream::range;
 use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::{ExtraParameter, FRICTION, Unknowns, friction_row};
+use crate::parallel;
 use crate::robot::{IdentificationInput, Robot, TorqueSide, is_between};
 use nalgebra::{DVector, Matrix6, Vector6};
 use proprio_dynamics::calibration::{Kind, Unknown};
@@ -172,9 +173,8 @@ impl<'a> MeasurementModel<'a> {
         let extra = measurement.unknowns.extra.len();
         let (first_channel, channels) = (links + extra, measurement.unknowns.channels());
         let mut nodes = AppearingNodes::new(first_channel + channels);
-        let mut rows = MeasurementRows::new(&measurement.unknowns);
         for observation in observations {
-            measurement.compute_rows(observation, &mut rows)?;
+            let rows = measurement.checked_rows(observation)?;
             for row in 0..rows.count {
                 nodes.add(links, rows.a(row), rows.n(row));
             }
@@ -311,14 +311,13 @@ impl<'a> MeasurementModel<'a> {
     /// joint.
     ///
     /// # Errors
-    /// As for [`MeasurementModel::compute_rows`].
+    /// The observation is of another robot, or a position, velocity or acceleration is not finite.
     pub(crate) fn torque_errors(
         &mut self,
         observation: &Annotated,
         d: &[f64],
     ) -> Result<Vec<f64>, DynamicsError> {
-        let mut rows = MeasurementRows::new(&self.unknowns);
-        self.compute_rows(observation, &mut rows)?;
+        self.move_to(observation)?;
         self.tree.update(&self.robot.model, &self.kinematics)?;
         let blocked = self.blocked(observation);
         let error = |dof: usize| {
@@ -337,17 +336,42 @@ impl<'a> MeasurementModel<'a> {
         self.robot
     }
 
-    /// Computes the rows of an observation. Sub-trees with a missing reading, missing torques, and
-    /// sub-trees under an undeclared disturbance ([`Annotated::disturbed`]) have no rows.
-    ///
-    /// # Errors
-    /// The observation is of another robot, or a position, velocity or acceleration is not finite.
-    pub(crate) fn compute_rows(
-        &mut self,
-        observation: &Annotated,
-        rows: &mut MeasurementRows,
-    ) -> Result<(), DynamicsError> {
-        rows.clear();
+    /// Runs `work` for each item, on all cores, with a copy of this model for each thread. Results
+    /// are in the order of the items.
+    pub(crate) fn map<I: Copy + Sync, T: Send>(
+        &self,
+        items: impl IntoIterator<Item = I>,
+        work: impl Fn(&mut Self, I) -> T + Sync,
+    ) -> Vec<T> {
+        let items: Vec<I> = items.into_iter().collect();
+        parallel::map_with(
+            items.len(),
+            || self.clone(),
+            |own, number| work(own, items[number]),
+        )
+    }
+
+    /// The rows of an observation. Sub-trees with a missing reading, missing torques, and sub-trees
+    /// under an undeclared disturbance ([`Annotated::disturbed`]) have none, nor has an observation
+    /// whose motion is not finite.
+    pub(crate) fn rows(&mut self, observation: &Annotated) -> MeasurementRows {
+        let rows = self.checked_rows(observation);
+        rows.unwrap_or_else(|_| MeasurementRows::new(&self.unknowns))
+    }
+
+    fn checked_rows(&mut self, observation: &Annotated) -> Result<MeasurementRows, DynamicsError> {
+        let mut rows = MeasurementRows::new(&self.unknowns);
+        self.move_to(observation)?;
+        if self.wrench {
+            self.wrench_rows(observation, &mut rows)?;
+        }
+        if self.torque {
+            self.torque_rows(observation, &mut rows)?;
+        }
+        Ok(rows)
+    }
+
+    fn move_to(&mut self, observation: &Annotated) -> Result<(), DynamicsError> {
         self.kinematics
             .set_base(&self.robot.model, observation.base_link)?;
         let state = JointState {
@@ -356,14 +380,7 @@ impl<'a> MeasurementModel<'a> {
             acceleration: &observation.acceleration,
         };
         self.kinematics
-            .update(&self.robot.model, state, &observation.base)?;
-        if self.wrench {
-            self.wrench_rows(observation, rows)?;
-        }
-        if self.torque {
-            self.torque_rows(observation, rows)?;
-        }
-        Ok(())
+            .update(&self.robot.model, state, &observation.base)
     }
 
     /// Joints whose torque can be computed from either side: both have F/T sensors and no contacts.
@@ -416,7 +433,7 @@ impl<'a> MeasurementModel<'a> {
         };
         let sensors = (0..unknowns.sensors.len()).filter(|&place| is_read(unknowns.sensors[place]));
         let of_sensors = sensors.flat_map(|place| 6 * place..6 * place + 6);
-        let of_joints = 6 * unknowns.sensors.len()..unknowns.channels();
+        let of_joints = unknowns.wrenches()..unknowns.channels();
         of_sensors
             .chain(of_joints.filter(|_| set.contains(Observation::TORQUES)))
             .collect()

@@ -2,10 +2,14 @@
 
 use crate::arithmetic::mean;
 use crate::linear::noise;
-use crate::measurement::noise_model::{DriftLimits, NoiseModel};
+use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::reduction::{BLOCK, Residuals};
 use crate::measurement::unknowns::Unknowns;
 use std::ops::Range;
+
+/// Time constant of the fastest random walk of an offset \[s\]: the motion that excites the
+/// parameters is faster.
+const DRIFT_TIME: f64 = 1.0;
 
 /// Means over this many autocorrelation times count as independent.
 const INDEPENDENT: f64 = 8.0;
@@ -13,9 +17,11 @@ const INDEPENDENT: f64 = 8.0;
 const LONGEST: usize = 10;
 
 /// Lower limit of a channel's share of noise, for channels mixed with others.
-const LEAST_SHARE: f64 = 1e-3;
+pub(crate) const LEAST_SHARE: f64 = 1e-3;
 
-/// The noise of every channel, from the residuals of all segments for one set of parameters.
+/// The noise of every channel, from the residuals of all segments for one set of parameters. The
+/// drift of an F/T channel's offset is at most that of `fastest`, the rate of a random walk
+/// [unit^2/s]; the variance of a channel is at least that of `least`.
 ///
 /// Where rows mix channels (a sub-tree between two sensors shows the sum of both), the residual is
 /// the *most likely* noise of each channel. It varies less than the noise: its variance is the
@@ -26,8 +32,7 @@ const LEAST_SHARE: f64 = 1e-3;
 pub(crate) fn estimate_noise(
     unknowns: &Unknowns,
     segments: &[Residuals],
-    set: usize,
-    drift_limits: &DriftLimits,
+    fastest: &[f64],
     least: &[f64],
 ) -> NoiseModel {
     let mut model = NoiseModel {
@@ -37,18 +42,18 @@ pub(crate) fn estimate_noise(
     for channel in 0..unknowns.channels() {
         let mut left: Vec<Vec<f64>> = segments
             .iter()
-            .map(|segment| segment.noise[set][channel].clone())
+            .map(|segment| segment.noise[0][channel].clone())
             .collect();
-        let walk = (channel < 6 * unknowns.sensors.len()).then(|| {
+        let walk = (channel < unknowns.wrenches()).then(|| {
             for (segment, left) in segments.iter().zip(&mut left) {
-                let drift = segment.offset_drift(unknowns, set, channel);
+                let drift = segment.offset_drift(unknowns, channel);
                 for (range, offset) in segment.ranges.iter().zip(drift) {
                     left[range.clone()].iter_mut().for_each(|x| *x += offset);
                 }
             }
-            remove_random_walk(segments, &mut left, drift_limits, channel)
+            remove_random_walk(segments, &mut left, fastest[channel])
         });
-        let (square, time) = autocorrelation_time(&left);
+        let (square, time) = noise::autocorrelation_time(&left);
         let seen: f64 = segments.iter().map(|segment| segment.seen[channel]).sum();
         let shown: f64 = segments
             .iter()
@@ -69,20 +74,10 @@ pub(crate) fn estimate_noise(
     model
 }
 
-fn autocorrelation_time(segments: &[Vec<f64>]) -> (f64, f64) {
-    let slices: Vec<&[f64]> = segments.iter().map(Vec::as_slice).collect();
-    noise::autocorrelation_time(&slices)
-}
-
 /// Removes the random walk of a channel's offset from the sums of offset and noise. Returns the
 /// variances of its step between blocks, and of a row for which block means have the variance that
 /// was found for them beside it.
-fn remove_random_walk(
-    segments: &[Residuals],
-    left: &mut [Vec<f64>],
-    drift_limits: &DriftLimits,
-    channel: usize,
-) -> (f64, f64) {
+fn remove_random_walk(segments: &[Residuals], left: &mut [Vec<f64>], fastest: f64) -> (f64, f64) {
     let mut means: Vec<noise::BlockMeans> = Vec::new();
     let (mut used, mut filled) = (0usize, 0usize);
     for (segment, left) in segments.iter().zip(&*left) {
@@ -105,8 +100,9 @@ fn remove_random_walk(
         let merge = |means: &noise::BlockMeans| means.chunks(merged).map(mean).collect();
         let longer: Vec<noise::BlockMeans> = means.iter().map(merge).collect();
         let count = merged as f64;
-        let fastest = drift_limits.rates[channel] * BLOCK * count;
-        let mut bound = (drift_limits.relative * count * count).min(1.0);
+        let fastest = fastest * BLOCK * count;
+        // The greatest variance of a step, relative to that of a mean's noise.
+        let mut bound = ((BLOCK / DRIFT_TIME).powi(2) * count * count).min(1.0);
         for _ in 0..4 {
             (step, variance) = noise::random_walk(&longer, bound);
             if step <= fastest {
@@ -128,7 +124,7 @@ fn remove_random_walk(
                 }
             }
         }
-        let (_, time) = autocorrelation_time(left);
+        let (_, time) = noise::autocorrelation_time(left);
         merged = ((INDEPENDENT * time / per_block).round() as usize).clamp(1, LONGEST);
     }
     (step, variance * per_block)
@@ -140,7 +136,7 @@ fn remove_random_walk(
 /// each channel has at least half the mean noise of these channels, relative to the stated noise.
 fn alike(unknowns: &Unknowns, segments: &[Residuals], model: &NoiseModel) -> Vec<f64> {
     const MIN_SHARE: f64 = 0.5;
-    let wrenches = 6 * unknowns.sensors.len();
+    let wrenches = unknowns.wrenches();
     let relative =
         |c: usize| (model.square[c] * model.time[c]).max(model.block[c]) / model.least[c];
     let mut least = model.least.clone();

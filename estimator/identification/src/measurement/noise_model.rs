@@ -4,15 +4,6 @@ use crate::measurement::unknowns::Unknowns;
 use proprio_topics::Nanos;
 use std::collections::BTreeMap;
 
-/// Upper limits of the drift rates of offsets (random walk).
-#[derive(Clone, Debug)]
-pub(crate) struct DriftLimits {
-    /// The greatest variance of a step between blocks, relative to that of a block's noise.
-    pub relative: f64,
-    /// Per channel of F/T sensors, the greatest rate [unit^2/s].
-    pub rates: Vec<f64>,
-}
-
 /// The noise of all channels.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct NoiseModel {
@@ -115,7 +106,7 @@ impl NoiseModel {
         let (own, others) = (self.inflated(), other.inflated());
         let of_seconds = (other.seconds.mean() / self.seconds.mean()).ln();
         let of_channel = |&c: &usize| {
-            let varies = c < 6 * unknowns.sensors.len();
+            let varies = c < unknowns.wrenches();
             (others[c] / own[c]).ln() + if varies { of_seconds } else { 0.0 }
         };
         let sum: f64 = channels.iter().map(of_channel).sum();
@@ -159,12 +150,12 @@ impl NoiseModel {
         unknowns: &Unknowns,
         variances: &[f64],
         (log, t): (Option<usize>, Nanos),
-        out: &mut Vec<f64>,
-    ) {
-        let (factor, channels) = (self.seconds.factor(log, t), 6 * unknowns.sensors.len());
-        out.clear();
-        out.extend_from_slice(variances);
-        out[..channels].iter_mut().for_each(|x| *x *= factor);
+    ) -> Vec<f64> {
+        let (mut own, factor) = (variances.to_vec(), self.seconds.factor(log, t));
+        own[..unknowns.wrenches()]
+            .iter_mut()
+            .for_each(|x| *x *= factor);
+        own
     }
 }
 

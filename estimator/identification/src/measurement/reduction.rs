@@ -9,7 +9,6 @@ use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::Unknowns;
-use crate::parallel;
 use nalgebra::{DMatrix, DVector};
 use std::ops::Range;
 
@@ -28,8 +27,8 @@ const PANEL: usize = 96;
 /// Blocks that one thread processes at a time.
 const BLOCKS_PER_TASK: usize = 16;
 
-/// Number of such batches whose rows are kept in memory.
-const AT_ONCE: usize = 32;
+/// Number of blocks whose rows are kept in memory.
+const AT_ONCE: usize = 512;
 
 /// Consecutive observations of one log, with their own offsets and friction.
 #[derive(Clone, Copy, Debug)]
@@ -49,7 +48,7 @@ impl<'a> LogSegment<'a> {
 
 /// Prior variances of the nuisance parameters.
 pub(crate) fn nuisance_prior(unknowns: &Unknowns) -> Vec<f64> {
-    let mut prior = vec![OFFSET_VARIANCE; 6 * unknowns.sensors.len()];
+    let mut prior = vec![OFFSET_VARIANCE; unknowns.wrenches()];
     prior.resize(unknowns.nuisance(), FRICTION_VARIANCE);
     prior
 }
@@ -82,13 +81,12 @@ pub(crate) fn reduce(
     segment: LogSegment<'_>,
     noise: &NoiseModel,
 ) -> ReducedLog {
-    reduce_with(measurement, segment, noise, &[], 0, &mut |_, _, _, _| ())
+    reduce_with(measurement, segment, noise, &[], 0, &|_, _, _| Vec::new())
 }
 
-/// Writes extra columns of an observation's rows, row by row, given its number in the segment and
-/// its rows.
-type ExtraColumns<'a> =
-    dyn FnMut(&mut MeasurementModel<'_>, usize, &MeasurementRows, &mut [f64]) + 'a;
+/// Extra columns of an observation's rows, row by row, given its number in the segment and the
+/// rows.
+type ExtraColumns<'a> = dyn Fn(&mut MeasurementModel<'_>, usize, &MeasurementRows) -> Vec<f64> + 'a;
 
 /// As [`reduce`], without the observations flagged in `excluded` (all are used if it is empty), and
 /// with `width` extra columns after those of `d`.
@@ -98,18 +96,16 @@ pub(crate) fn reduce_with(
     noise: &NoiseModel,
     excluded: &[bool],
     width: usize,
-    columns: &mut ExtraColumns<'_>,
+    columns: &ExtraColumns<'_>,
 ) -> ReducedLog {
     let unknowns = measurement.unknowns().clone();
     let links = unknowns.parameters();
     let p = links + width;
     let variances = noise.inflated();
     let mut nuisance = NuisanceFilter::new(&nuisance_prior(&unknowns), p + 1);
-    let mut rows = MeasurementRows::new(&unknowns);
     let mut information = Information::new(p);
     let mut panel = Panel::new(p, PANEL);
     let mut line = vec![0.0; p + 1];
-    let (mut slopes, mut own) = (Vec::new(), Vec::new());
     let mut last = None;
     for range in blocks(segment.instants, BLOCK) {
         let t = segment.instants[range.start].t;
@@ -117,19 +113,13 @@ pub(crate) fn reduce_with(
             nuisance.drift(&noise.steps(&unknowns, (t - last).seconds()));
         }
         for number in range {
-            if excluded.get(number) == Some(&true)
-                || measurement
-                    .compute_rows(&segment.instants[number], &mut rows)
-                    .is_err()
-            {
+            if excluded.get(number) == Some(&true) {
                 continue;
             }
-            slopes.clear();
-            slopes.resize(rows.count * width, 0.0);
-            columns(measurement, number, &rows, &mut slopes);
-            let t = segment.instants[number].t;
-            noise.at(&unknowns, &variances, (segment.log, t), &mut own);
-            rows.whiten_with(&own, &mut slopes, width);
+            let mut rows = measurement.rows(&segment.instants[number]);
+            let mut slopes = columns(measurement, number, &rows);
+            let at = (segment.log, segment.instants[number].t);
+            rows.whiten_with(&noise.at(&unknowns, &variances, at), &mut slopes, width);
             for row in 0..rows.count {
                 line[..links].copy_from_slice(rows.a(row));
                 line[links..p].copy_from_slice(&slopes[row * width..][..width]);
@@ -178,18 +168,18 @@ impl Residuals {
         self.measured[channel].iter().any(|x| x.is_finite())
     }
 
-    /// The drift of a channel's offset about its mean, per block. Drifts of several sensors that
-    /// rows mix are shared as their noise is. (Otherwise the sensor with the greatest assumed drift
-    /// rate would get all of it.)
-    pub(crate) fn offset_drift(&self, unknowns: &Unknowns, set: usize, channel: usize) -> Vec<f64> {
+    /// The drift of a channel's offset about its mean, per block, for the first set. Drifts of
+    /// several sensors that rows mix are shared as their noise is. (Otherwise the sensor with the
+    /// greatest assumed drift rate would get all of it.)
+    pub(crate) fn offset_drift(&self, unknowns: &Unknowns, channel: usize) -> Vec<f64> {
         let mut sum = vec![0.0; self.nuisance.len()];
-        for other in 0..6 * unknowns.sensors.len() {
+        for other in 0..unknowns.wrenches() {
             let share = self.shares[(channel, other)];
             if share == 0.0 {
                 continue;
             }
             let unknown = unknowns.offset_of(other);
-            let values = self.nuisance.iter().map(|block| block.x[(unknown, set)]);
+            let values = self.nuisance.iter().map(|block| block.x[(unknown, 0)]);
             let mean = values.clone().sum::<f64>() / self.nuisance.len() as f64;
             for (sum, value) in sum.iter_mut().zip(values) {
                 *sum += share * (value - mean);
@@ -211,43 +201,26 @@ pub(crate) fn filter_nuisance(
     let k = sets.len();
     let variances = noise.offset_tracking_variances();
     let mut nuisance = NuisanceFilter::new(&nuisance_prior(&unknowns), k);
-    let make = || (measurement.clone(), MeasurementRows::new(&unknowns));
     let (mut states, mut last) = (Vec::new(), None);
     let blocks = blocks(segment.instants, BLOCK);
-    for some in blocks.chunks(AT_ONCE * BLOCKS_PER_TASK) {
+    for some in blocks.chunks(AT_ONCE) {
         // Per row: the residual of every set, and the coefficients of the nuisance parameters.
         let width = k + unknowns.nuisance();
-        let shares: Vec<_> = some.chunks(BLOCKS_PER_TASK).collect();
-        let lines = parallel::map_with(
-            shares.len(),
-            make,
-            |(measurement, rows), number| -> Vec<Vec<f64>> {
-                let mut own = Vec::new();
-                let of_block = |range: &Range<usize>| {
-                    let mut lines = Vec::new();
-                    for observation in &segment.instants[range.clone()] {
-                        if measurement.compute_rows(observation, rows).is_err() {
-                            continue;
-                        }
-                        noise.at(
-                            &unknowns,
-                            &variances,
-                            (segment.log, observation.t),
-                            &mut own,
-                        );
-                        rows.whiten(&own);
-                        for row in 0..rows.count {
-                            let sets = sets.iter().map(DVector::as_slice);
-                            lines.extend(sets.map(|set| rows.without_bodies(row, set)));
-                            lines.extend_from_slice(rows.g(row));
-                        }
-                    }
-                    lines
-                };
-                shares[number].iter().map(of_block).collect()
-            },
-        );
-        for (range, mut lines) in some.iter().zip(lines.into_iter().flatten()) {
+        let lines = measurement.map(some, |measurement, range| {
+            let mut lines = Vec::new();
+            for observation in &segment.instants[range.clone()] {
+                let mut rows = measurement.rows(observation);
+                let at = (segment.log, observation.t);
+                rows.whiten(&noise.at(&unknowns, &variances, at));
+                for row in 0..rows.count {
+                    let sets = sets.iter().map(DVector::as_slice);
+                    lines.extend(sets.map(|set| rows.without_bodies(row, set)));
+                    lines.extend_from_slice(rows.g(row));
+                }
+            }
+            lines
+        });
+        for (range, mut lines) in some.iter().zip(lines) {
             let t = segment.instants[range.start].t;
             let mut drift = vec![0.0; unknowns.nuisance()];
             if let Some(last) = last.replace(t) {
@@ -290,17 +263,14 @@ pub(crate) fn residuals(
         cad,
         variances: noise.offset_tracking_variances(),
     };
-    let parts = parallel::map_with(
-        ranges.len().div_ceil(BLOCKS_PER_TASK),
-        || (measurement.clone(), MeasurementRows::new(unknowns)),
-        |(measurement, rows), at| {
+    let tasks = ranges.chunks(BLOCKS_PER_TASK);
+    let parts = measurement.map(
+        tasks.zip(states.chunks(BLOCKS_PER_TASK)),
+        |measurement, blocks| {
             let mut sums = ResidualSums::new(channels);
-            for block in at * BLOCKS_PER_TASK..ranges.len().min((at + 1) * BLOCKS_PER_TASK) {
-                for observation in &segment.instants[ranges[block].clone()] {
-                    if measurement.compute_rows(observation, rows).is_err() {
-                        rows.clear();
-                    }
-                    pass.add(rows, &states[block], &mut sums);
+            for (range, state) in blocks.0.iter().zip(blocks.1) {
+                for observation in &segment.instants[range.clone()] {
+                    pass.add(measurement.rows(observation), state, &mut sums);
                 }
             }
             sums
@@ -338,7 +308,7 @@ pub(crate) fn residuals(
     }
 }
 
-/// What the pass over some observations gives, and its buffers.
+/// What the pass over some observations gives.
 struct ResidualSums {
     /// Per observation and channel: the residual of each set, the prediction of the first set, the
     /// measurement.
@@ -347,8 +317,6 @@ struct ResidualSums {
     shares: Vec<f64>,
     /// Number of observations in which any row has a channel.
     seen: Vec<f64>,
-    white: Vec<f64>,
-    noise: Vec<f64>,
 }
 
 impl ResidualSums {
@@ -357,8 +325,6 @@ impl ResidualSums {
             values: Vec::new(),
             shares: vec![0.0; channels * channels],
             seen: vec![0.0; channels],
-            white: Vec::new(),
-            noise: vec![0.0; channels],
         }
     }
 }
@@ -374,13 +340,11 @@ struct ResidualPass<'a> {
 
 impl ResidualPass<'_> {
     /// Adds an observation with these rows, given the nuisance parameters of all sets.
-    fn add(&self, rows: &mut MeasurementRows, state: &NuisanceEstimate, sums: &mut ResidualSums) {
+    fn add(&self, mut rows: MeasurementRows, state: &NuisanceEstimate, sums: &mut ResidualSums) {
         let ResidualSums {
             values,
             shares,
             seen,
-            white,
-            noise,
         } = sums;
         let (k, channels, start) = (self.sets.len(), seen.len(), values.len());
         values.resize(start + (k + 2) * channels, f64::NAN);
@@ -389,9 +353,8 @@ impl ResidualPass<'_> {
         let there: Vec<usize> = (0..channels).filter(|&channel| rows.has(channel)).collect();
         there.iter().for_each(|&channel| seen[channel] += 1.0);
         let mut write = |column: usize, of_row: &dyn Fn(usize) -> f64| {
-            white.clear();
-            white.extend((0..rows.count).map(of_row));
-            rows.channel_noise(&self.variances, white, noise);
+            let white = (0..rows.count).map(of_row).collect();
+            let noise = rows.channel_noise(&self.variances, white);
             for &channel in &there {
                 values[start + column * channels + channel] = noise[channel];
             }
@@ -411,7 +374,6 @@ pub(crate) mod tests {
     use crate::arithmetic::normals;
     use crate::dataset::observation::Observation;
     use crate::measurement::noise_estimate::estimate_noise;
-    use crate::measurement::noise_model::DriftLimits;
     use crate::measurement::noise_model::Seconds;
     use crate::robot::{IdentificationInput, Robot};
     use nalgebra::{Matrix6, Vector6};
@@ -560,13 +522,10 @@ pub(crate) mod tests {
             instants.iter(),
         )
         .expect("rows");
-        let mut rows = MeasurementRows::new(measurement.unknowns());
         let mut offset = [0.0; 12];
         for observation in &mut instants {
             // r = 0 for G m + r(0) = 0: the foot's reading is chosen, the hip's follows.
-            measurement
-                .compute_rows(observation, &mut rows)
-                .expect("rows");
+            let rows = measurement.rows(observation);
             assert_eq!(rows.count, 6);
             let g = |first: usize| Matrix6::from_fn(|i, j| rows.g(i)[first + j]);
             let foot = Vector6::new(0.5, -0.3, 0.2, 3.0, -2.0, 20.0);
@@ -604,13 +563,10 @@ pub(crate) mod tests {
         let mut noise = NoiseModel::unknown(least.clone());
         let segment = LogSegment::alone(instants);
         let zero = DVector::zeros(unknowns.parameters());
-        let walks = DriftLimits {
-            relative: 0.01,
-            rates: vec![f64::INFINITY; 12],
-        };
+        let fastest = [f64::INFINITY; 12];
         for _ in 0..rounds {
             let left = residuals(&measurement, segment, &noise, std::slice::from_ref(&zero));
-            noise = estimate_noise(&unknowns, std::slice::from_ref(&left), 0, &walks, &least);
+            noise = estimate_noise(&unknowns, std::slice::from_ref(&left), &fastest, &least);
         }
         noise
     }
@@ -635,7 +591,6 @@ pub(crate) mod tests {
             link.and_then(|link| robot.structure.subtree_of(link))
                 .expect("a sub-tree")
         };
-        let mut rows = MeasurementRows::new(measurement.unknowns());
         for (disturbed, expected) in [
             (None, 2),
             (Some(of_link("base")), 2),
@@ -647,11 +602,7 @@ pub(crate) mod tests {
             disturbed
                 .into_iter()
                 .for_each(|unit| observation.disturbed.insert(unit));
-            measurement
-                .compute_rows(&observation, &mut rows)
-                .expect("rows");
-            let mut own = MeasurementRows::new(measurement.unknowns());
-            rows.copy_unit(Observation::TORQUES, &mut own);
+            let own = measurement.rows(&observation).of_unit(Observation::TORQUES);
             assert_eq!(own.count, expected, "rows with {disturbed:?}");
             if disturbed != Some(Observation::TORQUES) {
                 let errors = measurement

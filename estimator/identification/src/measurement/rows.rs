@@ -3,13 +3,14 @@
 use crate::arithmetic::{add_multiple, dot, factorise, forward};
 use crate::measurement::unknowns::Unknowns;
 
-/// The rows of one observation; reusable buffers.
+/// The rows of one observation.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct MeasurementRows {
     pub count: usize,
     pub(crate) parameters: usize,
     pub(crate) nuisance: usize,
     pub(crate) channels: usize,
+    wrenches: usize,
     pub(crate) a: Vec<f64>,
     pub(crate) r: Vec<f64>,
     pub(crate) g: Vec<f64>,
@@ -26,21 +27,8 @@ impl MeasurementRows {
             parameters: unknowns.parameters(),
             nuisance: unknowns.nuisance(),
             channels: unknowns.channels(),
+            wrenches: unknowns.wrenches(),
             ..Self::default()
-        }
-    }
-
-    pub(crate) fn clear(&mut self) {
-        self.count = 0;
-        self.units.clear();
-        for part in [
-            &mut self.a,
-            &mut self.r,
-            &mut self.g,
-            &mut self.n,
-            &mut self.factor,
-        ] {
-            part.clear();
         }
     }
 
@@ -61,16 +49,23 @@ impl MeasurementRows {
         )
     }
 
-    /// Copies the rows of one unit into `out`, before whitening.
-    pub(crate) fn copy_unit(&self, unit: usize, out: &mut Self) {
-        out.clear();
+    /// The rows of one unit, before whitening.
+    pub(crate) fn of_unit(&self, unit: usize) -> Self {
+        let mut own = Self {
+            parameters: self.parameters,
+            nuisance: self.nuisance,
+            channels: self.channels,
+            wrenches: self.wrenches,
+            ..Self::default()
+        };
         for row in (0..self.count).filter(|&row| self.units[row] == unit) {
-            let (a, r, g, n) = out.push(unit);
+            let (a, r, g, n) = own.push(unit);
             a.copy_from_slice(self.a(row));
             *r = self.r(row);
             g.copy_from_slice(self.g(row));
             n.copy_from_slice(self.n(row));
         }
+        own
     }
 
     pub(crate) fn a(&self, row: usize) -> &[f64] {
@@ -134,13 +129,13 @@ impl MeasurementRows {
 
     /// The most likely noise of each channel, given whitened residuals of all rows: `diag(v) N^T
     /// W^-1 rho` (Gauss, Markov); zero for channels in no row.
-    pub(crate) fn channel_noise(&self, variances: &[f64], whitened: &mut [f64], out: &mut [f64]) {
+    pub(crate) fn channel_noise(&self, variances: &[f64], mut whitened: Vec<f64>) -> Vec<f64> {
         let m = self.count;
         for i in (0..m).rev() {
             let below = (i + 1..m).map(|k| self.factor[k * m + i] * whitened[k]);
             whitened[i] = (whitened[i] - below.sum::<f64>()) / self.factor[i * m + i];
         }
-        out.fill(0.0);
+        let mut out = vec![0.0; self.channels];
         for (row, weight) in whitened.iter().enumerate() {
             for (sum, entry) in out.iter_mut().zip(self.n(row)) {
                 *sum += weight * entry;
@@ -149,6 +144,7 @@ impl MeasurementRows {
         for (value, variance) in out.iter_mut().zip(variances) {
             *value *= variance;
         }
+        out
     }
 
     /// Adds `diag(v) N^T W^-1 N` to `sum` (channels by channels, row by row): how
@@ -174,10 +170,9 @@ impl MeasurementRows {
         }
     }
 
-    /// The joint of a torque row; None for other rows. `offsets`: number of channels before those
-    /// of joints.
-    pub(crate) fn joint(&self, row: usize, offsets: usize) -> Option<usize> {
-        let torques = &self.n(row)[offsets..];
+    /// The joint of a torque row; None for other rows.
+    pub(crate) fn joint(&self, row: usize) -> Option<usize> {
+        let torques = &self.n(row)[self.wrenches..];
         torques.iter().position(|entry| *entry != 0.0)
     }
 

@@ -37,9 +37,8 @@ impl Seconds {
         unknowns: &Unknowns,
         segments: &[LogSegment<'_>],
         residuals: &[Residuals],
-        set: usize,
     ) -> Self {
-        let channels = 6 * unknowns.sensors.len();
+        let channels = unknowns.wrenches();
         // Per second and channel: sum of squares, number of readings.
         let mut sums: BTreeMap<(usize, i64), Vec<(f64, f64)>> = BTreeMap::new();
         for (segment, residuals) in segments.iter().zip(residuals) {
@@ -47,7 +46,7 @@ impl Seconds {
             for (i, instant) in segment.instants.iter().enumerate() {
                 let own = sums.entry((log, second(instant.t)));
                 let own = own.or_insert_with(|| vec![(0.0, 0.0); channels]);
-                for (sum, noise) in own.iter_mut().zip(&residuals.noise[set]) {
+                for (sum, noise) in own.iter_mut().zip(&residuals.noise[0]) {
                     if noise[i].is_finite() {
                         *sum = (sum.0 + noise[i] * noise[i], sum.1 + 1.0);
                     }
@@ -67,7 +66,7 @@ impl Seconds {
         segments: &[LogSegment<'_>],
         residuals: &mut [Residuals],
     ) {
-        let channels = 6 * unknowns.sensors.len();
+        let channels = unknowns.wrenches();
         for (segment, residuals) in segments.iter().zip(residuals) {
             for (i, instant) in segment.instants.iter().enumerate() {
                 let root = self.factor(segment.log, instant.t).sqrt();

@@ -104,19 +104,24 @@ impl Unknowns {
             .collect()
     }
 
+    /// Number of channels of F/T sensors, and of their offsets: they come before those of joints.
+    pub(crate) fn wrenches(&self) -> usize {
+        6 * self.sensors.len()
+    }
+
     /// Number of nuisance parameters.
     pub(crate) fn nuisance(&self) -> usize {
-        6 * self.sensors.len() + FRICTION * self.joints.len()
+        self.wrenches() + FRICTION * self.joints.len()
     }
 
     /// Number of channels.
     pub(crate) fn channels(&self) -> usize {
-        6 * self.sensors.len() + self.joints.len()
+        self.wrenches() + self.joints.len()
     }
 
     /// The factor that converts a channel's unit to Nm.
     pub(crate) fn scale(&self, channel: usize) -> f64 {
-        if channel < 6 * self.sensors.len() && channel % 6 >= 3 {
+        if channel < self.wrenches() && channel % 6 >= 3 {
             Structure::LENGTH_SCALE
         } else {
             1.0
@@ -131,11 +136,9 @@ impl Unknowns {
 
     /// The nuisance parameter that is the offset of a channel.
     pub(crate) fn offset_of(&self, channel: usize) -> usize {
-        let wrenches = 6 * self.sensors.len();
-        if channel < wrenches {
-            channel
-        } else {
-            wrenches + FRICTION * (channel - wrenches) + 2
+        match channel.checked_sub(self.wrenches()) {
+            None => channel,
+            Some(joint) => self.wrenches() + FRICTION * joint + 2,
         }
     }
 }

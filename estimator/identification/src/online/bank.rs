@@ -128,8 +128,6 @@ pub(crate) fn bits(components: impl Iterator<Item = usize>) -> u64 {
 pub(crate) struct Bank {
     equations: TickEquations,
     units: Vec<SubtreeHypotheses>,
-    /// The stated variances of each sensor's channels, [torque; force].
-    variances: Vec<[f64; 6]>,
     waiting: Vec<Tick>,
     /// The last [`LATEST`], waiting or not.
     latest: Vec<Tick>,
@@ -147,6 +145,8 @@ struct TickEquations {
     stacked: StackedRegressor,
     solver: Solver,
     motion: SeenMotion,
+    /// The stated variances of each sensor's channels, [torque; force].
+    variances: Vec<[f64; 6]>,
 }
 
 impl Bank {
@@ -175,8 +175,8 @@ impl Bank {
         let stated = sensors.map(|cut| stated_noise(cut).map(|sigma| sigma * sigma));
         Ok(Self {
             units,
-            variances: stated.collect(),
             equations: TickEquations {
+                variances: stated.collect(),
                 kinematics: Kinematics::new(model, robot.base_link)?,
                 stacked,
                 solver: Solver::new(structure),
@@ -227,7 +227,7 @@ impl Bank {
                 }
                 let units = self.units.iter_mut().zip(&shifted);
                 for (unit, shifted) in units.filter(|(unit, _)| is_learnt(unit.component)) {
-                    let rows = self.equations.rows(unit, &tick, shifted, &self.variances);
+                    let rows = self.equations.rows(unit, &tick, shifted);
                     for fit in unit.fits.iter_mut().filter(|fit| fit.view == view) {
                         fit.add(&unit.columns, &rows);
                     }
@@ -263,7 +263,7 @@ impl Bank {
             let mut fits = unit.changes();
             for tick in &rejected {
                 if self.equations.update(tick, MotionReading::AsStated) {
-                    let rows = self.equations.rows(unit, tick, &[], &self.variances);
+                    let rows = self.equations.rows(unit, tick, &[]);
                     for fit in &mut fits {
                         fit.add(&unit.columns, &rows);
                     }
@@ -396,7 +396,6 @@ impl TickEquations {
         unit: &SubtreeHypotheses,
         tick: &'a Tick,
         shifted: &'a [Vector6<f64>],
-        variances: &'a [[f64; 6]],
     ) -> TickRows<'a> {
         TickRows {
             rows: &self.stacked.subtrees()[unit.subtree],
@@ -404,7 +403,7 @@ impl TickEquations {
             kinematics: &self.kinematics,
             readings: &tick.readings,
             shifted,
-            variances,
+            variances: &self.variances,
         }
     }
 

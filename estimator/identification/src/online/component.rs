@@ -4,7 +4,7 @@ use crate::arithmetic::{add_multiple, dot, factorise, forward};
 use crate::linear::information::{Information, Panel};
 use crate::linear::simd::{self, VECTORS};
 use crate::online::channel::NoiseTracker;
-use crate::online::rows::{ComponentColumns, RowBuffer, WhitenedRows, spread};
+use crate::online::rows::{RowBuffer, SubtreeColumns, WhitenedRows, most_rows, row_kinds, spread};
 use crate::online::solution::{
     BLOCK, ComponentSolution, DetectedChange, ObservationCounts, OnlineObservation, Paused,
 };
@@ -66,7 +66,8 @@ pub(crate) struct ComponentLayout {
     pub(crate) intermittent: ContactSet,
     /// CAD and configured offsets, `[s | d]`.
     pub(crate) reference: Vec<f64>,
-    pub(crate) columns: ComponentColumns,
+    /// The kinds of its rows.
+    pub(crate) kinds: Vec<SubtreeColumns>,
     /// Columns of the links at the ends of its limbs.
     pub(crate) outermost: Vec<usize>,
     /// The links that carry the sensors.
@@ -81,10 +82,9 @@ pub(crate) struct Component {
     pub(crate) layout: Arc<ComponentLayout>,
     pub(crate) information: Information,
     pub(crate) panel: Panel,
-    /// For a large component, the information of its limbs since the last merge.
-    pub(crate) limbs: Vec<Limb>,
-    /// The limb that takes the rows of each kind, if any.
-    pub(crate) limb_of: Vec<Option<usize>>,
+    /// Per kind of rows, for a large component: the limb that takes them, if any, with its
+    /// information since the last merge.
+    pub(crate) limbs: Vec<Option<Limb>>,
     /// Time of drift that the information does not include yet, and its limit [s].
     pub(crate) drift_time: f64,
     pub(crate) drift_interval: f64,
@@ -177,7 +177,7 @@ impl ComponentLayout {
                 .fold(ContactSet::default(), |all, own| all.union(own))
                 .difference(&robot.always),
             reference: of_sensors.chain(of_links).collect(),
-            columns: ComponentColumns::new(stacked, &subtrees, &sensors, &links),
+            kinds: row_kinds(stacked, &subtrees, &sensors, &links),
             outermost: outermost.collect(),
             carriers: sensors.iter().map(|&s| cuts[s].joint() + 1).collect(),
             deviations: deviations.collect(),
@@ -214,25 +214,25 @@ impl Component {
         per_block: usize,
         period: f64,
     ) -> Self {
-        let (columns, unknowns) = (&layout.columns, layout.reference.len());
-        let (offset_count, most) = (layout.offset_count(), columns.most());
-        let (mut limbs, mut limb_of) = (Vec::new(), Vec::new());
-        for own in columns.iter() {
+        let (kinds, unknowns) = (&layout.kinds, layout.reference.len());
+        let (offset_count, most) = (layout.offset_count(), most_rows(kinds));
+        let limb = |own: &SubtreeColumns| {
             let is_limb = unknowns >= LARGE && 2 * own.columns.len() <= unknowns;
-            limb_of.push(is_limb.then_some(limbs.len()));
-            if is_limb {
-                limbs.push(Limb::new(own.columns.clone(), 6 * per_block));
-            }
-        }
+            is_limb.then(|| Limb::new(own.columns.clone(), 6 * per_block))
+        };
+        let limbs: Vec<Option<Limb>> = kinds.iter().map(limb).collect();
         let noise: Vec<(f64, f64)> = (layout.trackers(period).iter())
             .map(NoiseTracker::noise)
             .collect();
         let variances: Vec<f64> = noise.iter().map(|(variance, _)| *variance).collect();
         Self {
-            drift_interval: if limbs.is_empty() { 0.0 } else { GATHERED },
+            drift_interval: if limbs.iter().any(Option::is_some) {
+                GATHERED
+            } else {
+                0.0
+            },
             drift_time: 0.0,
             limbs,
-            limb_of,
             information: Information::new(unknowns),
             panel: Panel::new(unknowns, most * per_block),
             whitened: variances.clone(),
@@ -240,10 +240,10 @@ impl Component {
             drift_rates: noise.iter().map(|(_, rate)| *rate).collect(),
             offsets: (0..offset_count).collect(),
             deviations: vec![0.0; offset_count],
-            gathered: RowBuffer::new(columns, per_block),
-            pending: RowBuffer::new(columns, per_block),
-            learnt: RowBuffer::new(columns, per_job),
-            rejected_rows: RowBuffer::new(columns, per_job),
+            gathered: RowBuffer::new(kinds, per_block),
+            pending: RowBuffer::new(kinds, per_block),
+            learnt: RowBuffer::new(kinds, per_job),
+            rejected_rows: RowBuffer::new(kinds, per_job),
             block_from: Nanos::MIN,
             last_drift: Nanos::MIN,
             active: ContactSet::default(),
@@ -261,7 +261,7 @@ impl Component {
             counts: ObservationCounts::default(),
             motion: 0.0,
             rows: 0,
-            current_rows: WhitenedRows::new(columns),
+            current_rows: WhitenedRows::new(kinds, offset_count),
             row: vec![0.0; unknowns],
             scratch: GateBuffers {
                 covariance: vec![0.0; most * most],
@@ -356,8 +356,8 @@ impl Component {
             return;
         }
         self.seen = t;
-        let (columns, reference) = (&self.layout.columns, &self.layout.reference);
-        let made = (self.current_rows).make(columns, stacked, reference, &self.variances);
+        let (kinds, reference) = (&self.layout.kinds, &self.layout.reference);
+        let made = (self.current_rows).make(kinds, stacked, reference, &self.variances);
         if made == 0 {
             self.paused = Paused::Contact;
             self.counts.contact += 1;
@@ -462,7 +462,7 @@ impl Component {
 
     /// Merges the limbs' information.
     pub(crate) fn join(&mut self) {
-        for limb in &mut self.limbs {
+        for limb in self.limbs.iter_mut().flatten() {
             if limb.information.rows() > 0 {
                 // The sizes match by construction.
                 let (panel, row) = (&mut self.panel, &mut self.row);
@@ -474,16 +474,10 @@ impl Component {
     /// Absorbs the pending block.
     pub(crate) fn absorb(&mut self) {
         // The rows are finite, and there is room.
-        for ((kind, rows), limb) in self
-            .layout
-            .columns
-            .iter()
-            .zip(self.pending.iter())
-            .zip(&self.limb_of)
-        {
-            let mut limb = limb.and_then(|limb| self.limbs.get_mut(limb));
+        let kinds = self.layout.kinds.iter().zip(&mut self.limbs);
+        for ((kind, limb), rows) in kinds.zip(self.pending.iter()) {
             for (a, y, _) in rows.iter() {
-                if let Some(limb) = &mut limb {
+                if let Some(limb) = limb {
                     let _ = limb.panel.push_row(a, y);
                 } else if a.len() == self.row.len() {
                     let _ = self.panel.push_row(a, y);
@@ -494,7 +488,7 @@ impl Component {
             }
         }
         let _ = self.information.absorb(&mut self.panel);
-        for limb in &mut self.limbs {
+        for limb in self.limbs.iter_mut().flatten() {
             let _ = limb.information.absorb(&mut limb.panel);
         }
         let observations = self.pending.observations();
@@ -512,7 +506,7 @@ impl Component {
     /// Whether the mean innovation of the gathered block exceeds what noise, the uncertainty of the
     /// solution in use, and the drift of the offsets up to `t` since its data explain.
     pub(crate) fn exceeds_gate(&mut self, known: &ComponentSolution, t: Nanos) -> bool {
-        let unknowns = self.layout.columns.unknowns();
+        let unknowns = self.layout.reference.len();
         let offset_count = self.offsets.len();
         let root_time = (t - known.data).seconds().max(0.0).sqrt();
         let projected_width = unknowns + offset_count;
@@ -526,7 +520,7 @@ impl Component {
             innovations,
         } = &mut self.scratch;
         let mut m = 0;
-        for (kind, rows) in self.layout.columns.iter().zip(self.gathered.iter()) {
+        for (kind, rows) in self.layout.kinds.iter().zip(self.gathered.iter()) {
             // The observations of a block have equally many rows with the same meaning: their sum
             // over the root of their number has unit noise.
             let Some(first) = rows.slots().first() else {

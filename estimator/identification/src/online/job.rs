@@ -3,6 +3,7 @@
 
 use crate::arithmetic::mean;
 use crate::linear::information::{Information, Panel};
+use crate::measurement::noise_estimate::LEAST_SHARE;
 use crate::online::bank::{self, Bank, LATEST, Tick};
 use crate::online::channel::{NoiseTracker, SecondMean, SecondResiduals, take_scatters};
 use crate::online::component::{Component, ComponentLayout};
@@ -42,9 +43,6 @@ pub(crate) const SOLUTION_TOLERANCE: f64 = 1e-8;
 /// Logarithmic step of the prior's weight that needs no second fit in the same job.
 pub(crate) const SETTLED: f64 = 1e-3;
 
-/// Lower limit of a channel's share of noise, for channels mixed with others.
-pub(crate) const LEAST_SHARE: f64 = 1e-3;
-
 /// Longest series of residuals [observations]. Longer ones come from unexplained gaps.
 pub(crate) const LONGEST: usize = 100_000;
 
@@ -58,8 +56,6 @@ pub(crate) struct ComponentJob {
     pub(crate) is_disturbed: bool,
     /// Whether a sensor's offset was forgotten since the solution in use.
     pub(crate) has_new_zero: bool,
-    /// Whether something moved in this second.
-    pub(crate) is_moving: bool,
     /// [`Component::cosines`].
     pub(crate) cosines: Vec<f64>,
     /// Inflated variances of the channels.
@@ -141,7 +137,6 @@ impl ComponentJob {
             rejected_rows: component.rejected_rows.clone_room(),
             is_disturbed: false,
             has_new_zero: false,
-            is_moving: false,
             cosines: component.cosines.clone(),
             variances: component.variances.clone(),
             channels: component.layout.trackers(period.seconds()),
@@ -364,6 +359,7 @@ impl ComponentJob {
         let Some(span) = SlotRange::of(rows.into_iter()).filter(|_| is_solved) else {
             return self.take_seconds(&seconds);
         };
+        let is_moving = rows.iter().any(|rows| rows.is_moving());
         let observations = span.count;
         let (series, shown) = self.series(&rows, &span, &self.estimate);
         let mut sensitivities = self.sensitivities(&rows);
@@ -418,7 +414,7 @@ impl ComponentJob {
                     count,
                     of_bodies: of_bodies.column(channel).norm_squared(),
                     scatter,
-                    is_moving: self.is_moving,
+                    is_moving,
                 });
                 seconds[channel] = SecondResiduals {
                     mean,
@@ -452,7 +448,7 @@ impl ComponentJob {
         let mut series = vec![f64::NAN; offset_count * span.count];
         let mut shown = vec![0.0; offset_count];
         for rows in rows {
-            for (kind, rows) in self.layout.columns.iter().zip(rows.iter()) {
+            for (kind, rows) in self.layout.kinds.iter().zip(rows.iter()) {
                 for (row, right, slot) in rows.iter() {
                     let residual = kind.residual(row, right, unknowns);
                     let Some(place) = span.place(slot) else {
@@ -478,7 +474,7 @@ impl ComponentJob {
         let (offset_count, unknowns) = (self.variances.len(), self.information.unknowns());
         let mut sensitivities = DMatrix::zeros(unknowns - offset_count, offset_count);
         for rows in rows {
-            for (kind, rows) in self.layout.columns.iter().zip(rows.iter()) {
+            for (kind, rows) in self.layout.kinds.iter().zip(rows.iter()) {
                 let (width, count) = (kind.width(), rows.slots().len());
                 let all = DMatrixView::from_slice(rows.values(), width, count);
                 let weights = DMatrix::from_fn(count, kind.offsets, |row, place| {
@@ -521,7 +517,7 @@ impl ComponentJob {
         let unknowns = self.information.unknowns();
         let mut panel = Panel::new(unknowns, self.rejected_rows.len());
         let mut dense = vec![0.0; unknowns];
-        for (kind, rows) in self.layout.columns.iter().zip(self.rejected_rows.iter()) {
+        for (kind, rows) in self.layout.kinds.iter().zip(self.rejected_rows.iter()) {
             for (row, right, _) in rows.iter() {
                 spread(kind, row, &mut dense);
                 let _ = panel.push_row(&dense, right);

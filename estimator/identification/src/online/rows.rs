@@ -36,93 +36,70 @@ impl SubtreeColumns {
     }
 }
 
-/// The kinds of a component's rows, over `[s | d]`.
-#[derive(Clone, Debug)]
-pub(crate) struct ComponentColumns {
-    all: Vec<SubtreeColumns>,
-    unknowns: usize,
-    /// Number of offsets, `s`.
-    offset_count: usize,
+/// The kinds of a component's rows over `[s | d]`, for these sub-trees, sensors and links.
+pub(crate) fn row_kinds(
+    stacked: &StackedRegressor,
+    subtrees: &[usize],
+    sensors: &[usize],
+    links: &[usize],
+) -> Vec<SubtreeColumns> {
+    let offset_count = 6 * sensors.len();
+    let place = |list: &[usize], own: usize| list.binary_search(&own).unwrap_or(0);
+    // The columns of a sub-tree's regressor.
+    let columns = subtrees.iter().map(|&subtree| {
+        let subtree = &stacked.subtrees()[subtree];
+        let of_links = subtree.links().iter().flat_map(|&link| {
+            let first = offset_count + LINK_PARAMETERS * place(links, link);
+            first..first + LINK_PARAMETERS
+        });
+        let of_sensors = subtree.sensors().flat_map(|sensor| {
+            let first = 6 * place(sensors, sensor);
+            first..first + 6
+        });
+        of_links.chain(of_sensors).collect::<Vec<usize>>()
+    });
+    let mut all: Vec<SubtreeColumns> = Vec::new();
+    // Linked sub-trees have the number of the last of them.
+    let mut group: Vec<usize> = Vec::new();
+    for (number, (&subtree, own)) in subtrees.iter().zip(columns).enumerate() {
+        let sensors: Vec<usize> = stacked.subtrees()[subtree].sensors().collect();
+        for earlier in 0..number {
+            let mut others = stacked.subtrees()[all[earlier].subtree].sensors();
+            let (shares, of) = (others.any(|s| sensors.contains(&s)), group[earlier]);
+            if shares {
+                let linked = group.iter_mut().filter(|g| **g == of);
+                linked.for_each(|g| *g = number);
+            }
+        }
+        group.push(number);
+        let is_joined = |earlier: &usize| group[*earlier] == number;
+        let joined = (0..number).filter(is_joined);
+        let of_joined = joined.flat_map(|earlier| &all[earlier].columns);
+        let columns: BTreeSet<usize> = of_joined.chain(&own).copied().collect();
+        let columns: Vec<usize> = columns.into_iter().collect();
+        let places = |of: &[usize]| -> Vec<usize> {
+            let places = of.iter().map(|column| columns.binary_search(column));
+            places.filter_map(Result::ok).collect()
+        };
+        let within = (0..number).map(|earlier| match is_joined(&earlier) {
+            true => places(&all[earlier].columns),
+            false => Vec::new(),
+        });
+        let kind = SubtreeColumns {
+            offsets: columns.partition_point(|column| *column < offset_count),
+            subtree,
+            own: places(&own),
+            within: within.collect(),
+            columns,
+        };
+        all.push(kind);
+    }
+    all
 }
 
-impl ComponentColumns {
-    /// For these sub-trees with these sensors and links.
-    pub(crate) fn new(
-        stacked: &StackedRegressor,
-        subtrees: &[usize],
-        sensors: &[usize],
-        links: &[usize],
-    ) -> Self {
-        let offset_count = 6 * sensors.len();
-        let place = |list: &[usize], own: usize| list.binary_search(&own).unwrap_or(0);
-        // The columns of a sub-tree's regressor.
-        let columns = subtrees.iter().map(|&subtree| {
-            let subtree = &stacked.subtrees()[subtree];
-            let of_links = subtree.links().iter().flat_map(|&link| {
-                let first = offset_count + LINK_PARAMETERS * place(links, link);
-                first..first + LINK_PARAMETERS
-            });
-            let of_sensors = subtree.sensors().flat_map(|sensor| {
-                let first = 6 * place(sensors, sensor);
-                first..first + 6
-            });
-            of_links.chain(of_sensors).collect::<Vec<usize>>()
-        });
-        let mut all: Vec<SubtreeColumns> = Vec::new();
-        // Linked sub-trees have the number of the last of them.
-        let mut group: Vec<usize> = Vec::new();
-        for (number, (&subtree, own)) in subtrees.iter().zip(columns).enumerate() {
-            let sensors: Vec<usize> = stacked.subtrees()[subtree].sensors().collect();
-            for earlier in 0..number {
-                let mut others = stacked.subtrees()[all[earlier].subtree].sensors();
-                let (shares, of) = (others.any(|s| sensors.contains(&s)), group[earlier]);
-                if shares {
-                    let linked = group.iter_mut().filter(|g| **g == of);
-                    linked.for_each(|g| *g = number);
-                }
-            }
-            group.push(number);
-            let is_joined = |earlier: &usize| group[*earlier] == number;
-            let joined = (0..number).filter(is_joined);
-            let of_joined = joined.flat_map(|earlier| &all[earlier].columns);
-            let columns: BTreeSet<usize> = of_joined.chain(&own).copied().collect();
-            let columns: Vec<usize> = columns.into_iter().collect();
-            let places = |of: &[usize]| -> Vec<usize> {
-                let places = of.iter().map(|column| columns.binary_search(column));
-                places.filter_map(Result::ok).collect()
-            };
-            let within = (0..number).map(|earlier| match is_joined(&earlier) {
-                true => places(&all[earlier].columns),
-                false => Vec::new(),
-            });
-            let kind = SubtreeColumns {
-                offsets: columns.partition_point(|column| *column < offset_count),
-                subtree,
-                own: places(&own),
-                within: within.collect(),
-                columns,
-            };
-            all.push(kind);
-        }
-        Self {
-            all,
-            unknowns: offset_count + LINK_PARAMETERS * links.len(),
-            offset_count,
-        }
-    }
-
-    pub(crate) fn iter(&self) -> impl Iterator<Item = &SubtreeColumns> {
-        self.all.iter()
-    }
-
-    pub(crate) fn unknowns(&self) -> usize {
-        self.unknowns
-    }
-
-    /// Greatest number of rows of an observation.
-    pub(crate) fn most(&self) -> usize {
-        6 * self.all.len()
-    }
+/// Greatest number of rows of an observation.
+pub(crate) fn most_rows(kinds: &[SubtreeColumns]) -> usize {
+    6 * kinds.len()
 }
 
 /// Expands a row to all unknowns, without its right side.
@@ -146,13 +123,14 @@ pub(crate) struct WhitenedRows {
 }
 
 impl WhitenedRows {
-    pub(crate) fn new(kinds: &ComponentColumns) -> Self {
-        let most = kinds.most();
+    /// For rows of these kinds over this number of offsets.
+    pub(crate) fn new(kinds: &[SubtreeColumns], offset_count: usize) -> Self {
+        let most = most_rows(kinds);
         Self {
-            values: Vec::with_capacity(kinds.all.iter().map(|kind| 6 * kind.width()).sum()),
+            values: Vec::with_capacity(kinds.iter().map(|kind| 6 * kind.width()).sum()),
             places: Vec::with_capacity(most),
-            deviations: vec![0.0; kinds.offset_count],
-            noise: vec![0.0; most * kinds.offset_count],
+            deviations: vec![0.0; offset_count],
+            noise: vec![0.0; most * offset_count],
             covariance: vec![0.0; most * most],
         }
     }
@@ -161,14 +139,14 @@ impl WhitenedRows {
     /// the variance of each offset's channel. Returns their number.
     pub(crate) fn make(
         &mut self,
-        kinds: &ComponentColumns,
+        kinds: &[SubtreeColumns],
         stacked: &StackedRegressor,
         reference: &[f64],
         variances: &[f64],
     ) -> usize {
         self.values.clear();
         self.places.clear();
-        for (number, kind) in kinds.all.iter().enumerate() {
+        for (number, kind) in kinds.iter().enumerate() {
             let subtree = &stacked.subtrees()[kind.subtree];
             for (index, measured) in subtree.projected_measured().iter().enumerate() {
                 let start = self.values.len();
@@ -194,20 +172,20 @@ impl WhitenedRows {
     }
 
     /// Computes the factor of the rows' covariance by the noise of these variances.
-    fn factorise_noise(&mut self, kinds: &ComponentColumns, variances: &[f64]) {
+    fn factorise_noise(&mut self, kinds: &[SubtreeColumns], variances: &[f64]) {
         let count = self.places.len();
         for (deviation, variance) in self.deviations.iter_mut().zip(variances) {
             *deviation = variance.sqrt();
         }
         // Noise enters as offsets do.
-        let (offset_count, noise) = (kinds.offset_count, &mut self.noise);
+        let (offset_count, noise) = (self.deviations.len(), &mut self.noise);
         noise[..count * offset_count].fill(0.0);
         for (&(number, start), noise) in self
             .places
             .iter()
             .zip(noise.chunks_exact_mut(offset_count.max(1)))
         {
-            let kind = &kinds.all[number];
+            let kind = &kinds[number];
             for (&column, value) in kind.columns[..kind.offsets]
                 .iter()
                 .zip(&self.values[start..])
@@ -218,7 +196,7 @@ impl WhitenedRows {
         let noise = |row: usize| &noise[row * offset_count..][..offset_count];
         for (i, (number, _)) in self.places.iter().enumerate() {
             for (j, (other, _)) in self.places[..=i].iter().enumerate() {
-                let is_joined = number == other || !kinds.all[*number].within[*other].is_empty();
+                let is_joined = number == other || !kinds[*number].within[*other].is_empty();
                 self.covariance[i * count + j] = if is_joined {
                     dot(noise(i), noise(j))
                 } else {
@@ -230,18 +208,18 @@ impl WhitenedRows {
     }
 
     /// Applies the inverse of the factor from the left.
-    fn whiten(&mut self, kinds: &ComponentColumns) {
+    fn whiten(&mut self, kinds: &[SubtreeColumns]) {
         let count = self.places.len();
         for (i, &(number, start)) in self.places.iter().enumerate() {
             let (above, own) = self.values.split_at_mut(start);
-            let kind = &kinds.all[number];
+            let kind = &kinds[number];
             let own = &mut own[..kind.width()];
             for (j, &(other, from)) in self.places[..i].iter().enumerate() {
                 let weight = self.covariance[i * count + j];
                 if weight == 0.0 {
                     continue;
                 }
-                let row = &above[from..][..kinds.all[other].width()];
+                let row = &above[from..][..kinds[other].width()];
                 if number == other {
                     own.iter_mut().zip(row).for_each(|(x, y)| *x -= weight * y);
                 } else {
@@ -307,7 +285,7 @@ impl SubtreeRows {
 
 impl RowBuffer {
     /// With room for this number of observations.
-    pub(crate) fn new(kinds: &ComponentColumns, observations: usize) -> Self {
+    pub(crate) fn new(kinds: &[SubtreeColumns], observations: usize) -> Self {
         let of_kind = |kind: &SubtreeColumns| {
             let (width, room) = (kind.width(), 6 * observations);
             SubtreeRows {
@@ -318,7 +296,7 @@ impl RowBuffer {
             }
         };
         Self {
-            kinds: kinds.all.iter().map(of_kind).collect(),
+            kinds: kinds.iter().map(of_kind).collect(),
             observations: 0,
             span: 0.0,
             has_moved: false,

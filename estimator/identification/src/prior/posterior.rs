@@ -242,9 +242,7 @@ impl Posterior {
             state.centred = Some(current);
             if is_last || iterations >= NEWTON_STEPS {
                 return Ok(Descent {
-                    decrement: newton.decrement,
-                    factor: newton.factor,
-                    prior_rows: newton.prior_rows,
+                    next: newton,
                     iterations,
                     is_converged: is_converged && is_last,
                 });
@@ -386,12 +384,12 @@ impl Posterior {
         // gamma = 10 L - tr(H^-1 K), K the links' part of the prior's Hessian. With H = S^2 + K +
         // K_f, S the data's diagonal, K_f the part of the extra parameters, it follows from S and
         // K_f.
-        let inverse = blocked::inverse(descent.factor.l_dirty());
+        let inverse = blocked::inverse(descent.next.factor.l_dirty());
         let of_data = inverse.column_iter().zip(chart.scale.iter());
         let of_data: f64 = of_data
             .map(|(column, scale)| scale * scale * column.norm_squared())
             .sum();
-        let extra = descent.prior_rows.rows(10 * links, self.extra.len());
+        let extra = descent.next.prior_rows.rows(10 * links, self.extra.len());
         let of_further = self.extra.len() as f64 - (&inverse * extra.transpose()).norm_squared();
         let effective = (of_data - of_further).max(0.0);
         let residual_square = self.residual_square + chart.excess(&y);
@@ -406,7 +404,7 @@ impl Posterior {
             residual_square,
             iterations: descent.iterations,
             is_converged: descent.is_converged,
-            decrement: descent.decrement,
+            decrement: descent.next.decrement,
             maps: maps.collect(),
             expected: self.expected,
             units: self.extra.iter().map(|&(unit, _)| unit).collect(),

@@ -3,7 +3,6 @@
 
 use crate::finding::{Finding, FindingCode};
 use crate::fit::{Identified, per_column};
-use crate::measurement::model::MeasurementModel;
 use crate::measurement::unknowns::Unknowns;
 use crate::report::calibration::{calibrations, channels};
 use crate::report::comparison::Judged;
@@ -18,8 +17,13 @@ use crate::robot::Robot;
 use crate::training::{PreparedLog, training_logs};
 use nalgebra::DMatrix;
 
-/// The outcome without identified parameters: CAD's, and the reason.
-pub(crate) fn nothing(robot: &Robot, logs: &[PreparedLog], reason: String) -> Outcome {
+/// The outcome without identified parameters: CAD's, and the reason, with what was found.
+pub(crate) fn nothing(
+    robot: &Robot,
+    logs: &[PreparedLog],
+    reason: String,
+    found: Vec<Finding>,
+) -> Outcome {
     let logs = logs.iter().map(|log| LogOutcome {
         file: log.file.clone(),
         role: log.role,
@@ -41,7 +45,7 @@ pub(crate) fn nothing(robot: &Robot, logs: &[PreparedLog], reason: String) -> Ou
         tau: f64::NAN,
         condition: f64::NAN,
         logs: logs.collect(),
-        findings: vec![finding],
+        findings: std::iter::once(finding).chain(found).collect(),
         verdict: Verdict::Nothing(reason),
         ..Outcome::default()
     }
@@ -50,12 +54,11 @@ pub(crate) fn nothing(robot: &Robot, logs: &[PreparedLog], reason: String) -> Ou
 /// The whole outcome; with what the search for errors of the set-up `found`, and the time offset of
 /// every stream.
 pub(crate) fn outcome(
-    measurement: &MeasurementModel<'_>,
     logs: &[PreparedLog],
-    identified: &Identified,
+    identified: &Identified<'_>,
     (found, time_offsets): (Vec<Finding>, Vec<TimeOffset>),
 ) -> Outcome {
-    let (robot, unknowns) = (measurement.robot(), &identified.unknowns);
+    let (robot, unknowns) = (identified.robot(), identified.unknowns());
     let training = training_logs(logs);
     let narrow = identified.fit.covariance_root();
     let (scaled, spread) = scaled_information(identified);
@@ -66,119 +69,98 @@ pub(crate) fn outcome(
         let (r, _) = identified.information.to_triangle();
         shrunk(&narrow, &cad_root(unknowns, &r, &spread), &kept)
     };
-    let spectrum = Spectrum::new(robot, unknowns, scaled, &spread);
-    let subspace = subspace(robot, &training, identified);
+    let subspace = subspace(&training, identified);
     let (base_parameters, mut not_separable, structural_rank) =
-        base_parameters(robot, identified, &root, subspace.as_ref());
-    let sums = rotors_not_separable(robot, identified, &spread);
+        base_parameters(identified, &root, subspace.as_ref());
+    let sums = rotors_not_separable(identified, &spread);
     let structural_rank = structural_rank.saturating_sub(sums.len());
     not_separable.extend(sums);
-    let mut findings = inertia_findings(robot, identified);
+    let mut findings = inertia_findings(identified);
     findings.extend(found);
     findings.extend(identified.findings.iter().cloned());
-    let (calibrations, calibration_findings) = calibrations(robot, measurement, identified, &root);
+    let (calibrations, calibration_findings) = calibrations(identified, &root);
     findings.extend(calibration_findings);
-    let judged = Judged::new(measurement, logs, identified, &root);
-    let mut measurement = measurement.clone();
-    let outcomes = logs
-        .iter()
-        .map(|log| log_outcome(&mut measurement, log, &judged));
+    let judged = Judged::new(logs, identified, &root);
     Outcome {
         robot: robot.name.clone(),
         verdict: verdict(identified),
-        links: links(robot, identified, &narrow, &root, &spread),
+        links: links(identified, &narrow, &root, &spread),
         covariance: covariance(unknowns, &identified.reduced, &root),
         tau: identified.fit.tau,
         least_retained_fraction: identified.retained[..unknowns.links.len()]
             .iter()
             .copied()
             .fold(1.0, f64::min),
-        rotors: rotors(robot, identified, &root),
+        rotors: rotors(identified, &root),
         calibrations,
         unknowns: unknowns.inertial(),
-        rank: spectrum.rank,
         structural_rank,
         effective: identified.fit.effective,
-        condition: spectrum.condition(),
-        singular_values: spectrum.singular_values,
-        weakest: spectrum.weakest,
         not_separable,
         base_parameters,
-        channels: channels(robot, identified, &training),
+        channels: channels(identified, &training),
         time_offsets,
-        logs: outcomes.collect(),
+        logs: logs.iter().map(|log| log_outcome(log, &judged)).collect(),
         findings,
+        ..spectrum(robot, unknowns, scaled, &spread)
     }
 }
 
 /// Notes of the seen links whose inertia in CAD is that of no body.
-fn inertia_findings(robot: &Robot, identified: &Identified) -> Vec<Finding> {
+fn inertia_findings(identified: &Identified<'_>) -> Vec<Finding> {
     let floors = identified.prior.floors().iter();
-    let seen = floors.filter(|floor| identified.unknowns.links.contains(&floor.link));
+    let seen = floors.filter(|floor| identified.unknowns().links.contains(&floor.link));
     seen.map(|floor| {
-        let name = robot.model.link_name(floor.link);
+        let name = identified.robot().model.link_name(floor.link);
         let text = floor.describe(name);
         Finding::note(FindingCode::InertiaRegularised, name, text)
     })
     .collect()
 }
 
-/// What the logs tell of the links' parameters in units of the prior's spread.
-struct Spectrum {
-    /// Descending.
-    singular_values: Vec<f64>,
-    rank: usize,
-    weakest: Vec<WeakDirection>,
-}
-
-impl Spectrum {
+/// What the logs tell of the links' parameters in units of the prior's spread: the figures of an
+/// outcome about that, without all others.
+fn spectrum(
+    robot: &Robot,
+    unknowns: &Unknowns,
+    scaled: DMatrix<f64>,
+    spread: &[DMatrix<f64>],
+) -> Outcome {
     /// Most weak directions that are named.
     const WEAKEST: usize = 5;
-
-    fn new(
-        robot: &Robot,
-        unknowns: &Unknowns,
-        scaled: DMatrix<f64>,
-        spread: &[DMatrix<f64>],
-    ) -> Self {
-        let svd = scaled.svd(false, true);
-        let mut order: Vec<usize> = (0..svd.singular_values.len()).collect();
-        order.sort_by(|&a, &b| svd.singular_values[b].total_cmp(&svd.singular_values[a]));
-        let singular_values: Vec<f64> = order.iter().map(|&i| svd.singular_values[i]).collect();
-        let greatest = singular_values.first().copied().unwrap_or(0.0);
-        let is_seen = |s: &&f64| **s > 1e-8 * greatest && greatest > 0.0;
-        let rank = singular_values.iter().filter(is_seen).count();
-        let directions = svd
-            .v_t
-            .unwrap_or_else(|| DMatrix::zeros(0, unknowns.inertial()));
-        let weakest = order[..rank].iter().rev().take(Self::WEAKEST).map(|&i| {
-            let direction = directions.row(i).transpose();
-            let value = svd.singular_values[i];
-            let (expression, links) = expression(robot, unknowns, spread, &direction);
-            WeakDirection {
-                expression,
-                links,
-                relative: value / greatest,
-                prior_share: 1.0 / (1.0 + value * value),
-            }
-        });
-        Self {
-            weakest: weakest.collect(),
-            singular_values,
-            rank,
+    let svd = scaled.svd(false, true);
+    let mut order: Vec<usize> = (0..svd.singular_values.len()).collect();
+    order.sort_by(|&a, &b| svd.singular_values[b].total_cmp(&svd.singular_values[a]));
+    let singular_values: Vec<f64> = order.iter().map(|&i| svd.singular_values[i]).collect();
+    let greatest = singular_values.first().copied().unwrap_or(0.0);
+    let is_seen = |s: &&f64| **s > 1e-8 * greatest && greatest > 0.0;
+    let rank = singular_values.iter().filter(is_seen).count();
+    let directions = svd
+        .v_t
+        .unwrap_or_else(|| DMatrix::zeros(0, unknowns.inertial()));
+    let weakest = order[..rank].iter().rev().take(WEAKEST).map(|&i| {
+        let direction = directions.row(i).transpose();
+        let value = svd.singular_values[i];
+        let (expression, links) = expression(robot, unknowns, spread, &direction);
+        WeakDirection {
+            expression,
+            links,
+            relative: value / greatest,
+            prior_share: 1.0 / (1.0 + value * value),
         }
-    }
-
-    fn condition(&self) -> f64 {
-        match self.rank.checked_sub(1) {
-            Some(last) => self.singular_values[0] / self.singular_values[last],
-            None => f64::NAN,
-        }
+    });
+    let least = rank.checked_sub(1).map(|last| singular_values[last]);
+    Outcome {
+        rank,
+        condition: least.map_or(f64::NAN, |least| greatest / least),
+        weakest: weakest.collect(),
+        singular_values,
+        ..Outcome::default()
     }
 }
 
 /// The verdict after cross-validation.
-fn verdict(identified: &Identified) -> Verdict {
+fn verdict(identified: &Identified<'_>) -> Verdict {
     if identified.retained.iter().any(|kept| *kept > 0.0) {
         Verdict::Identified
     } else {

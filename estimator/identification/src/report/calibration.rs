@@ -3,7 +3,6 @@
 use crate::finding::{Finding, FindingCode};
 use crate::fit::Identified;
 use crate::measurement::channels::{channel_name, sensor_name};
-use crate::measurement::model::MeasurementModel;
 use crate::measurement::unknowns::ExtraParameter;
 use crate::report::outcome::{CalibrationOutcome, ChannelNoise};
 use crate::robot::{AXES, Robot};
@@ -20,17 +19,16 @@ pub(crate) const MAX_NAMED: usize = 8;
 
 /// Identified calibrations of the sensors, and findings about them.
 pub(crate) fn calibrations(
-    robot: &Robot,
-    measurement: &MeasurementModel<'_>,
-    identified: &Identified,
+    identified: &Identified<'_>,
     root: &DMatrix<f64>,
 ) -> (Vec<CalibrationOutcome>, Vec<Finding>) {
+    let robot = identified.robot();
     let (mut outcomes, mut findings) = (Vec::new(), Vec::new());
     if identified.calibrated.is_empty() {
         return (outcomes, findings);
     }
-    for &sensor in &identified.unknowns.sensors {
-        let errors = SensorErrors::new(robot, identified, root, sensor);
+    for &sensor in &identified.unknowns().sensors {
+        let errors = SensorErrors::new(identified, root, sensor);
         if robot.calibrated.temperature && !errors.kind.temperature {
             let name = &errors.name;
             findings.push(Finding::warning(
@@ -47,7 +45,7 @@ pub(crate) fn calibrations(
         }
         findings.extend(errors.not_excited());
         findings.extend(errors.not_separable(robot, root));
-        let reference = measurement.reference(sensor);
+        let reference = identified.measurement.reference(sensor);
         let configured = robot.calibrations[sensor];
         outcomes.push(errors.outcome(configured, reference));
     }
@@ -95,8 +93,8 @@ struct SensorErrors {
 }
 
 impl SensorErrors {
-    fn new(robot: &Robot, identified: &Identified, root: &DMatrix<f64>, sensor: usize) -> Self {
-        let unknowns = &identified.unknowns;
+    fn new(identified: &Identified<'_>, root: &DMatrix<f64>, sensor: usize) -> Self {
+        let unknowns = identified.unknowns();
         let extra = unknowns.extra.iter().zip(unknowns.inertial()..);
         let errors: Vec<CalibrationError> = (extra.zip(&unknowns.precision))
             .filter_map(|((extra, column), precision)| match *extra {
@@ -121,7 +119,7 @@ impl SensorErrors {
             temperature: !errors.iter().all(CalibrationError::is_gain),
         };
         Self {
-            name: sensor_name(robot, sensor),
+            name: sensor_name(identified.robot(), sensor),
             kind,
             errors,
         }
@@ -208,8 +206,7 @@ impl SensorErrors {
 }
 
 pub(crate) fn channels(
-    robot: &Robot,
-    identified: &Identified,
+    identified: &Identified<'_>,
     training: &[&PreparedLog],
 ) -> Vec<ChannelNoise> {
     let noise = &identified.noise;
@@ -218,9 +215,9 @@ pub(crate) fn channels(
         .map(|log| (log.span.1 - log.span.0).seconds());
     let instants: usize = training.iter().map(|log| log.instants.len()).sum();
     let period = seconds.sum::<f64>() / instants.max(1) as f64;
-    (0..identified.unknowns.channels())
+    (0..identified.unknowns().channels())
         .map(|channel| {
-            let (name, unit) = channel_name(robot, &identified.unknowns, channel);
+            let (name, unit) = channel_name(identified.robot(), identified.unknowns(), channel);
             ChannelNoise {
                 name,
                 unit,

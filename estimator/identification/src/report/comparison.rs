@@ -5,11 +5,9 @@ use crate::dataset::observation::Annotated;
 use crate::fit::Identified;
 use crate::linear::nuisance::NuisanceEstimate;
 use crate::measurement::channels::{attribute_to, channel_of};
-use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::{OFFSET_VARIANCE, Residuals};
 use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::Unknowns;
-use crate::parallel;
 use crate::report::outcome::ModelComparison;
 use crate::report::prediction::{self, JudgedParameters};
 use crate::robot::Robot;
@@ -21,7 +19,7 @@ pub(crate) const STILL: f64 = 0.01;
 
 /// What a log is compared with: two sets of parameters.
 pub(crate) struct Judged<'a> {
-    pub identified: &'a Identified,
+    pub identified: &'a Identified<'a>,
     /// CAD, the identified parameters.
     pub sets: [DVector<f64>; 2],
     /// The same with the friction of the training logs.
@@ -32,13 +30,13 @@ pub(crate) struct Judged<'a> {
 
 impl<'a> Judged<'a> {
     pub(crate) fn new(
-        measurement: &MeasurementModel<'_>,
         logs: &[PreparedLog],
-        identified: &'a Identified,
+        identified: &'a Identified<'a>,
         root: &'a DMatrix<f64>,
     ) -> Self {
         let sets = [identified.cad.clone(), identified.d.clone()];
-        let friction = prediction::friction(measurement, training_instants(logs), &sets);
+        let all = training_instants(logs);
+        let friction = prediction::friction(&identified.measurement, all, &sets);
         let candidates =
             [0, 1].map(|set| JudgedParameters::constant(&sets[set], friction[set].clone()));
         Self {
@@ -63,9 +61,6 @@ pub(crate) struct TorqueSeries {
 
 /// An offset with this variance or more has not been observed.
 pub(crate) const UNREAD: f64 = 0.9 * OFFSET_VARIANCE;
-
-/// Blocks of instants that one thread takes at a time.
-pub(crate) const BLOCKS_PER_TASK: usize = 64;
 
 pub(crate) fn three<T: Copy>(values: [T; 3]) -> ModelComparison<T> {
     ModelComparison {
@@ -126,45 +121,34 @@ impl ComparedReading {
 }
 
 impl SensorComparison {
-    /// `sets`: CAD, the identified parameters; `residuals`: of these two.
-    pub(crate) fn new(
-        measurement: &MeasurementModel<'_>,
-        instants: &[Annotated],
-        residuals: &Residuals,
-        identified: &Identified,
-        sets: &[DVector<f64>; 2],
-    ) -> Self {
-        let unknowns = measurement.unknowns().clone();
-        let configured = configured_nuisance(measurement.robot(), &unknowns);
+    /// `residuals`: of CAD and the identified parameters.
+    pub(crate) fn new(judged: &Judged<'_>, instants: &[Annotated], residuals: &Residuals) -> Self {
+        let identified = judged.identified;
+        let unknowns = identified.unknowns();
+        let configured = configured_nuisance(identified.robot(), unknowns);
         let variances = identified.noise.offset_tracking_variances();
         let (sensors, ranges) = (unknowns.sensors.len(), &residuals.ranges);
-        let parts = parallel::map_with(
-            ranges.len().div_ceil(BLOCKS_PER_TASK),
-            || (measurement.clone(), MeasurementRows::new(&unknowns)),
-            |(measurement, rows), part| {
-                let end = ranges.len().min((part + 1) * BLOCKS_PER_TASK);
-                let mut out = Vec::new();
-                for block in part * BLOCKS_PER_TASK..end {
-                    let cases = cases(sets, &configured, &residuals.nuisance[block]);
-                    for instant in &instants[ranges[block].clone()] {
-                        let start = out.len();
-                        out.resize(start + 6 * sensors, ComparedReading::NONE);
-                        if sensors > 0 && measurement.compute_rows(instant, rows).is_ok() {
-                            let sensors = &unknowns.sensors;
-                            compare(
-                                instant,
-                                sensors,
-                                rows,
-                                &variances,
-                                &cases,
-                                &mut out[start..],
-                            );
-                        }
-                    }
+        let blocks = ranges.iter().zip(&residuals.nuisance);
+        let parts = (identified.measurement).map(blocks, |measurement, (range, block)| {
+            let cases = cases(&judged.sets, &configured, block);
+            let mut out = Vec::new();
+            for instant in &instants[range.clone()] {
+                let start = out.len();
+                out.resize(start + 6 * sensors, ComparedReading::NONE);
+                if sensors > 0 {
+                    let (sensors, rows) = (&unknowns.sensors, measurement.rows(instant));
+                    compare(
+                        instant,
+                        sensors,
+                        &rows,
+                        &variances,
+                        &cases,
+                        &mut out[start..],
+                    );
                 }
-                out
-            },
-        );
+            }
+            out
+        });
         let empty = || vec![vec![f64::NAN; instants.len()]; 6 * sensors];
         let mut comparison = Self {
             load: empty(),
@@ -234,68 +218,63 @@ pub(crate) fn configured_nuisance(robot: &Robot, unknowns: &Unknowns) -> Vec<f64
     configured
 }
 
-/// Predicted standard deviation of each channel's residual at an instant, from the parameters'
-/// covariance and the noise of all channels that the prediction uses.
-pub(crate) fn predicted_deviations(
-    measurement: &mut MeasurementModel<'_>,
-    instant: &Annotated,
-    identified: &Identified,
-    root: &DMatrix<f64>,
-) -> Vec<f64> {
-    let unknowns = measurement.unknowns().clone();
-    let mut rows = MeasurementRows::new(&unknowns);
-    let mut out = vec![f64::NAN; unknowns.channels()];
-    if measurement.compute_rows(instant, &mut rows).is_err() {
-        return out;
+impl Judged<'_> {
+    /// Predicted standard deviation of each channel's residual at each of these instants, from the
+    /// parameters' covariance and the noise of all channels that the prediction uses.
+    pub(crate) fn deviations<'b>(
+        &self,
+        instants: impl Iterator<Item = &'b Annotated>,
+    ) -> Vec<Vec<f64>> {
+        let measurement = &self.identified.measurement;
+        measurement.map(instants, |own, instant| {
+            self.deviations_of(&own.rows(instant))
+        })
     }
-    let a = DMatrix::from_fn(rows.count, unknowns.parameters(), |i, j| rows.a(i)[j]) * root;
-    let noise = DMatrix::from_fn(rows.count, unknowns.channels(), |i, c| {
-        rows.n(i)[c] * identified.noise.square[c].sqrt()
-    });
-    let wrenches = 6 * unknowns.sensors.len();
-    let sensors = (0..unknowns.sensors.len()).map(|index| 6 * index..6 * index + 6);
-    for channels in sensors.chain((wrenches..unknowns.channels()).map(|c| c..c + 1)) {
-        let Some(map) = attribute_to(
-            &rows,
-            &identified.noise.offset_tracking_variances(),
-            channels.clone(),
-        ) else {
-            continue;
-        };
-        let (parameters, noise) = (&map * &a, &map * &noise);
-        for (k, channel) in channels
-            .enumerate()
-            .filter(|(_, channel)| rows.has(*channel))
-        {
-            out[channel] = parameters.row(k).norm().hypot(noise.row(k).norm());
-        }
-    }
-    out
-}
 
-/// Per channel, the fraction of its errors within 1.96 standard deviations, at some of the
-/// instants.
-pub(crate) fn covered(
-    measurement: &mut MeasurementModel<'_>,
-    instants: &[Annotated],
-    errors: &[&[f64]],
-    identified: &Identified,
-    root: &DMatrix<f64>,
-) -> Vec<f64> {
-    let mut counts = vec![(0.0, 0.0); errors.len()];
-    for i in (0..instants.len()).step_by((instants.len() / 200).max(1)) {
-        if errors.iter().all(|errors| !errors[i].is_finite()) {
-            continue;
-        }
-        let deviations = predicted_deviations(measurement, &instants[i], identified, root);
-        for ((errors, deviation), (inside, count)) in errors.iter().zip(deviations).zip(&mut counts)
-        {
-            if errors[i].is_finite() {
-                *inside += f64::from(u8::from(errors[i].abs() <= 1.96 * deviation));
-                *count += 1.0;
+    fn deviations_of(&self, rows: &MeasurementRows) -> Vec<f64> {
+        let (unknowns, noise) = (self.identified.unknowns(), &self.identified.noise);
+        let mut out = vec![f64::NAN; unknowns.channels()];
+        let a = DMatrix::from_fn(rows.count, unknowns.parameters(), |i, j| rows.a(i)[j]);
+        let a = a * self.root;
+        let deviations = DMatrix::from_fn(rows.count, unknowns.channels(), |i, c| {
+            rows.n(i)[c] * noise.square[c].sqrt()
+        });
+        let variances = noise.offset_tracking_variances();
+        let sensors = (0..unknowns.sensors.len()).map(|index| 6 * index..6 * index + 6);
+        let joints = unknowns.wrenches()..unknowns.channels();
+        for channels in sensors.chain(joints.map(|c| c..c + 1)) {
+            let Some(map) = attribute_to(rows, &variances, channels.clone()) else {
+                continue;
+            };
+            let (parameters, noise) = (&map * &a, &map * &deviations);
+            for (k, channel) in channels
+                .enumerate()
+                .filter(|(_, channel)| rows.has(*channel))
+            {
+                out[channel] = parameters.row(k).norm().hypot(noise.row(k).norm());
             }
         }
+        out
     }
-    let counts = counts.into_iter();
-    counts.map(|(inside, count)| inside / count).collect()
+
+    /// Per channel, the fraction of its errors within 1.96 standard deviations, at some of the
+    /// instants.
+    pub(crate) fn covered(&self, instants: &[Annotated], errors: &[&[f64]]) -> Vec<f64> {
+        let some = (0..instants.len()).step_by((instants.len() / 200).max(1));
+        let is_compared = |i: &usize| errors.iter().any(|errors| errors[*i].is_finite());
+        let some: Vec<usize> = some.filter(is_compared).collect();
+        let deviations = self.deviations(some.iter().map(|&i| &instants[i]));
+        let of_channel = |(channel, errors): (usize, &&[f64])| {
+            let pairs = some.iter().zip(&deviations);
+            let pairs = pairs.filter(|(i, _)| errors[**i].is_finite());
+            let (mut inside, mut count) = (0.0, 0.0);
+            for (i, deviations) in pairs {
+                let is_inside = errors[*i].abs() <= 1.96 * deviations[channel];
+                inside += f64::from(u8::from(is_inside));
+                count += 1.0;
+            }
+            inside / count
+        };
+        errors.iter().enumerate().map(of_channel).collect()
+    }
 }

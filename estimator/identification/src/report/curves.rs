@@ -2,8 +2,7 @@
 
 use crate::dataset::observation::Annotated;
 use crate::measurement::channels::{channel_of, sensor_name};
-use crate::measurement::model::MeasurementModel;
-use crate::report::comparison::{Judged, SensorComparison, TorqueSeries, predicted_deviations};
+use crate::report::comparison::{Judged, SensorComparison, TorqueSeries};
 use crate::report::outcome::Curve;
 use crate::robot::AXES;
 
@@ -11,33 +10,19 @@ use crate::robot::AXES;
 pub(crate) const POINTS: usize = 2000;
 
 pub(crate) fn curves(
-    measurement: &mut MeasurementModel<'_>,
+    judged: &Judged<'_>,
     instants: &[Annotated],
     times: &[f64],
     compared: &SensorComparison,
     torques: &[TorqueSeries],
-    judged: &Judged<'_>,
 ) -> Vec<Curve> {
-    let robot = measurement.robot();
-    let unknowns = measurement.unknowns().clone();
-    let wrenches = 6 * unknowns.sensors.len();
+    let (robot, unknowns) = (judged.identified.robot(), judged.identified.unknowns());
     let points: Vec<usize> = (0..instants.len())
         .step_by(instants.len().div_ceil(POINTS).max(1))
         .collect();
     // The standard deviation changes slowly: it is computed at a tenth of the points and held
     // between them.
-    let mut deviations: Vec<Vec<f64>> = Vec::new();
-    for (number, &i) in points.iter().enumerate() {
-        if number % 10 == 0 {
-            let (identified, root) = (judged.identified, judged.root);
-            deviations.push(predicted_deviations(
-                measurement,
-                &instants[i],
-                identified,
-                root,
-            ));
-        }
-    }
+    let deviations = judged.deviations(points.iter().step_by(10).map(|&i| &instants[i]));
     let sigma = |channel: usize| -> Vec<f64> {
         (0..points.len())
             .map(|number| deviations[number / 10][channel])
@@ -63,7 +48,7 @@ pub(crate) fn curves(
             identified: pick(&|i| measured[i] - errors[2][i]),
             sigma: index.map_or_else(
                 || vec![f64::NAN; points.len()],
-                |index| sigma(wrenches + index),
+                |index| sigma(unknowns.wrenches() + index),
             ),
         });
     }

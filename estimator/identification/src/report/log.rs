@@ -1,16 +1,15 @@
 //! The figures of one log: residuals, prediction errors, coverage, offsets, friction, findings.
 
 use crate::arithmetic::{dot, mean, rms};
+use crate::dataset::LogRole;
 use crate::dataset::observation::{Annotated, SubtreeSet};
 use crate::finding::{Finding, FindingCode};
 use crate::fit::Identified;
 use crate::measurement::channels::{channel_of, sensor_name};
-use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::{LogSegment, Residuals, reduce, residuals};
-use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::{FRICTION, Unknowns, friction_row};
 use crate::report::comparison::{
-    Judged, STILL, SensorComparison, TorqueSeries, cases, configured_nuisance, covered, three,
+    Judged, STILL, SensorComparison, TorqueSeries, cases, configured_nuisance, three,
 };
 use crate::report::curves::curves;
 use crate::report::outcome::{
@@ -20,7 +19,6 @@ use crate::report::outcome::{
 use crate::report::prediction::PredictionError;
 use crate::robot::{AXES, Robot};
 use crate::training::{MIN_FOLD, PreparedLog, SEGMENT_INSTANTS};
-use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::Structure;
 use proprio_topics::Nanos;
 
@@ -54,7 +52,7 @@ pub(crate) fn with_friction_of_training(
     (set, friction): (usize, &[[f64; FRICTION]]),
     index: usize,
 ) -> Vec<f64> {
-    let wrenches = 6 * unknowns.sensors.len();
+    let wrenches = unknowns.wrenches();
     let mut errors = residuals.noise[set][wrenches + index].clone();
     for (range, block) in residuals.ranges.iter().zip(&residuals.nuisance) {
         for i in range.clone() {
@@ -70,41 +68,34 @@ pub(crate) fn with_friction_of_training(
     errors
 }
 
-pub(crate) fn log_outcome(
-    measurement: &mut MeasurementModel<'_>,
-    log: &PreparedLog,
-    judged: &Judged<'_>,
-) -> LogOutcome {
-    let (identified, sets, root) = (judged.identified, &judged.sets, judged.root);
-    let robot = measurement.robot();
-    let unknowns = &identified.unknowns;
+pub(crate) fn log_outcome(log: &PreparedLog, judged: &Judged<'_>) -> LogOutcome {
+    let (identified, unknowns) = (judged.identified, judged.identified.unknowns());
     let usable = !log.instants.is_empty() && !log.refused;
     let instants = if usable { log.instants.as_slice() } else { &[] };
-    let segment = LogSegment::alone(instants);
-    let residuals = residuals(measurement, segment, &identified.noise, sets);
+    let residuals = judged.residuals(instants);
     let times = instants.iter().map(|i| (i.t - log.span.0).seconds());
     let times: Vec<f64> = times.collect();
-    let wrenches = 6 * unknowns.sensors.len();
-    let compared = SensorComparison::new(measurement, instants, &residuals, identified, sets);
-    let torques = residuals.noise[1].iter().skip(wrenches);
+    let compared = SensorComparison::new(judged, instants, &residuals);
+    let torques = residuals.noise[1].iter().skip(unknowns.wrenches());
     let errors: Vec<&[f64]> = compared.errors[2]
         .iter()
         .chain(torques)
         .map(Vec::as_slice)
         .collect();
-    let coverage = covered(measurement, instants, &errors, identified, root);
+    let coverage = judged.covered(instants, &errors);
     // Torques: an input of the identification, or a reference for F/T sensors.
     let torques = if unknowns.joints.is_empty() {
-        reference_torques(measurement, instants, sets)
+        reference_torques(judged, instants)
     } else {
-        input_torques(instants, &residuals, judged)
+        input_torques(judged, instants, &residuals)
     };
     let inner: Vec<TorqueSeries> = torques.iter().map(|own| own.inner(&times)).collect();
-    let undisturbed = undisturbed(measurement, log, identified, sets);
+    let undisturbed = undisturbed(judged, log);
     let tested = undisturbed.as_ref().unwrap_or(&compared);
     let sensors = unknowns.sensors.iter().enumerate();
+    let robot = identified.robot();
     let findings = sensors.filter_map(|(index, &sensor)| unexplained(robot, sensor, tested, index));
-    let deviations = nuisance_deviations(measurement, instants, identified, root);
+    let deviations = nuisance_deviations(judged, instants);
     LogOutcome {
         file: log.file.clone(),
         role: log.role,
@@ -112,42 +103,46 @@ pub(crate) fn log_outcome(
         used: instants.len() as u64,
         excluded: log.excluded.clone(),
         onset: onset(instants),
-        predicted: predicted(robot, instants, judged, &inner),
-        joints: joint_outcomes(robot, unknowns, &inner, &coverage),
-        sensors: sensor_outcomes(robot, unknowns, &compared, &coverage),
-        two_route: two_route(measurement, instants, &residuals, sets),
-        offsets: offsets(robot, unknowns, identified, &residuals, &deviations),
-        friction: friction(robot, unknowns, &residuals, &deviations),
+        predicted: predicted(judged, instants, &inner),
+        joints: joint_outcomes(identified, &inner, &coverage),
+        sensors: sensor_outcomes(identified, &compared, &coverage),
+        two_route: two_route(judged, instants, &residuals),
+        offsets: offsets(identified, &residuals, &deviations),
+        friction: friction(identified, &residuals, &deviations),
         findings: log.findings.iter().cloned().chain(findings).collect(),
-        curves: curves(measurement, instants, &times, &compared, &torques, judged),
+        curves: curves(judged, instants, &times, &compared, &torques),
+    }
+}
+
+impl Judged<'_> {
+    /// The residuals of CAD and of the identified parameters.
+    fn residuals(&self, instants: &[Annotated]) -> Residuals {
+        let (segment, noise) = (LogSegment::alone(instants), &self.identified.noise);
+        residuals(&self.identified.measurement, segment, noise, &self.sets)
     }
 }
 
 /// Residuals of torques that nothing is identified from: no friction is fitted to them.
-fn reference_torques(
-    measurement: &mut MeasurementModel<'_>,
-    instants: &[Annotated],
-    sets: &[DVector<f64>; 2],
-) -> Vec<TorqueSeries> {
+fn reference_torques(judged: &Judged<'_>, instants: &[Annotated]) -> Vec<TorqueSeries> {
+    let measurement = &judged.identified.measurement;
     let dofs = measurement.robot().model.dof_count();
     let is_measured = |i: &Annotated| i.torque.iter().any(|x| x.is_finite());
     if !instants.iter().any(is_measured) {
         return Vec::new();
     }
-    let mut errors = [vec![Vec::new(); dofs], vec![Vec::new(); dofs]];
-    for (set, errors) in sets.iter().zip(&mut errors) {
-        for instant in instants {
-            let row = measurement
-                .torque_errors(instant, set.as_slice())
-                .unwrap_or_else(|_| vec![f64::NAN; dofs]);
-            errors.iter_mut().zip(row).for_each(|(e, x)| e.push(x));
-        }
-    }
-    let [cad, own] = errors;
-    let pairs = cad.into_iter().zip(own).enumerate();
-    let compared = pairs.filter(|(_, (cad, _))| cad.iter().any(|x| x.is_finite()));
+    // Per instant, with each set, of each degree of freedom.
+    let errors = measurement.map(instants, |measurement, instant| {
+        judged.sets.each_ref().map(|set| {
+            let errors = measurement.torque_errors(instant, set.as_slice());
+            errors.unwrap_or_else(|_| vec![f64::NAN; dofs])
+        })
+    });
+    let of_set = |set: usize, dof: usize| errors.iter().map(|own| own[set][dof]).collect();
+    let pairs = (0..dofs)
+        .map(|dof| -> (usize, [Vec<f64>; 2]) { (dof, [0, 1].map(|set| of_set(set, dof))) });
+    let compared = pairs.filter(|(_, [cad, _])| cad.iter().any(|x| x.is_finite()));
     compared
-        .map(|(dof, (cad, own))| TorqueSeries {
+        .map(|(dof, [cad, own])| TorqueSeries {
             dof,
             errors: [cad.clone(), cad.clone(), own.clone(), cad, own],
             measured: instants.iter().map(|i| i.torque[dof]).collect(),
@@ -157,13 +152,13 @@ fn reference_torques(
 
 /// Residuals of torques that are an input of the identification.
 fn input_torques(
+    judged: &Judged<'_>,
     instants: &[Annotated],
     residuals: &Residuals,
-    judged: &Judged<'_>,
 ) -> Vec<TorqueSeries> {
-    let unknowns = &judged.identified.unknowns;
+    let unknowns = judged.identified.unknowns();
     let series = |(index, &dof): (usize, &usize)| {
-        let channel = 6 * unknowns.sensors.len() + index;
+        let channel = unknowns.wrenches() + index;
         let raw = residuals.measured[channel]
             .iter()
             .zip(&residuals.predicted[channel])
@@ -184,13 +179,8 @@ fn input_torques(
 }
 
 /// The prediction errors by which parameters are judged; `torques` without the ends of the log.
-fn predicted(
-    robot: &Robot,
-    instants: &[Annotated],
-    judged: &Judged<'_>,
-    torques: &[TorqueSeries],
-) -> Predicted {
-    let identified = judged.identified;
+fn predicted(judged: &Judged<'_>, instants: &[Annotated], torques: &[TorqueSeries]) -> Predicted {
+    let (identified, robot) = (judged.identified, judged.identified.robot());
     let prediction_error = PredictionError::of_record(
         robot,
         &identified.inputs,
@@ -200,7 +190,7 @@ fn predicted(
     // No error is expected: rows of the same instants were computed before.
     let mut predicted = prediction_error.map_or_else(
         |_| Predicted::default(),
-        |errors| errors.predicted(&identified.unknowns, &judged.candidates),
+        |errors| errors.predicted(identified.unknowns(), &judged.candidates),
     );
     let of_joint = |own: &TorqueSeries| {
         let of_training = both([3, 4].map(|set| rms(own.errors[set].iter().copied())));
@@ -230,14 +220,14 @@ fn predicted(
 
 /// The figures of each torque, without the ends of the log.
 fn joint_outcomes(
-    robot: &Robot,
-    unknowns: &Unknowns,
+    identified: &Identified<'_>,
     torques: &[TorqueSeries],
     coverage: &[f64],
 ) -> Vec<JointOutcome> {
+    let (robot, unknowns) = (identified.robot(), identified.unknowns());
     let outcome = |own: &TorqueSeries| {
         let index = unknowns.joints.binary_search(&own.dof).ok();
-        let channel = index.map(|index| 6 * unknowns.sensors.len() + index);
+        let channel = index.map(|index| unknowns.wrenches() + index);
         JointOutcome {
             name: robot.model.dof_name(own.dof).to_owned(),
             rms_nm: three([0, 1, 2].map(|set| rms(own.errors[set].iter().copied()))),
@@ -249,11 +239,11 @@ fn joint_outcomes(
 }
 
 fn sensor_outcomes(
-    robot: &Robot,
-    unknowns: &Unknowns,
+    identified: &Identified<'_>,
     compared: &SensorComparison,
     coverage: &[f64],
 ) -> Vec<SensorOutcome> {
+    let (robot, unknowns) = (identified.robot(), identified.unknowns());
     let outcome = |(index, &sensor): (usize, &usize)| SensorOutcome {
         name: sensor_name(robot, sensor),
         rms: three(compared.errors.each_ref().map(|errors| {
@@ -266,28 +256,16 @@ fn sensor_outcomes(
 
 /// A validation log compared as a training log: without undeclared disturbances and their effect on
 /// the offsets. None if no disturbance was found, because the comparison is then the same.
-pub(crate) fn undisturbed(
-    measurement: &MeasurementModel<'_>,
-    log: &PreparedLog,
-    identified: &Identified,
-    sets: &[DVector<f64>; 2],
-) -> Option<SensorComparison> {
-    if log.disturbed.iter().all(SubtreeSet::is_empty) {
+fn undisturbed(judged: &Judged<'_>, log: &PreparedLog) -> Option<SensorComparison> {
+    if log.role == LogRole::Train || log.contacts.iter().all(SubtreeSet::is_empty) {
         return None;
     }
     let mut instants = log.instants.clone();
-    for (instant, subtrees) in instants.iter_mut().zip(&log.disturbed) {
+    for (instant, subtrees) in instants.iter_mut().zip(&log.contacts) {
         instant.disturbed = *subtrees;
     }
-    let segment = LogSegment::alone(&instants);
-    let residuals = residuals(measurement, segment, &identified.noise, sets);
-    Some(SensorComparison::new(
-        measurement,
-        &instants,
-        &residuals,
-        identified,
-        sets,
-    ))
+    let residuals = judged.residuals(&instants);
+    Some(SensorComparison::new(judged, &instants, &residuals))
 }
 
 /// A warning if the residual of a sensor's readings with the identified parameters is much larger
@@ -387,24 +365,23 @@ pub(crate) fn onset(instants: &[Annotated]) -> Option<Nanos> {
 }
 
 /// Joint torques computed from the two sides of a joint.
-pub(crate) fn two_route(
-    measurement: &mut MeasurementModel<'_>,
+fn two_route(
+    judged: &Judged<'_>,
     instants: &[Annotated],
     residuals: &Residuals,
-    sets: &[DVector<f64>; 2],
 ) -> Vec<TwoRouteOutcome> {
-    let robot = measurement.robot();
-    let unknowns = measurement.unknowns().clone();
+    let (robot, unknowns) = (judged.identified.robot(), judged.identified.unknowns());
+    if unknowns.sensors.len() < 2 {
+        return Vec::new();
+    }
+    let mut measurement = judged.identified.measurement.clone();
     let dofs = robot.model.dof_count();
-    let configured = configured_nuisance(robot, &unknowns);
+    let configured = configured_nuisance(robot, unknowns);
     let mut series = vec![[const { Vec::new() }; 3]; dofs];
-    let mut rows = MeasurementRows::new(&unknowns);
     for (range, block) in residuals.ranges.iter().zip(&residuals.nuisance) {
-        let cases = cases(sets, &configured, block);
+        let cases = cases(&judged.sets, &configured, block);
         for instant in &instants[range.clone()] {
-            if unknowns.sensors.len() < 2 || measurement.compute_rows(instant, &mut rows).is_err() {
-                continue;
-            }
+            let rows = measurement.rows(instant);
             for (dof, along) in measurement.two_routes(&rows) {
                 for (series, (d, nuisance)) in series[dof].iter_mut().zip(cases) {
                     let weights = along.iter().enumerate();
@@ -430,31 +407,26 @@ pub(crate) fn two_route(
 
 /// Standard deviations of the nuisance parameters at the end of the log: their uncertainty for
 /// known parameters, and the contribution of the parameters' covariance.
-pub(crate) fn nuisance_deviations(
-    measurement: &mut MeasurementModel<'_>,
-    instants: &[Annotated],
-    identified: &Identified,
-    root: &DMatrix<f64>,
-) -> Vec<f64> {
+fn nuisance_deviations(judged: &Judged<'_>, instants: &[Annotated]) -> Vec<f64> {
     // From the last instants only: an offset drifts, and a filter that starts there without prior
     // knowledge overestimates the uncertainty.
     let first = instants.len().saturating_sub(SEGMENT_INSTANTS);
     let segment = LogSegment::alone(&instants[first..]);
-    let reduced = reduce(measurement, segment, &identified.noise);
-    let moved = &reduced.slope * root;
+    let mut measurement = judged.identified.measurement.clone();
+    let reduced = reduce(&mut measurement, segment, &judged.identified.noise);
+    let moved = &reduced.slope * judged.root;
     (0..reduced.covariance.nrows())
         .map(|i| (reduced.covariance[(i, i)].max(0.0) + moved.row(i).norm_squared()).sqrt())
         .collect()
 }
 
 /// Offsets of the sensors that occur in rows of the log.
-pub(crate) fn offsets(
-    robot: &Robot,
-    unknowns: &Unknowns,
-    identified: &Identified,
+fn offsets(
+    identified: &Identified<'_>,
     residuals: &Residuals,
     deviations: &[f64],
 ) -> Vec<OffsetOutcome> {
+    let (robot, unknowns) = (identified.robot(), identified.unknowns());
     let (Some(first), Some(last)) = (residuals.nuisance.first(), residuals.nuisance.last()) else {
         return Vec::new();
     };
@@ -476,16 +448,16 @@ pub(crate) fn offsets(
 }
 
 /// Friction of the joints whose torque was measured in the log.
-pub(crate) fn friction(
-    robot: &Robot,
-    unknowns: &Unknowns,
+fn friction(
+    identified: &Identified<'_>,
     residuals: &Residuals,
     deviations: &[f64],
 ) -> Vec<FrictionOutcome> {
+    let (robot, unknowns) = (identified.robot(), identified.unknowns());
     let Some(last) = residuals.nuisance.last() else {
         return Vec::new();
     };
-    let first = 6 * unknowns.sensors.len();
+    let first = unknowns.wrenches();
     let value = |index: usize, k: usize| last.x[(first + FRICTION * index + k, 1)];
     unknowns
         .joints

@@ -25,7 +25,6 @@ use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::OFFSET_VARIANCE;
 use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::{ExtraParameter, FRICTION, Unknowns};
-use crate::parallel;
 use crate::report::outcome::{Both, InForce, Predicted, both};
 use crate::robot::{IdentificationInput, Robot};
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Matrix6xX, Vector3, Vector6};
@@ -236,7 +235,7 @@ impl<'a> PredictionError<'a> {
         let errors = self.errors(unknowns, candidates, true);
         let unknowns = self.unknowns();
         let (mut squares, mut all) = ([[0.0; 2]; 2], 0.0);
-        for channel in 0..6 * unknowns.sensors.len() {
+        for channel in 0..unknowns.wrenches() {
             let weighted = |values: &[f64]| -> f64 {
                 let finite = values.iter().filter(|x| x.is_finite());
                 finite.map(|x| (x * unknowns.scale(channel)).powi(2)).sum()
@@ -292,7 +291,7 @@ impl<'a> PredictionError<'a> {
         with_drifts: bool,
     ) -> Vec<PredictionErrors> {
         let own = self.unknowns();
-        let (offsets, channels) = (6 * own.sensors.len(), own.channels());
+        let (offsets, channels) = (own.wrenches(), own.channels());
         let drifts = if with_drifts { offsets } else { 0 };
         let width = channels + drifts + self.measurement.robot().model.dof_count();
         let plan = JudgedSets::new(unknowns, own, candidates);
@@ -322,7 +321,7 @@ impl<'a> PredictionError<'a> {
                     }
                 }
                 for row in 0..made.rows.count {
-                    if let Some(joint) = made.rows.joint(row, offsets) {
+                    if let Some(joint) = made.rows.joint(row) {
                         let share = &made.rows.g(row)[offsets + FRICTION * joint..][..FRICTION];
                         out[offsets + joint] = made.rows.without_bodies(row, d.as_slice())
                             - dot(share, &course.friction[joint]);
@@ -351,7 +350,7 @@ impl<'a> PredictionError<'a> {
     /// together with this number of linear drifts.
     fn fitted_offsets(&self, plan: &JudgedSets, drifts: usize) -> Vec<[DVector<f64>; 2]> {
         let own = self.unknowns();
-        let offsets = 6 * own.sensors.len();
+        let offsets = own.wrenches();
         let width = offsets + drifts;
         let all: Vec<usize> = (0..plan.sets.len()).collect();
         let zero = || {
@@ -400,33 +399,20 @@ impl<'a> PredictionError<'a> {
             return Vec::new();
         };
         let half = 0.5 * (last.t - first.t).seconds().max(f64::MIN_POSITIVE);
-        parallel::map_with(
-            self.instants.len().div_ceil(BATCH),
-            || {
-                (
-                    self.measurement.clone(),
-                    MeasurementRows::new(self.unknowns()),
-                )
-            },
-            |(measurement, rows), part| {
-                let mut state = make();
-                let end = self.instants.len().min(BATCH * (part + 1));
-                for instant in &self.instants[BATCH * part..end] {
-                    if measurement.compute_rows(instant, rows).is_err() {
-                        rows.clear();
-                    }
-                    let made = InstantRows {
-                        late: (instant.t - first.t).seconds() / half - 1.0,
-                        instant,
-                        measurement,
-                        rows,
-                        trusted: &trusted,
-                    };
-                    each(&mut state, &made);
-                }
-                state
-            },
-        )
+        (self.measurement).map(self.instants.chunks(BATCH), |measurement, batch| {
+            let mut state = make();
+            for instant in batch {
+                let made = InstantRows {
+                    late: (instant.t - first.t).seconds() / half - 1.0,
+                    instant,
+                    rows: measurement.rows(instant),
+                    measurement,
+                    trusted: &trusted,
+                };
+                each(&mut state, &made);
+            }
+            state
+        })
     }
 }
 
@@ -436,14 +422,14 @@ struct InstantRows<'a, 'b> {
     /// From -1 at the log's beginning to 1 at its end.
     late: f64,
     measurement: &'a MeasurementModel<'b>,
-    rows: &'a MeasurementRows,
+    rows: MeasurementRows,
     trusted: &'a [f64],
 }
 
 /// The comparisons at an instant, for these sets: readings, and torques from two sides.
 fn comparisons(made: &InstantRows<'_, '_>, plan: &JudgedSets, sets: &[usize]) -> Vec<ComparedRow> {
-    let (rows, unknowns) = (made.rows, made.measurement.unknowns());
-    let offsets = 6 * unknowns.sensors.len();
+    let (rows, unknowns) = (&made.rows, made.measurement.unknowns());
+    let offsets = unknowns.wrenches();
     let residuals: Vec<DVector<f64>> = sets
         .iter()
         .map(|&set| &plan.sets[set].d)
@@ -594,39 +580,31 @@ pub(crate) fn friction<'b>(
     sets: &[DVector<f64>],
 ) -> Vec<Vec<[f64; FRICTION]>> {
     let unknowns = measurement.unknowns();
-    let (joints, offsets) = (unknowns.joints.len(), 6 * unknowns.sensors.len());
+    let (joints, offsets) = (unknowns.joints.len(), unknowns.wrenches());
     if joints == 0 {
         return vec![Vec::new(); sets.len()];
     }
     let zero = || vec![(Matrix3::zeros(), vec![Vector3::zeros(); sets.len()]); joints];
     let instants: Vec<&Annotated> = instants.collect();
-    let parts = parallel::map_with(
-        instants.len().div_ceil(BATCH),
-        || (measurement.clone(), MeasurementRows::new(unknowns)),
-        |(measurement, rows), part| {
-            let mut sums = zero();
-            let end = instants.len().min(BATCH * (part + 1));
-            for instant in &instants[BATCH * part..end] {
-                if measurement.compute_rows(instant, rows).is_err() {
+    let parts = measurement.map(instants.chunks(BATCH), |measurement, batch| {
+        let mut sums = zero();
+        for instant in batch {
+            let rows = measurement.rows(instant);
+            for row in 0..rows.count {
+                let Some(joint) = rows.joint(row) else {
                     continue;
-                }
-                for row in 0..rows.count {
-                    let Some(joint) = rows.joint(row, offsets) else {
-                        continue;
-                    };
-                    let g = Vector3::from_column_slice(
-                        &rows.g(row)[offsets + FRICTION * joint..][..FRICTION],
-                    );
-                    let (normal, rights) = &mut sums[joint];
-                    *normal += g * g.transpose();
-                    for (right, d) in rights.iter_mut().zip(sets) {
-                        *right += g * rows.without_bodies(row, d.as_slice());
-                    }
+                };
+                let friction = &rows.g(row)[offsets + FRICTION * joint..][..FRICTION];
+                let g = Vector3::from_column_slice(friction);
+                let (normal, rights) = &mut sums[joint];
+                *normal += g * g.transpose();
+                for (right, d) in rights.iter_mut().zip(sets) {
+                    *right += g * rows.without_bodies(row, d.as_slice());
                 }
             }
-            sums
-        },
-    );
+        }
+        sums
+    });
     let mut total = zero();
     for part in parts {
         for ((normal, rights), (more, others)) in total.iter_mut().zip(part) {

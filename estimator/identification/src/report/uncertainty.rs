@@ -35,11 +35,10 @@ pub(crate) fn unseen(robot: &Robot, link: usize, cad: &RigidInertia) -> LinkOutc
 /// Rotors whose inertia is not separable from that of links: their column is a combination of those
 /// of the other rotors and the links' parameters.
 pub(crate) fn rotors_not_separable(
-    robot: &Robot,
-    identified: &Identified,
+    identified: &Identified<'_>,
     spread: &[DMatrix<f64>],
 ) -> Vec<String> {
-    let unknowns = &identified.unknowns;
+    let (robot, unknowns) = (identified.robot(), identified.unknowns());
     let mut fitted = unknowns.parameters_without_cad();
     if fitted.is_empty() {
         return Vec::new();
@@ -98,12 +97,8 @@ pub(crate) fn combinations(matrix: &DMatrix<f64>, columns: &[usize]) -> Vec<usiz
 }
 
 /// Identified rotor inertias.
-pub(crate) fn rotors(
-    robot: &Robot,
-    identified: &Identified,
-    root: &DMatrix<f64>,
-) -> Vec<RotorOutcome> {
-    let unknowns = &identified.unknowns;
+pub(crate) fn rotors(identified: &Identified<'_>, root: &DMatrix<f64>) -> Vec<RotorOutcome> {
+    let (robot, unknowns) = (identified.robot(), identified.unknowns());
     let rotor = |(extra, column): (&ExtraParameter, usize)| {
         let ExtraParameter::RotorInertia(dof) = *extra else {
             return None;
@@ -121,7 +116,7 @@ pub(crate) fn rotors(
 /// `R` of the links' parameters, marginalised over the extra parameters, with columns in units of
 /// the prior's spread; and that spread: per link a matrix from such units to the ten parameters, `2
 /// tau^2 M^-1 = spread spread^T`.
-pub(crate) fn scaled_information(identified: &Identified) -> (DMatrix<f64>, Vec<DMatrix<f64>>) {
+pub(crate) fn scaled_information(identified: &Identified<'_>) -> (DMatrix<f64>, Vec<DMatrix<f64>>) {
     let mut scaled = of_links(identified);
     let spread = |&link: &usize| {
         let factor = identified.prior.metric(link).cholesky();
@@ -130,7 +125,7 @@ pub(crate) fn scaled_information(identified: &Identified) -> (DMatrix<f64>, Vec<
         let spread = inverse * (2.0_f64.sqrt() * identified.fit.tau);
         DMatrix::from_column_slice(LINK_PARAMETERS, LINK_PARAMETERS, spread.as_slice())
     };
-    let spreads: Vec<DMatrix<f64>> = identified.unknowns.links.iter().map(spread).collect();
+    let spreads: Vec<DMatrix<f64>> = identified.unknowns().links.iter().map(spread).collect();
     scale_links(&mut scaled, &spreads);
     (scaled, spreads)
 }
@@ -147,9 +142,9 @@ fn scale_links(r: &mut DMatrix<f64>, spreads: &[DMatrix<f64>]) {
 /// Square-root information about the links' parameters, marginalised over the extra parameters: the
 /// lower right block of the triangle of `[R_extra | R_links]`. Extra parameters that CAD contains
 /// have their prior; the others have none.
-pub(crate) fn of_links(identified: &Identified) -> DMatrix<f64> {
+pub(crate) fn of_links(identified: &Identified<'_>) -> DMatrix<f64> {
     let (r, _) = identified.information.to_triangle();
-    let unknowns = &identified.unknowns;
+    let unknowns = identified.unknowns();
     let (links, extra) = (unknowns.inertial(), unknowns.extra.len());
     if extra == 0 {
         return r;
@@ -242,13 +237,12 @@ pub(crate) fn shrunk(root: &DMatrix<f64>, cad: &DMatrix<f64>, kept: &[f64]) -> D
 }
 
 pub(crate) fn links(
-    robot: &Robot,
-    identified: &Identified,
+    identified: &Identified<'_>,
     root: &DMatrix<f64>,
     wide: &DMatrix<f64>,
     spread: &[DMatrix<f64>],
 ) -> Vec<LinkOutcome> {
-    let unknowns = &identified.unknowns;
+    let (robot, unknowns) = (identified.robot(), identified.unknowns());
     let moved = link_inertias(robot, unknowns, &identified.d);
     let inverse = |spread: &DMatrix<f64>| {
         let inverse = spread.clone().try_inverse();
@@ -353,7 +347,7 @@ pub(crate) fn covariance(
     root: &DMatrix<f64>,
 ) -> CovarianceRoot {
     let (links, p) = (unknowns.inertial(), unknowns.parameters());
-    let s = 6 * unknowns.sensors.len();
+    let s = unknowns.wrenches();
     let of_links = unknowns.links.iter().flat_map(|&link| {
         (0..LINK_PARAMETERS).map(move |parameter| ParameterColumn::Inertial { link, parameter })
     });
@@ -465,10 +459,10 @@ pub(crate) fn expression(
 
 /// Identifiable subspace for the joints that moved in the logs.
 pub(crate) fn subspace(
-    robot: &Robot,
     training: &[&PreparedLog],
-    identified: &Identified,
+    identified: &Identified<'_>,
 ) -> Option<Identifiable> {
+    let robot = identified.robot();
     let mut regime = robot.regime();
     for (dof, joint) in regime.joints.iter_mut().enumerate() {
         let all = || training.iter().flat_map(|log| log.instants.iter());
@@ -498,7 +492,7 @@ pub(crate) fn subspace(
     // some torques is not computed.
     let is_measured = |dof| {
         matches!(regime.joints[dof], JointMotion::Locked(_))
-            || identified.unknowns.joints.contains(&dof)
+            || identified.unknowns().joints.contains(&dof)
     };
     let all_measured = (0..regime.joints.len()).all(is_measured);
     let both = all_measured.then(|| subspace(Measurement::Both));
@@ -506,12 +500,11 @@ pub(crate) fn subspace(
 }
 
 pub(crate) fn base_parameters(
-    robot: &Robot,
-    identified: &Identified,
+    identified: &Identified<'_>,
     root: &DMatrix<f64>,
     subspace: Option<&Identifiable>,
 ) -> (Vec<BaseParameterOutcome>, Vec<String>, usize) {
-    let unknowns = &identified.unknowns;
+    let (robot, unknowns) = (identified.robot(), identified.unknowns());
     let Some(subspace) = subspace else {
         return (Vec::new(), Vec::new(), 0);
     };

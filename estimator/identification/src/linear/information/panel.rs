@@ -42,7 +42,7 @@ pub enum InformationError {
         /// The number.
         value: f64,
     },
-    /// A standard deviation, or a retained fraction, outside its range.
+    /// A standard deviation outside its range.
     #[error("{what} is {value}, which is outside its range")]
     Range {
         /// The quantity.

@@ -62,9 +62,8 @@ impl Newton {
 
 /// The result of a descent.
 pub(crate) struct Descent {
-    pub(crate) decrement: f64,
-    pub(crate) factor: Cholesky<f64, Dyn>,
-    pub(crate) prior_rows: DMatrix<f64>,
+    /// The next step, which is not taken.
+    pub(crate) next: Newton,
     pub(crate) iterations: usize,
     pub(crate) is_converged: bool,
 }
