@@ -7,6 +7,7 @@ mod board;
 use crate::bringup::{Bringup, NoInquiry};
 use crate::canopen::{self, SYNC};
 use crate::family::{Family, Session, Supervised, next_in_step};
+use crate::received::Received;
 use crate::{Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -74,14 +75,9 @@ struct Producer {
 impl Family for Producer {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, _frame: &Frame, _session: &mut Session<NoInquiry>, _out: &mut Decoded) {}
+    fn on_frame(&mut self, _frame: &mut Received<'_>, _session: &mut Session) {}
 
-    fn request(
-        &mut self,
-        now: Nanos,
-        session: &mut Session<NoInquiry>,
-        _out: &mut Decoded,
-    ) -> Option<Frame> {
+    fn request(&mut self, now: Nanos, session: &mut Session, _out: &mut Decoded) -> Option<Frame> {
         if now < self.next {
             return None;
         }

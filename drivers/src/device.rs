@@ -101,6 +101,13 @@ impl StampedReading {
             reading,
         }
     }
+
+    /// The same reading with the stamp `acquired`.
+    #[must_use]
+    pub(crate) const fn at(mut self, acquired: Nanos, stamp: StampKind) -> Self {
+        (self.acquired, self.stamp) = (acquired, stamp);
+        self
+    }
 }
 
 /// An output of a device, as its driver states it before the device is built.

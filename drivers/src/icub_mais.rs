@@ -9,10 +9,8 @@ mod recognise;
 use crate::bringup::{Bringup, NoInquiry};
 use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class, command};
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, OutputInfo, Outputs, Spec, SpecError, StampedReading,
-    bytes,
-};
+use crate::received::Received;
+use crate::{Claim, Device, Driver, OutputInfo, Outputs, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
@@ -94,14 +92,14 @@ struct Mais {
 impl Family for Mais {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address);
         let (first, length) = match stream {
             Some(HES0TO6) => (0, SECOND),
             Some(HES7TO14) => (SECOND, SENSORS - SECOND),
             _ => return,
         };
-        let Some(data) = bytes::payload_of(usize::from(length), frame, out) else {
+        let Some(data) = frame.payload_of(usize::from(length)) else {
             return;
         };
         if session.bringup.reading(frame.t) {
@@ -122,8 +120,7 @@ impl Family for Mais {
                 position: f64::from(*count),
                 ..JointState::ABSENT
             });
-            let stamped = StampedReading::new(output, frame, quality, reading);
-            out.push(stamped, frame.id);
+            frame.tell(output, quality, reading);
         }
     }
 }

@@ -7,14 +7,12 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Session, Supervised, count_faults, quality_of};
+use crate::family::{Family, Session, Supervised, quality_of};
 use crate::held::HeldValue;
 use crate::icub::{self, class};
 use crate::icub_motor::mode;
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Outputs, Spec, SpecError,
-    StampedReading, bytes,
-};
+use crate::received::Received;
+use crate::{Claim, Device, Driver, Mode, OutputInfo, Outputs, Spec, SpecError, bytes};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
@@ -178,20 +176,14 @@ struct Mc4 {
 }
 
 impl Mc4 {
-    fn positions(
-        &self,
-        data: &[u8],
-        frame: &Frame,
-        session: &mut Session<NoInquiry>,
-        out: &mut Decoded,
-    ) {
+    fn positions(&self, data: &[u8], frame: &mut Received<'_>, session: &mut Session) {
         let gap = session.bringup.reading(frame.t);
         for (joint, output) in self.joints.iter().zip(0_u8..) {
             if !self.outputs.0.contains(&output) {
                 continue;
             }
             let mut quality = joint.status;
-            count_faults(quality, frame, out);
+            frame.faults_in(quality);
             if gap {
                 quality |= Quality::GAP_BEFORE;
             }
@@ -201,12 +193,11 @@ impl Mc4 {
                 velocity: joint.velocity.at(frame, self.hold),
                 ..JointState::ABSENT
             });
-            let stamped = StampedReading::new(output, frame, quality, reading);
-            out.push(stamped, frame.id);
+            frame.tell(output, quality, reading);
         }
     }
 
-    fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn status(&mut self, data: &[u8], frame: &mut Received<'_>) {
         let &[faults0, mode0, faults1, mode1, _, shared, ..] = data else {
             return;
         };
@@ -223,8 +214,7 @@ impl Mc4 {
                 faults,
             });
             if self.outputs.0.contains(&output) {
-                let stamped = StampedReading::new(output, frame, joint.status, reading);
-                out.push(stamped, frame.id);
+                frame.tell(output, joint.status, reading);
             }
         }
     }
@@ -233,17 +223,17 @@ impl Mc4 {
 impl Family for Mc4 {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_MOTOR, self.address);
         let Some(kind @ (kind::POSITION | kind::STATUS | kind::VELOCITY)) = stream else {
             return;
         };
-        let Some(data) = bytes::payload_of(FRAME, frame, out) else {
+        let Some(data) = frame.payload_of(FRAME) else {
             return;
         };
         match kind {
-            kind::POSITION => self.positions(data, frame, session, out),
-            kind::STATUS => self.status(data, frame, out),
+            kind::POSITION => self.positions(data, frame, session),
+            kind::STATUS => self.status(data, frame),
             _ => {
                 for (joint, at) in self.joints.iter_mut().zip([0, 2]) {
                     let steps = f64::from(bytes::i16_le(data, at));

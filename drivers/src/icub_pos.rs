@@ -10,10 +10,8 @@ use crate::bringup::{Bringup, Timing};
 use crate::configure::{Configure, Setting};
 use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class, command};
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, OutputInfo, Outputs, Spec, SpecError, StampedReading,
-    bytes,
-};
+use crate::received::Received;
+use crate::{Claim, Device, Driver, Frame, OutputInfo, Outputs, Spec, SpecError, bytes};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
@@ -223,32 +221,32 @@ struct Pos {
 impl Family for Pos {
     type Questions = Configure;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<Configure>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session<Configure>) {
         if frame.id == icub::to_host(class::POLLING_ANALOG, self.address) {
             // Answers to other questions are for other devices.
-            if let Some(data) = bytes::payload(frame, out)
+            if let Some(data) = frame.payload()
                 && data.first() == Some(&command::POS_CONFIG_GET)
             {
-                session.questions.answer(data, frame, out);
+                session.questions.answer(data, frame);
             }
             return;
         }
         if icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) != Some(POS) {
             return;
         }
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = frame.payload() else {
             return;
         };
         let &[quantity, label_and_count, ref values @ ..] = data else {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         };
         if values.len() != 2 * usize::from(VALUES) {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         }
         let (label, count) = (label_and_count >> 4, label_and_count & 0xF);
         let (code, lsb) = self.quantity.code_and_lsb();
         if quantity != code || !(1..=VALUES).contains(&count) || label + count - 1 > LABEL_MOST {
-            return out.fault(Counter::Value, 1, frame.id);
+            return frame.fault(Counter::Value);
         }
         if session.bringup.reading(frame.t) {
             self.gap = self.seen;
@@ -275,8 +273,7 @@ impl Family for Pos {
                 position,
                 ..JointState::ABSENT
             });
-            let stamped = StampedReading::new(output, frame, quality, reading);
-            out.push(stamped, frame.id);
+            frame.tell(output, quality, reading);
         }
     }
 }

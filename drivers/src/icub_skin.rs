@@ -10,9 +10,8 @@ use crate::bringup::{Bringup, NoInquiry};
 use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError, StampedReading, bytes,
-};
+use crate::received::Received;
+use crate::{Claim, Device, Driver, OutputInfo, Spec, SpecError, StampedReading};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Skin};
@@ -193,21 +192,21 @@ impl SkinPatch {
 impl Family for SkinPatch {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_SKIN, self.address);
         let Some(triangle) = stream else { return };
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = frame.payload() else {
             return;
         };
         let &[kind, ref rest @ ..] = data else {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         };
         let Ok(half) = <[u8; 7]>::try_from(rest) else {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         };
         let [first, last] = self.triangles;
         if !matches!(kind, FIRST | SECOND) || !(first..=last).contains(&triangle) {
-            return out.fault(Counter::Value, 1, frame.id);
+            return frame.fault(Counter::Value);
         }
         let Some(pairing) = self.pairing.get_mut(usize::from(triangle)) else {
             return;
@@ -217,7 +216,7 @@ impl Family for SkinPatch {
         let bit = 1 << triangle;
         if unpaired > 0 {
             self.gap |= bit & self.seen;
-            out.fault(Counter::Unpaired, unpaired, frame.id);
+            frame.faults(Counter::Unpaired, unpaired);
         }
         let Paired::With(acquired, stamp, [first, second]) = paired else {
             return;
@@ -227,19 +226,16 @@ impl Family for SkinPatch {
         }
         let (skin, mut quality) = self.skin(triangle, first, second);
         if quality.contains(Quality::DEVICE_FAULT) {
-            out.fault(Counter::DeviceFault, 1, frame.id);
+            frame.fault(Counter::DeviceFault);
         }
         if self.gap & bit != 0 {
             quality |= Quality::GAP_BEFORE;
         }
         self.gap &= !bit;
         self.seen |= bit;
-        let stamped = StampedReading {
-            acquired,
-            stamp,
-            ..StampedReading::new(0, frame, quality, Reading::Skin(skin))
-        };
-        out.push(stamped, frame.id);
+        let stamped =
+            StampedReading::new(0, frame, quality, Reading::Skin(skin)).at(acquired, stamp);
+        frame.push(stamped);
     }
 
     fn reset(&mut self) {
