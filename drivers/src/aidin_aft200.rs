@@ -59,14 +59,12 @@ impl Default for AidinAft200Options {
 
 impl AidinAft200Options {
     fn period(&self) -> Result<Nanos, SpecError> {
-        match self.period_ms {
-            1..=65 => Ok(Nanos::from_millis(i64::from(self.period_ms))),
-            other => Err(SpecError::Key {
-                key: "period_ms",
-                value: f64::from(other),
-                expected: "an integer from 1 to 65",
-            }),
-        }
+        keys::ms(
+            "period_ms",
+            self.period_ms,
+            1..=65,
+            "an integer from 1 to 65",
+        )
     }
 
     /// The identifiers of force and torque.
@@ -75,10 +73,8 @@ impl AidinAft200Options {
         let force = keys::id("id_force", self.id_force, 0..=0x7FF, expected)?;
         let torque = keys::id("id_torque", self.id_torque, 0..=0x7FF, expected)?;
         if force == torque {
-            return Err(SpecError::Keys {
-                key: "id_torque",
-                expected: "another identifier than id_force",
-            });
+            let expected = "another identifier than id_force";
+            return Err(SpecError::keys("id_torque", expected));
         }
         Ok([force, torque])
     }
@@ -86,8 +82,7 @@ impl AidinAft200Options {
 
 /// The number of the sensor. FF in its place is a command to all sensors.
 fn number(spec: &Spec) -> Result<u8, SpecError> {
-    #[allow(clippy::cast_possible_truncation)] // at most 254
-    keys::address(spec, 1..=254).map(|number| number as u8)
+    keys::address(spec, 1..=254)
 }
 
 impl Driver for AidinAft200Options {

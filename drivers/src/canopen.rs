@@ -39,21 +39,14 @@ use crate::bytes::u16_le;
 use crate::family::Session;
 use crate::objects::Objects;
 use crate::received::Received;
-use crate::{Claim, Frame, Spec, SpecError};
+use crate::{Claim, Frame, Spec, SpecError, keys};
 use alloc::format;
 use proprio_topics::{Counter, Nanos, StampKind};
 use protocol::{emcy, heartbeat};
 
 /// The node of `spec`.
 pub(crate) fn node_of(spec: &Spec) -> Result<u8, SpecError> {
-    let address = spec.address;
-    let node = u8::try_from(address).ok();
-    node.filter(|node| (1..=127).contains(node))
-        .ok_or(SpecError::Address {
-            address,
-            least: 1,
-            most: 127,
-        })
+    keys::address(spec, 1..=127)
 }
 
 /// Refuses a file that configures another node.

@@ -15,7 +15,7 @@ use crate::family::{Family, Session, Supervised};
 use crate::objects::Objects;
 use crate::received::Received;
 use crate::signal::Bits;
-use crate::{Claim, Device, Driver, Id, Mode, OutputInfo, Spec, SpecError, StampedReading};
+use crate::{Claim, Device, Driver, Id, Mode, OutputInfo, Spec, SpecError, StampedReading, keys};
 use alloc::boxed::Box;
 use alloc::format;
 use alloc::string::String;
@@ -72,23 +72,14 @@ impl Default for CanopenEncoderOptions {
 
 impl CanopenEncoderOptions {
     fn check(&self) -> Result<(), SpecError> {
-        let (key, value, expected) = if !(1..=65_535).contains(&self.period_ms) {
-            ("period_ms", f64::from(self.period_ms), "1 to 65535")
-        } else if self.sync > 240 {
-            ("sync", f64::from(self.sync), "0 to 240")
-        } else if let Some(counts) = self
-            .counts_per_turn
-            .filter(|n| !(*n > 0.0 && n.is_finite()))
-        {
-            ("counts_per_turn", counts, "above 0")
-        } else {
-            return Ok(());
-        };
-        Err(SpecError::Key {
-            key,
-            value,
-            expected,
-        })
+        keys::within("period_ms", self.period_ms, 1..=65_535, "1 to 65535")?;
+        keys::within("sync", self.sync, 0..=240, "0 to 240")?;
+        match self.counts_per_turn {
+            Some(counts) if !(counts > 0.0 && counts.is_finite()) => {
+                Err(SpecError::key("counts_per_turn", counts, "above 0"))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// The counts per turn of this very encoder by its file: of 6001 if 6000 says that it is

@@ -50,10 +50,7 @@ impl Claim {
     /// Whether `id` is in the set.
     #[must_use]
     pub fn matches(&self, id: Id) -> bool {
-        matches!(
-            (self.id, id),
-            (Id::Standard(_), Id::Standard(_)) | (Id::Extended(_), Id::Extended(_))
-        ) && (self.id.raw() ^ id.raw()) & self.mask == 0
+        self.overlaps(&Self::shared(id))
     }
 
     /// Whether some identifier is in both sets.
@@ -412,6 +409,23 @@ pub enum SpecError {
     /// A joint device without a joint, or a sensor with joints.
     #[error("{0}")]
     Joints(&'static str),
+}
+
+impl SpecError {
+    /// [`SpecError::Key`].
+    pub(crate) fn key(key: &'static str, value: impl Into<f64>, expected: &'static str) -> Self {
+        let value = value.into();
+        Self::Key {
+            key,
+            value,
+            expected,
+        }
+    }
+
+    /// [`SpecError::Keys`].
+    pub(crate) const fn keys(key: &'static str, expected: &'static str) -> Self {
+        Self::Keys { key, expected }
+    }
 }
 
 /// The host's side of a device: decoder and bring-up in one state machine.

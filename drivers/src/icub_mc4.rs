@@ -12,10 +12,9 @@ use crate::held::HeldValue;
 use crate::icub::{self, class};
 use crate::icub_motor::mode;
 use crate::received::Received;
-use crate::{Claim, Device, Driver, Mode, OutputInfo, Outputs, Spec, SpecError, bytes};
+use crate::{Device, Driver, Mode, OutputInfo, Outputs, Spec, SpecError, bytes, keys};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
 use proprio_topics::{Actuator, JointState, Kind, Nanos, Quality, Reading};
 use serde::Deserialize;
@@ -85,24 +84,16 @@ struct StepSizes {
 }
 
 impl IcubMc4Options {
+    fn hold(&self) -> Result<Nanos, SpecError> {
+        keys::ms("hold_ms", self.hold_ms, 1..=1000, "1 to 1000")
+    }
+
     fn scales(&self) -> Result<[StepSizes; JOINTS], SpecError> {
-        let error = |key, value, expected| SpecError::Key {
-            key,
-            value,
-            expected,
-        };
-        if !(1..=1000).contains(&self.hold_ms) {
-            return Err(error("hold_ms", f64::from(self.hold_ms), "1 to 1000"));
-        }
         for ticks in self.ticks_per_turn {
-            if !(ticks > 0.0 && ticks.is_finite()) {
-                return Err(error("ticks_per_turn", ticks, "a number above 0"));
-            }
+            keys::above_zero("ticks_per_turn", ticks)?;
         }
         for shift in self.velocity_shift {
-            if shift > 15 {
-                return Err(error("velocity_shift", f64::from(shift), "0 to 15"));
-            }
+            keys::within("velocity_shift", shift, 0..=15, "0 to 15")?;
         }
         let [ticks0, ticks1] = self.ticks_per_turn;
         let [shift0, shift1] = self.velocity_shift;
@@ -126,19 +117,20 @@ impl Driver for IcubMc4Options {
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
         let address = icub::address(spec)?;
         icub::period_ms("period_ms", self.period_ms)?;
+        let hold = self.hold()?;
         let joints = self.scales()?.map(|scale| Mc4Joint {
             scale,
             velocity: HeldValue::ABSENT,
             status: Quality::GOOD,
         });
         let kinds = [kind::POSITION, kind::STATUS, kind::VELOCITY];
-        let claims: ArrayVec<Claim, 3> = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
+        let claims = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
         let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::POSITION);
         let bringup = Bringup::new(spec, Mode::Listen, Timing::USUAL, watched);
         let this = Mc4 {
             address,
             outputs: spec.outputs.clone(),
-            hold: Nanos::from_millis(i64::from(self.hold_ms)),
+            hold,
             joints,
         };
         Ok(Supervised::boxed(claims, bringup, NoInquiry, this))

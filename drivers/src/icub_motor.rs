@@ -10,10 +10,9 @@ use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class};
 use crate::received::Received;
-use crate::{Claim, Device, Driver, Mode, OutputInfo, Spec, SpecError, bytes};
+use crate::{Device, Driver, Mode, OutputInfo, Spec, SpecError, bytes};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
 use proprio_topics::{Actuator, Counter, JointState, Kind, Quality, Reading};
 use serde::Deserialize;
@@ -119,7 +118,7 @@ impl Driver for IcubMotorOptions {
             kind::OVERFLOW,
         ];
         let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::TWO_FOC);
-        let claims: ArrayVec<Claim, 4> = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
+        let claims = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
         let bringup = Bringup::new(spec, Mode::Listen, Timing::USUAL, watched);
         let this = TwoFoc {
             address,

@@ -8,7 +8,7 @@ mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::family::{Family, Session, Supervised};
-use crate::icub::{self, class, command};
+use crate::icub::{self, OutputGaps, class, command};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
 use crate::received::Received;
 use crate::{Claim, Device, Driver, OutputInfo, Spec, SpecError, StampedReading};
@@ -92,10 +92,10 @@ impl IcubSkinOptions {
     fn check(&self) -> Result<(), SpecError> {
         match self.triangles {
             [first, last] if first <= last && usize::from(last) < TRIANGLES => Ok(()),
-            _ => Err(SpecError::Keys {
-                key: "triangles",
-                expected: "the first and the last of 0 to 15",
-            }),
+            _ => {
+                let expected = "the first and the last of 0 to 15";
+                Err(SpecError::keys("triangles", expected))
+            }
         }
     }
 }
@@ -115,11 +115,8 @@ impl Driver for IcubSkinOptions {
             None => Limit::of_period(Nanos::from_millis(i64::from(period))),
             Some(ms) if ms > 0.0 && ms <= 1000.0 => Limit::fixed(Nanos::from_seconds(ms * 1e-3)),
             Some(value) => {
-                return Err(SpecError::Key {
-                    key: "pair_timeout_ms",
-                    value,
-                    expected: "above 0, at most 1000",
-                });
+                let expected = "above 0, at most 1000";
+                return Err(SpecError::key("pair_timeout_ms", value, expected));
             }
         };
         let timing = icub::timing(self.power_on_silence_ms)?;
@@ -148,8 +145,7 @@ impl Driver for IcubSkinOptions {
             no_load: self.no_load,
             triangles: self.triangles,
             pairing: core::array::from_fn(|_| Pairing::new(limit, HalfOrder::Usual)),
-            gap: 0,
-            seen: 0,
+            gaps: OutputGaps::default(),
         };
         Ok(Supervised::boxed([claim], bringup, NoInquiry, this))
     }
@@ -162,10 +158,8 @@ struct SkinPatch {
     no_load: u8,
     triangles: [u8; 2],
     pairing: [Pairing<[u8; 7]>; TRIANGLES],
-    /// Triangles whose next reading follows a gap, one bit each.
-    gap: u16,
-    /// Triangles that have been read, one bit each.
-    seen: u16,
+    /// Of the triangles.
+    gaps: OutputGaps,
 }
 
 impl SkinPatch {
@@ -213,26 +207,21 @@ impl Family for SkinPatch {
         };
         let mut unpaired = 0;
         let paired = pairing.push(kind == SECOND, frame, half, &mut unpaired);
-        let bit = 1 << triangle;
         if unpaired > 0 {
-            self.gap |= bit & self.seen;
+            self.gaps.one(triangle);
             frame.faults(Counter::Unpaired, unpaired);
         }
         let Paired::With(acquired, stamp, [first, second]) = paired else {
             return;
         };
         if session.bringup.reading(frame.t) {
-            self.gap = self.seen;
+            self.gaps.all();
         }
         let (skin, mut quality) = self.skin(triangle, first, second);
         if quality.contains(Quality::DEVICE_FAULT) {
             frame.fault(Counter::DeviceFault);
         }
-        if self.gap & bit != 0 {
-            quality |= Quality::GAP_BEFORE;
-        }
-        self.gap &= !bit;
-        self.seen |= bit;
+        quality |= self.gaps.take(triangle);
         let stamped =
             StampedReading::new(0, frame, quality, Reading::Skin(skin)).at(acquired, stamp);
         frame.push(stamped);

@@ -13,6 +13,7 @@ use crate::held::OnChange;
 use crate::received::Received;
 use crate::{
     Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, NotSent, OutputInfo, Spec, SpecError,
+    keys,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -73,28 +74,13 @@ impl Default for MoteusOptions {
 impl MoteusOptions {
     /// The controller's address and the period.
     fn check(&self, spec: &Spec) -> Result<(u8, Nanos), SpecError> {
-        let address = spec.address;
-        let (least, most) = (1, 127);
-        let range = SpecError::Address {
-            address,
-            least,
-            most,
-        };
-        let node = u8::try_from(address).ok();
-        let node = node.filter(|n| (1..=127).contains(n)).ok_or(range)?;
-        let key = |key, value, expected| SpecError::Key {
-            key,
-            value,
-            expected,
-        };
-        if !(1..=1000).contains(&self.period_ms) {
-            return Err(key("period_ms", f64::from(self.period_ms), "1 to 1000"));
-        }
+        let node = keys::address(spec, 1..=127)?;
+        let period = keys::ms("period_ms", self.period_ms, 1..=1000, "1 to 1000")?;
         if self.host > 127 || self.host == node {
             let expected = "0 to 127, and not the controller's address";
-            return Err(key("host", f64::from(self.host), expected));
+            return Err(SpecError::key("host", self.host, expected));
         }
-        Ok((node, Nanos::from_millis(i64::from(self.period_ms))))
+        Ok((node, period))
     }
 }
 

@@ -15,6 +15,19 @@ pub(super) const TIMING: Timing = Timing {
     ..Timing::POLLED
 };
 
+/// \[N or Nm per gauge count\], by axis and gauge.
+pub(super) fn per_count(
+    mut matrix: [[f64; 6]; 6],
+    [force, torque]: [f64; 2],
+    [newton, newton_metre]: [f64; 2],
+) -> [[f64; 6]; 6] {
+    let (f, t) = (newton / force, newton_metre / torque);
+    for (row, unit) in matrix.iter_mut().zip([f, f, f, t, t, t]) {
+        *row = row.map(|entry| entry * unit);
+    }
+    matrix
+}
+
 /// The requests, in their order: select a calibration, counts, units, six rows.
 const SELECT: u8 = 0;
 const COUNTS: u8 = 1;
@@ -273,18 +286,7 @@ impl CalibrationQuery {
             return;
         }
         self.refusal = None;
-        let ([force, torque], [newton, newton_metre]) = (counts, units);
-        let [fx, fy, fz, tx, ty, tz] = self.matrix;
-        let scaled = |row: [f64; 6], unit: f64| row.map(|x| x * unit);
-        let (f, t) = (newton / force, newton_metre / torque);
-        self.per_count = Some([
-            scaled(fx, f),
-            scaled(fy, f),
-            scaled(fz, f),
-            scaled(tx, t),
-            scaled(ty, t),
-            scaled(tz, t),
-        ]);
+        self.per_count = Some(per_count(self.matrix, counts, units));
     }
 
     /// Whether the current request is not needed.

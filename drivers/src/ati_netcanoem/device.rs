@@ -92,7 +92,7 @@ impl Netcanoem {
         let in_time = self
             .firsts
             .first()
-            .is_none_or(|first| within((first.t, first.stamp), (frame.t, frame.stamp), LIMIT));
+            .is_none_or(|first| within((first.t, first.stamp), frame, LIMIT));
         if self.firsts.is_full() || !in_time {
             self.drop_all(session, frame);
         }
@@ -114,7 +114,7 @@ impl Netcanoem {
         let in_time = self
             .firsts
             .first()
-            .is_some_and(|first| within((first.t, first.stamp), (frame.t, frame.stamp), LIMIT));
+            .is_some_and(|first| within((first.t, first.stamp), frame, LIMIT));
         if !in_time {
             if !core::mem::take(&mut self.joined) {
                 session.lost(Counter::Unpaired, 1, frame);

@@ -5,11 +5,11 @@ use super::frames::{
 };
 use super::options::{DamiaoKeys, DamiaoOptions};
 use super::ranges::Ranges;
-use crate::bringup::{Bringup, Timing};
+use crate::bringup::Bringup;
 use crate::family::{Family, Rounds, Session, Supervised};
 use crate::held::OnChange;
 use crate::received::Received;
-use crate::{Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, mit};
+use crate::{Claim, Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError, mit};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Actuator, Counter, Kind, Nanos, Quality, Reading};
@@ -68,18 +68,14 @@ impl Driver for DamiaoOptions {
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
         let keys = DamiaoKeys::new(spec, self)?;
-        let (mode, timing) = match keys.request_period {
-            Some(_) => (spec.mode, Timing::POLLED),
-            None => (Mode::Listen, Timing::LISTENED),
-        };
-        let bringup = Bringup::new(spec, mode, timing, keys.id);
+        let bringup = Bringup::polled(spec, keys.request_period, keys.id);
         let this = DamiaoMotor {
             keys,
             told: OnChange::NOTHING,
             questions: Rounds::new(keys.request_period),
         };
         let claims = [Claim::shared(keys.id)];
-        let ranges = Ranges::new(keys, mode);
+        let ranges = Ranges::new(keys, bringup.mode());
         Ok(Supervised::boxed(claims, bringup, ranges, this))
     }
 }

@@ -3,7 +3,7 @@
 use super::frames::{RANGES, READ, question};
 use super::options::DamiaoKeys;
 use crate::bringup::{Ask, Attempts, Inquiry, Timing};
-use crate::mit::Scale;
+use crate::mit::{self, Scale};
 use crate::received::Received;
 use crate::{Mode, NotSent};
 use proprio_topics::{Counter, Nanos, Refusal};
@@ -41,12 +41,7 @@ impl Ranges {
 
     /// Position, velocity and torque, if all are known.
     pub(super) fn scales(&self) -> Option<[Scale; 3]> {
-        let [position, velocity, torque] = [self.end(0)?, self.end(1)?, self.end(2)?];
-        Some([
-            Scale::range(position, 16),
-            Scale::range(velocity, 12),
-            Scale::range(torque, 12),
-        ])
+        Some(mit::scales([self.end(0)?, self.end(1)?, self.end(2)?]))
     }
 
     /// The motor has told the value of a register in `frame`.

@@ -104,7 +104,7 @@ impl Assembly {
     /// Takes the values of a frame. True if the reading is complete.
     fn take(&mut self, part: &SignalGroup, sender: Option<u8>, frame: &mut Received<'_>) -> bool {
         let begun = (self.t, self.stamp);
-        let in_time = within(begun, (frame.t, frame.stamp), self.layout.limit);
+        let in_time = within(begun, frame, self.layout.limit);
         if self.have != 0 && in_time && sender.zip(self.sender).is_some_and(|(a, b)| a != b) {
             // Of another device that sends the same message.
             frame.fault(Counter::Unexpected);

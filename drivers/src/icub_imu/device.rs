@@ -16,7 +16,6 @@ use crate::{
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, StampKind};
 
 /// A frame up to this many sequence numbers back is late; further back, the counter has restarted
@@ -189,8 +188,7 @@ impl ImuDevice {
             return;
         }
         let begun = (self.acquisition.acquired, self.acquisition.stamp);
-        if !self.acquisition.open || !pairing::within(begun, (frame.t, frame.stamp), self.together)
-        {
+        if !self.acquisition.open || !pairing::within(begun, frame, self.together) {
             frame.fault(Counter::Unpaired);
             self.gap = true;
             return;
@@ -302,8 +300,7 @@ impl Driver for IcubImuOptions {
         );
         let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
         let id = icub::to_board(class::POLLING_ANALOG, plan.address);
-        let mut claims: ArrayVec<Claim, 4> =
-            icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);
+        let mut claims = icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);
         if is_legacy {
             bringup.start_with(
                 id,

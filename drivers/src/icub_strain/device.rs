@@ -15,7 +15,6 @@ use crate::{
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use arrayvec::ArrayVec;
 use proprio_topics::{
     Counter, Gauges, Kind, Nanos, Quality, Reading, Refusal, StampKind, Temperature, Wrench,
 };
@@ -318,15 +317,10 @@ impl Driver for IcubStrainOptions {
         let timing = icub::timing(self.power_on_silence_ms)?;
         let limit = match self.pair_timeout_ms {
             None => Limit::of_period(Nanos::from_millis(i64::from(period))),
-            Some(ms) if ms.is_finite() && ms > 0.0 && ms <= 1000.0 => {
-                Limit::fixed(Nanos::from_seconds(ms * 1e-3))
-            }
+            Some(ms) if ms > 0.0 && ms <= 1000.0 => Limit::fixed(Nanos::from_seconds(ms * 1e-3)),
             Some(value) => {
-                return Err(SpecError::Key {
-                    key: "pair_timeout_ms",
-                    value,
-                    expected: "above 0 and at most 1000",
-                });
+                let expected = "above 0 and at most 1000";
+                return Err(SpecError::key("pair_timeout_ms", value, expected));
             }
         };
         let (force, command_id) = (
@@ -349,7 +343,7 @@ impl Driver for IcubStrainOptions {
         }
         bringup.start_with(command_id, &[command::SET_TXMODE, self.stream.code()]);
         bringup.stop_with(command_id, &[command::SET_TXMODE, 1]);
-        let mut claims: ArrayVec<Claim, 7> = icub::claims(
+        let mut claims = icub::claims(
             class::PERIODIC_ANALOG,
             address,
             &[

@@ -2,7 +2,7 @@
 
 use super::frames::{Answer, JOINT, LENGTH, MOTOR, MotorStatus, MyactuatorProtocol, command};
 use super::options::{MyactuatorKeys, MyactuatorOptions, MyactuatorPosition};
-use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::bringup::{Bringup, NoInquiry};
 use crate::family::{Family, Rounds, Session, Supervised};
 use crate::held::{HeldValue, OnChange};
 use crate::received::Received;
@@ -113,16 +113,12 @@ impl Driver for MyactuatorOptions {
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
         let keys = MyactuatorKeys::new(spec, self)?;
-        let (mode, timing) = match keys.request_period {
-            Some(_) => (spec.mode, Timing::POLLED),
-            None => (Mode::Listen, Timing::LISTENED),
-        };
         let mut claims = [Claim::exclusive(keys.answers())].to_vec();
         if keys.position == MyactuatorPosition::Motion {
             claims.insert(0, Claim::exclusive(keys.motion()));
         }
         let watched = claims.first().map_or(keys.answers(), |claim| claim.id);
-        let bringup = Bringup::new(spec, mode, timing, watched);
+        let bringup = Bringup::polled(spec, keys.request_period, watched);
         let this = MyactuatorMotor {
             keys,
             errors: 0,

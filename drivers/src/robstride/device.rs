@@ -5,11 +5,11 @@ use super::frames::{
     parameter,
 };
 use super::options::{RobstrideKeys, RobstrideOptions, RobstrideProtocol};
-use crate::bringup::{Bringup, NoInquiry, Timing};
+use crate::bringup::{Bringup, NoInquiry};
 use crate::family::{Family, Rounds, Session, Supervised, quality_of};
 use crate::held::{HeldValue, OnChange};
 use crate::received::Received;
-use crate::{Claim, Decoded, Device, Driver, Frame, Id, Mode, OutputInfo, Spec, SpecError, mit};
+use crate::{Claim, Decoded, Device, Driver, Frame, Id, OutputInfo, Spec, SpecError, mit};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
@@ -126,10 +126,6 @@ impl Driver for RobstrideOptions {
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
         let keys = RobstrideKeys::new(spec, self)?;
-        let (mode, timing) = match keys.request_period {
-            Some(_) => (spec.mode, Timing::POLLED),
-            None => (Mode::Listen, Timing::LISTENED),
-        };
         let (address, host) = (keys.address, keys.host);
         let mut claims = match keys.protocol {
             RobstrideProtocol::Private => {
@@ -142,7 +138,7 @@ impl Driver for RobstrideOptions {
             claims.swap(0, 1);
         }
         let watched = claims.first().map_or(Id::standard(0), |claim| claim.id);
-        let bringup = Bringup::new(spec, mode, timing, watched);
+        let bringup = Bringup::polled(spec, keys.request_period, watched);
         let this = RobstrideMotor {
             keys,
             mode: 0,
