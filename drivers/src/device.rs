@@ -353,6 +353,17 @@ pub struct Spec {
     pub outputs: Outputs,
 }
 
+impl Spec {
+    /// The same in another mode.
+    #[must_use]
+    pub fn in_mode(&self, mode: Mode) -> Self {
+        Self {
+            mode,
+            ..self.clone()
+        }
+    }
+}
+
 /// A configuration that a driver cannot use.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]

@@ -141,10 +141,7 @@ fn fd(id: Id, data: &[u8]) -> Option<Frame> {
     while filled.len() < length {
         filled.push(NOTHING);
     }
-    let format = Format::Fd {
-        bit_rate_switch: true,
-        error_state: false,
-    };
+    let format = Format::fd(true, false);
     Frame::with_format(id, format, &filled)
 }
 
