@@ -98,6 +98,23 @@ impl CdrMessage {
         self.bytes.extend(text.bytes());
         self.bytes.push(0);
     }
+
+    /// A sequence of which `each` writes an element.
+    pub fn sequence<T>(&mut self, all: &[T], mut each: impl FnMut(&mut Self, &T)) {
+        self.count(all.len());
+        all.iter().for_each(|one| each(self, one));
+    }
+
+    /// A sequence of `float64`.
+    pub fn numbers<T>(&mut self, all: &[T], number: impl Fn(&T) -> f64) {
+        self.sequence(all, |message, one| message.f64s(&[number(one)]));
+    }
+
+    /// A sequence of `string`.
+    pub fn texts<'t, T>(&mut self, all: &'t [T], text: impl Fn(&'t T) -> &'t str) {
+        self.count(all.len());
+        all.iter().for_each(|one| self.text(text(one)));
+    }
 }
 
 /// A message that is being read.

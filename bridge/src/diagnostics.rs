@@ -38,22 +38,14 @@ pub(crate) fn of(
     estimator: Option<&EstimatorHealth>,
     now: Nanos,
 ) -> Vec<DiagnosticStatus> {
-    let mut all = vec![daemon(
-        robot,
-        "gateway",
-        gateway.map(|it| it.header.published),
-        now,
-    )];
+    let published = gateway.map(|it| it.header.published);
+    let mut all = vec![daemon(robot, "gateway", published, now)];
     if let Some(health) = gateway {
         all.extend(health.buses().iter().map(|it| bus(robot, it)));
         all.extend(health.devices().iter().map(|it| device(robot, it)));
     }
-    let mut status = daemon(
-        robot,
-        "estimator",
-        estimator.map(|it| it.header.published),
-        now,
-    );
+    let published = estimator.map(|it| it.header.published);
+    let mut status = daemon(robot, "estimator", published, now);
     if let Some(health) = estimator {
         if status.level == Level::Ok {
             let since = now.saturating_sub(health.last_estimate);
@@ -74,21 +66,16 @@ pub(crate) fn of(
             ("late", health.late.to_string()),
         ];
         if health.identification.groups > 0 {
-            status
-                .values
-                .push(("identification", health.identification.to_string()));
+            let identification = health.identification.to_string();
+            status.values.push(("identification", identification));
         }
     }
     all.push(status);
     // What a silent daemon said last may no longer hold.
-    if all
-        .first()
-        .is_some_and(|gateway| gateway.level == Level::Stale)
+    if let [gateway, parts @ .., _] = all.as_mut_slice()
+        && gateway.level == Level::Stale
     {
-        let parts = all.len() - 1;
-        for status in all.iter_mut().take(parts) {
-            status.level = Level::Stale;
-        }
+        parts.iter_mut().for_each(|part| part.level = Level::Stale);
     }
     all
 }

@@ -330,37 +330,26 @@ impl<S: MessageSink> Messages<S> {
         self.send("/torques", definitions::torques, t, |_| {
             let mut message = CdrMessage::new();
             message.i64(t.0);
-            message.count(joints.len());
-            joints.iter().for_each(|(name, _)| message.text(name));
-            message.count(joints.len());
-            (joints.iter()).for_each(|(_, joint)| message.f64s(&[joint.torque]));
-            message.count(joints.len());
-            (joints.iter()).for_each(|(_, joint)| message.f64s(&[joint.standard_deviation]));
-            message.count(joints.len());
-            (joints.iter()).for_each(|(_, joint)| message.bool(joint.valid == 1));
-            message.count(joints.len());
-            (joints.iter()).for_each(|(_, joint)| message.text(reason(joint)));
-            message.count(joints.len());
-            for (_, joint) in &joints {
-                message.text(name(names, Role::Channel, joint.cause));
-            }
+            message.texts(&joints, |(name, _)| name);
+            message.numbers(&joints, |(_, joint)| joint.torque);
+            message.numbers(&joints, |(_, joint)| joint.standard_deviation);
+            message.sequence(&joints, |message, (_, joint)| {
+                message.bool(joint.valid == 1)
+            });
+            message.texts(&joints, |(_, joint)| reason(joint));
+            message.texts(&joints, |(_, joint)| {
+                name(names, Role::Channel, joint.cause)
+            });
             message
         })?;
         let states = joints.iter().map(|(name, _)| self.state(name, t));
         let states: Vec<JointState> = states.collect();
         self.send("/joint_states", definitions::joint_state, t, |wall| {
             let mut message = CdrMessage::stamped(wall, "");
-            message.count(joints.len());
-            joints.iter().for_each(|(name, _)| message.text(name));
-            message.count(states.len());
-            (states.iter()).for_each(|state| message.f64s(&[state.position]));
-            message.count(states.len());
-            (states.iter()).for_each(|state| message.f64s(&[state.velocity]));
-            message.count(joints.len());
-            for (_, joint) in &joints {
-                let is_valid = joint.valid == 1;
-                message.f64s(&[if is_valid { joint.torque } else { f64::NAN }]);
-            }
+            message.texts(&joints, |(name, _)| name);
+            message.numbers(&states, |state| state.position);
+            message.numbers(&states, |state| state.velocity);
+            message.numbers(&joints, |(_, joint)| usable(joint));
             message
         })
     }
@@ -379,13 +368,12 @@ impl<S: MessageSink> Messages<S> {
         for (joint_name, joint) in joints(names, estimate) {
             let topic = format!("/torque/{joint_name}");
             self.send(&topic, definitions::joint_torque, t, |_| {
-                let is_valid = joint.valid == 1;
-                let torque = if is_valid { joint.torque } else { f64::NAN };
+                let torque = usable(joint);
                 let half = 2.0 * joint.standard_deviation;
                 let mut message = CdrMessage::new();
                 message.i64(t.0);
                 message.f64s(&[torque, torque - half, torque + half]);
-                message.bool(is_valid);
+                message.bool(joint.valid == 1);
                 message.text(reason(joint));
                 message.text(name(names, Role::Channel, joint.cause));
                 message
@@ -423,15 +411,14 @@ impl<S: MessageSink> Messages<S> {
             message.i64(t.0);
             message.count(estimate.contacts().len());
             for (contact, number) in estimate.contacts().iter().zip(0..) {
-                message.text(entry(number).map_or("", |entry| entry.name.as_str()));
+                message.text(name(names, Role::Contact, number));
                 message.text(entry(number).map_or("", |entry| entry.origin.as_str()));
                 message.f64s(&contact.force);
                 message.f64s(&contact.torque);
                 message.f64s(&contact.standard_deviation);
                 message.bool(contact.valid == 1);
                 message.text(contact.reason.get().map_or("?", |reason| reason.word()));
-                let cause = names.find(Role::Channel, contact.cause);
-                message.text(cause.map_or("", |entry| entry.name.as_str()));
+                message.text(name(names, Role::Channel, contact.cause));
                 message.bool(contact.detected == 1);
                 message.bool(contact.located == 1);
                 message.f64s(&contact.position);
@@ -471,28 +458,19 @@ impl<S: MessageSink> Messages<S> {
         self.send("/drives", definitions::drives, t, |_| {
             let mut message = CdrMessage::new();
             message.i64(t.0);
-            message.count(drives.len());
-            (drives.iter()).for_each(|own| message.text(name(names, Role::Joint, own.joint)));
-            message.count(drives.len());
-            drives.iter().for_each(|own| message.f64s(&[own.torque]));
-            message.count(drives.len());
-            (drives.iter()).for_each(|own| message.f64s(&[own.standard_deviation]));
-            message.count(drives.len());
-            for own in drives {
-                message.text(own.agreement.get().map_or("?", Agreement::word));
-            }
-            message.count(drives.len());
-            drives.iter().for_each(|own| message.f64s(&[own.deviate]));
-            message.count(drives.len());
-            (drives.iter()).for_each(|own| message.text(name(names, Role::Joint, own.group)));
-            message.count(candidates.len());
-            for own in candidates {
-                message.text(own.kind.get().map_or("?", Candidate::word));
-            }
-            message.count(candidates.len());
-            (candidates.iter()).for_each(|own| message.text(own.name.as_str()));
-            message.count(candidates.len());
-            (candidates.iter()).for_each(|own| message.text(name(names, Role::Joint, own.joint)));
+            message.texts(drives, |own| name(names, Role::Joint, own.joint));
+            message.numbers(drives, |own| own.torque);
+            message.numbers(drives, |own| own.standard_deviation);
+            message.texts(drives, |own| {
+                own.agreement.get().map_or("?", Agreement::word)
+            });
+            message.numbers(drives, |own| own.deviate);
+            message.texts(drives, |own| name(names, Role::Joint, own.group));
+            message.texts(candidates, |own| {
+                own.kind.get().map_or("?", Candidate::word)
+            });
+            message.texts(candidates, |own| own.name.as_str());
+            message.texts(candidates, |own| name(names, Role::Joint, own.joint));
             message
         })
     }
@@ -559,6 +537,14 @@ fn joints<'a>(
 ) -> impl Iterator<Item = (&'a str, &'a JointTorque)> {
     (estimate.joints().iter().zip(0..))
         .map(|(joint, number)| (name(names, Role::Joint, number), joint))
+}
+
+/// A torque; NaN if it is withheld.
+fn usable(joint: &JointTorque) -> f64 {
+    match joint.valid {
+        1 => joint.torque,
+        _ => f64::NAN,
+    }
 }
 
 /// Why a torque is withheld.

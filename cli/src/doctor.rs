@@ -96,21 +96,19 @@ const fn word(verdict: Readiness) -> &'static str {
     }
 }
 
-fn finding(
-    what: &'static str,
-    verdict: Readiness,
-    says: impl Into<String>,
-    hint: &str,
-) -> CheckResult {
+fn ok(what: &'static str, says: impl Into<String>) -> CheckResult {
+    CheckResult {
+        verdict: Readiness::Ok,
+        ..lacking(what, says, "")
+    }
+}
+
+fn lacking(what: &'static str, says: impl Into<String>, hint: impl Into<String>) -> CheckResult {
     CheckResult {
         what,
-        verdict,
+        verdict: Readiness::Lacking,
         says: says.into(),
-        hint: if verdict == Readiness::Ok {
-            String::new()
-        } else {
-            hint.into()
-        },
+        hint: hint.into(),
     }
 }
 
@@ -122,25 +120,18 @@ fn can() -> CheckResult {
         SockFlag::SOCK_CLOEXEC,
         None,
     ) {
-        Ok(_) => finding(
-            "kernel CAN",
-            Readiness::Ok,
-            "the kernel has raw CAN sockets",
-            "",
-        ),
+        Ok(_) => ok("kernel CAN", "the kernel has raw CAN sockets"),
         // An existing family refuses protocol 0; a missing family returns a different error.
         Err(nix::Error::EPROTONOSUPPORT | nix::Error::EPROTOTYPE) => {
-            finding("kernel CAN", Readiness::Ok, "the kernel has CAN", "")
+            ok("kernel CAN", "the kernel has CAN")
         }
-        Err(nix::Error::EPERM | nix::Error::EACCES) => finding(
+        Err(nix::Error::EPERM | nix::Error::EACCES) => lacking(
             "kernel CAN",
-            Readiness::Lacking,
             "the kernel has CAN, but this user has no permission to open it",
             "give the process CAP_NET_RAW, or run it as another user",
         ),
-        Err(error) => finding(
+        Err(error) => lacking(
             "kernel CAN",
-            Readiness::Lacking,
             format!("the kernel has no CAN ({error})"),
             "`modprobe can-raw` if the kernel has it as a module; otherwise use the virtual bus: \
              source = { kind = \"virtual\", name = \"...\" }",
@@ -169,23 +160,19 @@ fn interfaces() -> Vec<CheckResult> {
         );
         findings.push(match netlink.ask(name) {
             Ok(health) => interface(name, &system, &health),
-            Err(error) => finding(
+            Err(error) => lacking(
                 INTERFACE,
-                Readiness::Lacking,
                 format!("{system}; its controller is not known ({error})"),
                 "allow AF_NETLINK sockets",
             ),
         });
     }
     if findings.is_empty() {
-        let hint = "`ip link add dev vcan0 type vcan && ip link set vcan0 up` creates a virtual \
-                    one; `ip link set can0 up type can bitrate 1000000 restart-ms 100` brings a \
-                    real one up";
-        findings.push(finding(
+        findings.push(lacking(
             INTERFACE,
-            Readiness::Lacking,
             "no CAN interface",
-            hint,
+            "`ip link add dev vcan0 type vcan && ip link set vcan0 up` creates a virtual one; `ip \
+             link set can0 up type can bitrate 1000000 restart-ms 100` brings a real one up",
         ));
     }
     findings
@@ -235,37 +222,27 @@ fn interface(name: &str, system: &str, health: &InterfaceHealth) -> CheckResult 
         health.tx_errors,
         health.tx_dropped
     );
-    let (verdict, hint) = match controller {
-        Controller::BusOff => (
-            Readiness::Lacking,
-            format!(
-                "bus-off: check the cable, the termination and the bit-rate, then `ip link set \
-                 {name} type can restart`"
-            ),
+    let hint = match controller {
+        Controller::BusOff => format!(
+            "bus-off: check the cable, the termination and the bit-rate, then `ip link set {name} \
+             type can restart`"
         ),
-        Controller::Warning | Controller::Passive => (
-            Readiness::Lacking,
-            "many errors: check the cable, the termination and the bit-rate".to_owned(),
-        ),
-        Controller::Unknown => (Readiness::Ok, String::new()),
+        Controller::Warning | Controller::Passive => {
+            "many errors: check the cable, the termination and the bit-rate".to_owned()
+        }
         // A stopped one is that of an interface that is down.
         Controller::Active | Controller::Stopped | Controller::Sleeping
             if health.restart_ms == 0 =>
         {
-            (
-                Readiness::Lacking,
-                format!(
-                    "restart-ms 0: after too many errors (bus-off) it stays off until a person \
-                     restarts it; `ip link set {name} down && ip link set {name} up type can \
-                     restart-ms 100`"
-                ),
+            format!(
+                "restart-ms 0: after too many errors (bus-off) it stays off until a person \
+                 restarts it; `ip link set {name} down && ip link set {name} up type can \
+                 restart-ms 100`"
             )
         }
-        Controller::Active | Controller::Stopped | Controller::Sleeping => {
-            (Readiness::Ok, String::new())
-        }
+        _ => return ok(INTERFACE, says),
     };
-    finding(INTERFACE, verdict, says, &hint)
+    lacking(INTERFACE, says, hint)
 }
 
 fn virtual_bus(domain: &DomainConfig) -> CheckResult {
@@ -287,15 +264,12 @@ fn virtual_bus(domain: &DomainConfig) -> CheckResult {
         }
     };
     match test() {
-        Ok(took) => finding(
+        Ok(took) => ok(
             "virtual bus",
-            Readiness::Ok,
             format!("a frame arrives after {} us", took.0 / 1000),
-            "",
         ),
-        Err(problem) => finding(
+        Err(problem) => lacking(
             "virtual bus",
-            Readiness::Lacking,
             problem,
             "`ip link set lo up`; IPv4 multicast on it must not be filtered",
         ),
@@ -312,9 +286,8 @@ fn shared_memory(domain: &DomainConfig) -> CheckResult {
     let in_memory = statfs(&probe.base)
         .is_ok_and(|system| [TMPFS_MAGIC, RAMFS_MAGIC].contains(&system.filesystem_type()));
     match opened {
-        Ok(()) if !in_memory => finding(
+        Ok(()) if !in_memory => lacking(
             "shared memory",
-            Readiness::Lacking,
             format!(
                 "a domain opens, but its folder {} is on a disk: starts and restarts wait for the \
                  disk, for seconds if others write to it",
@@ -332,22 +305,24 @@ fn shared_memory(domain: &DomainConfig) -> CheckResult {
                  {more} MB for each bus",
                 probe.base.display()
             );
-            let (verdict, remedy) = match free >= one + more {
-                true => (Readiness::Ok, ""),
-                false => (
-                    Readiness::Lacking,
-                    "remove files in /dev/shm, or `mount -o remount,size=256M /dev/shm`; in a \
-                     container --shm-size",
-                ),
-            };
-            finding("shared memory", verdict, what, remedy)
+            if free >= one + more {
+                return ok("shared memory", what);
+            }
+            lacking(
+                "shared memory",
+                what,
+                "remove files in /dev/shm, or `mount -o remount,size=256M /dev/shm`; in a \
+                 container --shm-size",
+            )
         }
-        Err(error) => finding(
-            "shared memory",
-            Readiness::Failed,
-            error.to_string(),
-            "gateway, estimator and consumers need it",
-        ),
+        Err(error) => CheckResult {
+            verdict: Readiness::Failed,
+            ..lacking(
+                "shared memory",
+                error.to_string(),
+                "gateway, estimator and consumers need it",
+            )
+        },
     }
 }
 
@@ -360,16 +335,10 @@ fn buffers() -> CheckResult {
     };
     let most = number("/proc/sys/net/core/rmem_max").unwrap_or(0);
     if most >= WANTED || has_capability(CAP_NET_ADMIN) {
-        return finding(
-            "receive buffers",
-            Readiness::Ok,
-            "a burst of thousands of frames fits",
-            "",
-        );
+        return ok("receive buffers", "a burst of thousands of frames fits");
     }
-    finding(
+    lacking(
         "receive buffers",
-        Readiness::Lacking,
         format!(
             "at most {most} bytes: room for about {} frames while the gateway is not scheduled",
             most / 768
@@ -383,18 +352,13 @@ fn open_files() -> CheckResult {
     // more adds two or three to each. The most buses and a dozen readers stay below this.
     const WANTED: u64 = 256;
     let limit = getrlimit(Resource::RLIMIT_NOFILE).map_or(0, |(soft, _)| soft);
+    let says = format!("a process may open {limit}; a run needs {WANTED} at most");
     if limit >= WANTED {
-        return finding(
-            "open files",
-            Readiness::Ok,
-            format!("a process may open {limit}; a run needs {WANTED} at most"),
-            "",
-        );
+        return ok("open files", says);
     }
-    finding(
+    lacking(
         "open files",
-        Readiness::Lacking,
-        format!("a process may open {limit}; a run needs {WANTED} at most"),
+        says,
         "`ulimit -n 1024` in the shell, or LimitNOFILE=1024 in the systemd unit",
     )
 }
@@ -425,16 +389,10 @@ fn realtime() -> CheckResult {
         "not a PREEMPT_RT kernel"
     };
     if limit > 0 || has_capability(CAP_SYS_NICE) {
-        return finding(
-            "real-time",
-            Readiness::Ok,
-            format!("SCHED_FIFO is allowed; {kernel}"),
-            "",
-        );
+        return ok("real-time", format!("SCHED_FIFO is allowed; {kernel}"));
     }
-    finding(
+    lacking(
         "real-time",
-        Readiness::Lacking,
         format!("SCHED_FIFO is not allowed; {kernel}"),
         "LimitRTPRIO=80 in the systemd unit, or `ulimit -r 80`; needed only for realtime = \
          { priority = ... }",
@@ -445,11 +403,10 @@ fn locked_memory() -> CheckResult {
     const WANTED: u64 = 256 << 20;
     let limit = getrlimit(Resource::RLIMIT_MEMLOCK).map_or(0, |(soft, _)| soft);
     if limit >= WANTED || has_capability(CAP_IPC_LOCK) {
-        return finding("locked memory", Readiness::Ok, "memory can be locked", "");
+        return ok("locked memory", "memory can be locked");
     }
-    finding(
+    lacking(
         "locked memory",
-        Readiness::Lacking,
         format!("at most {limit} bytes can be locked"),
         "LimitMEMLOCK=infinity in the systemd unit, or `ulimit -l unlimited`; needed only for \
          realtime = { priority = ... }",

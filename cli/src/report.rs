@@ -210,6 +210,12 @@ impl ReportTable {
     }
 }
 
+/// Those tables that have rows.
+pub(crate) fn tables<const N: usize>(all: [ReportTable; N]) -> Vec<String> {
+    let filled = all.iter().filter(|table| !table.is_empty());
+    filled.map(ReportTable::html).collect()
+}
+
 /// A list of facts: names and values.
 pub(crate) fn facts(facts: &[(&str, String)]) -> String {
     let rows: String = facts

@@ -10,10 +10,8 @@ mod recognise;
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Session, Supervised};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, OutputInfo, Spec, SpecError, StampedReading, bytes,
-    keys, wrench,
-};
+use crate::received::Received;
+use crate::{Claim, Device, Driver, Id, OutputInfo, Spec, SpecError, StampedReading, keys, wrench};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Wrench};
@@ -61,14 +59,12 @@ impl Default for AidinAft200Options {
 
 impl AidinAft200Options {
     fn period(&self) -> Result<Nanos, SpecError> {
-        match self.period_ms {
-            1..=65 => Ok(Nanos::from_millis(i64::from(self.period_ms))),
-            other => Err(SpecError::Key {
-                key: "period_ms",
-                value: f64::from(other),
-                expected: "an integer from 1 to 65",
-            }),
-        }
+        keys::ms(
+            "period_ms",
+            self.period_ms,
+            1..=65,
+            "an integer from 1 to 65",
+        )
     }
 
     /// The identifiers of force and torque.
@@ -77,10 +73,8 @@ impl AidinAft200Options {
         let force = keys::id("id_force", self.id_force, 0..=0x7FF, expected)?;
         let torque = keys::id("id_torque", self.id_torque, 0..=0x7FF, expected)?;
         if force == torque {
-            return Err(SpecError::Keys {
-                key: "id_torque",
-                expected: "another identifier than id_force",
-            });
+            let expected = "another identifier than id_force";
+            return Err(SpecError::keys("id_torque", expected));
         }
         Ok([force, torque])
     }
@@ -88,8 +82,7 @@ impl AidinAft200Options {
 
 /// The number of the sensor. FF in its place is a command to all sensors.
 fn number(spec: &Spec) -> Result<u8, SpecError> {
-    #[allow(clippy::cast_possible_truncation)] // at most 254
-    keys::address(spec, 1..=254).map(|number| number as u8)
+    keys::address(spec, 1..=254)
 }
 
 impl Driver for AidinAft200Options {
@@ -138,33 +131,31 @@ fn axes(half: [u8; 6], scale: (f64, f64), axis: u32, quality: &mut Quality) -> [
 impl Family for Aft {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         let [force, torque] = self.ids;
         let second = frame.id == torque;
         if !second && frame.id != force {
             return;
         }
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = frame.payload() else {
             return;
         };
         let Some(&half) = data.first_chunk() else {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         };
         let mut unpaired = 0;
         let paired = self.pairing.push(second, frame, half, &mut unpaired);
-        session.lost(Counter::Unpaired, unpaired, frame, out);
+        session.lost(Counter::Unpaired, unpaired, frame);
         let Paired::With(acquired, stamp, [first, second]) = paired else {
             return;
         };
         let mut quality = Quality::GOOD;
         let force = axes(first, NEWTON, 0, &mut quality);
         let torque = axes(second, NEWTON_METRE, 3, &mut quality);
-        let stamped = StampedReading {
-            acquired,
-            stamp,
-            ..StampedReading::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
-        };
-        session.add(stamped, frame, out);
+        let stamped =
+            StampedReading::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
+                .at(acquired, stamp);
+        session.add(stamped, frame);
     }
 
     fn reset(&mut self) {

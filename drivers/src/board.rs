@@ -1,10 +1,10 @@
 //! The device's own side of its protocol as a sans-I/O state machine, [`Board`], and [`Simulate`],
 //! which makes it from a device's keys.
 
-use crate::{Driver, Frame, Spec, SpecError};
+use crate::{Driver, Frame, Id, Spec, SpecError};
 use alloc::boxed::Box;
 use arrayvec::ArrayVec;
-use proprio_topics::{Imu, Nanos, Quality, Reading, Wrench};
+use proprio_topics::{Imu, JointState, Nanos, Quality, Reading, Wrench};
 
 /// Frames that a board sends at once: two for each of a skin board's 16 triangles.
 pub type Frames = ArrayVec<Frame, 32>;
@@ -36,8 +36,10 @@ pub enum EncodeError {
 /// with the reading that [`Board::present`] gave it last.
 pub trait Board: Send {
     /// Takes a frame from the bus and adds the answers to `out`. Frames for other boards are
-    /// ignored.
-    fn on_frame(&mut self, frame: &Frame, out: &mut Frames);
+    /// ignored; a board that only sends ignores all.
+    fn on_frame(&mut self, frame: &Frame, out: &mut Frames) {
+        let _ = (frame, out);
+    }
 
     /// The current streaming period of its main reading \[ns\]; `None` while it does not stream.
     fn period(&self) -> Option<Nanos>;
@@ -78,6 +80,36 @@ pub trait Simulate: Driver {
     /// # Errors
     /// As [`Driver::device`].
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError>;
+}
+
+/// Adds a frame to those that a board sends; there is room for all.
+pub(crate) fn send(id: Id, data: &[u8], out: &mut Frames) {
+    let _ = out.try_push(Frame::new(id, data));
+}
+
+/// Whether the faults of a drive and of its sensor in `quality` are others than `told`.
+pub(crate) fn has_other_faults(quality: Quality, told: Quality) -> bool {
+    let carried = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
+    (quality.0 ^ told.0) & carried.0 != 0
+}
+
+/// The code that tells of the faults in `quality`: `none`, that of the sensor, or that of the drive.
+pub(crate) const fn fault_code<T: Copy>(quality: Quality, [none, sensor, drive]: [T; 3]) -> T {
+    if quality.contains(Quality::DEVICE_FAULT) {
+        sensor
+    } else if quality.contains(Quality::DRIVE_FAULT) {
+        drive
+    } else {
+        none
+    }
+}
+
+/// The current of a joint, if need be by its torque and the torque per current.
+pub(crate) fn current(joint: &JointState, torque_constant: Option<f64>) -> f64 {
+    match torque_constant {
+        Some(constant) if joint.current.is_nan() => joint.torque / constant,
+        _ => joint.current,
+    }
 }
 
 /// That `output` is 0, the only one of its board.

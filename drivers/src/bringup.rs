@@ -294,6 +294,15 @@ impl Bringup {
         }
     }
 
+    /// Of a motor that is asked for its readings if there is a period of requests, and listened to
+    /// otherwise.
+    pub(crate) fn polled(spec: &Spec, requests: Option<Nanos>, watched: Id) -> Self {
+        match requests {
+            Some(_) => Self::new(spec, spec.mode, Timing::POLLED, watched),
+            None => Self::new(spec, Mode::Listen, Timing::LISTENED, watched),
+        }
+    }
+
     /// Adds a start command.
     pub(crate) fn start_with(&mut self, id: Id, data: &[u8]) {
         let fits = self.start.try_push(Frame::new(id, data));

@@ -1,42 +1,5 @@
 //! The payload of a frame: numbers in either order of bytes, and their quantisation.
 
-use crate::{Decoded, Format, Frame};
-use proprio_topics::Counter;
-
-/// The payload of a classic data frame. Other frames are counted, except error frames, which belong
-/// to no device.
-pub(crate) fn payload<'f>(frame: &'f Frame, out: &mut Decoded) -> Option<&'f [u8]> {
-    match frame.format {
-        Format::Classic => return Some(frame.data()),
-        Format::Fd { .. } => out.fault(Counter::Value, 1, frame.id),
-        Format::Remote => out.fault(Counter::Length, 1, frame.id),
-        Format::Error => {}
-    }
-    None
-}
-
-/// As [`payload`], of a frame with `length` bytes: others are counted, too.
-pub(crate) fn payload_of<'f>(
-    length: usize,
-    frame: &'f Frame,
-    out: &mut Decoded,
-) -> Option<&'f [u8]> {
-    let data = payload(frame, out)?;
-    if data.len() != length {
-        out.fault(Counter::Length, 1, frame.id);
-        return None;
-    }
-    Some(data)
-}
-
-/// The payload of a data frame, classic or CAN FD. Other frames are counted, except error frames.
-pub(crate) fn fd_payload<'f>(frame: &'f Frame, out: &mut Decoded) -> Option<&'f [u8]> {
-    match frame.format {
-        Format::Fd { .. } => Some(frame.data()),
-        _ => payload(frame, out),
-    }
-}
-
 /// Little-endian 16 bits at `at`; 0 beyond the end (callers have checked the length).
 pub(crate) fn u16_le(data: &[u8], at: usize) -> u16 {
     match data.get(at..at + 2) {

@@ -38,21 +38,15 @@ pub(crate) use script::{READ, Script, ScriptStep, StartPlan};
 use crate::bytes::u16_le;
 use crate::family::Session;
 use crate::objects::Objects;
-use crate::{Claim, Decoded, Frame, Spec, SpecError, bytes};
+use crate::received::Received;
+use crate::{Claim, Frame, Spec, SpecError, keys};
 use alloc::format;
 use proprio_topics::{Counter, Nanos, StampKind};
 use protocol::{emcy, heartbeat};
 
 /// The node of `spec`.
 pub(crate) fn node_of(spec: &Spec) -> Result<u8, SpecError> {
-    let address = spec.address;
-    let node = u8::try_from(address).ok();
-    node.filter(|node| (1..=127).contains(node))
-        .ok_or(SpecError::Address {
-            address,
-            least: 1,
-            most: 127,
-        })
+    keys::address(spec, 1..=127)
 }
 
 /// Refuses a file that configures another node.
@@ -241,25 +235,24 @@ impl NodeState {
     pub(crate) fn on_frame<P: StartPlan>(
         &mut self,
         node: u8,
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<Script<P>>,
-        out: &mut Decoded,
     ) -> bool {
         let ids = [emcy(node), sdo_from(node), heartbeat(node), sdo_to(node)];
         if !ids.contains(&frame.id) {
             return false;
         }
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = frame.payload() else {
             return true;
         };
         if frame.id == sdo_from(node) {
-            session.questions.answer(data, frame, out);
+            session.questions.answer(data, frame);
         } else if frame.id == sdo_to(node) {
             session.questions.overhear(data);
         } else if frame.id == emcy(node) {
             match data.len() {
                 8 => self.error = u16_le(data, 0),
-                _ => out.fault(Counter::Length, 1, frame.id),
+                _ => frame.fault(Counter::Length),
             }
         } else {
             const OPERATIONAL: u8 = 0x05;
@@ -272,7 +265,7 @@ impl NodeState {
                 }
                 [_] if session.bringup.is_watching() => session.bringup.restart(),
                 [_] => {}
-                _ => out.fault(Counter::Length, 1, frame.id),
+                _ => frame.fault(Counter::Length),
             }
         }
         true

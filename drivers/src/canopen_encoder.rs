@@ -13,11 +13,9 @@ use crate::canopen::{
 };
 use crate::family::{Family, Session, Supervised};
 use crate::objects::Objects;
+use crate::received::Received;
 use crate::signal::Bits;
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, Mode, OutputInfo, Spec, SpecError, StampedReading,
-    bytes,
-};
+use crate::{Claim, Device, Driver, Id, Mode, OutputInfo, Spec, SpecError, StampedReading, keys};
 use alloc::boxed::Box;
 use alloc::format;
 use alloc::string::String;
@@ -74,23 +72,14 @@ impl Default for CanopenEncoderOptions {
 
 impl CanopenEncoderOptions {
     fn check(&self) -> Result<(), SpecError> {
-        let (key, value, expected) = if !(1..=65_535).contains(&self.period_ms) {
-            ("period_ms", f64::from(self.period_ms), "1 to 65535")
-        } else if self.sync > 240 {
-            ("sync", f64::from(self.sync), "0 to 240")
-        } else if let Some(counts) = self
-            .counts_per_turn
-            .filter(|n| !(*n > 0.0 && n.is_finite()))
-        {
-            ("counts_per_turn", counts, "above 0")
-        } else {
-            return Ok(());
-        };
-        Err(SpecError::Key {
-            key,
-            value,
-            expected,
-        })
+        keys::within("period_ms", self.period_ms, 1..=65_535, "1 to 65535")?;
+        keys::within("sync", self.sync, 0..=240, "0 to 240")?;
+        match self.counts_per_turn {
+            Some(counts) if !(counts > 0.0 && counts.is_finite()) => {
+                Err(SpecError::key("counts_per_turn", counts, "above 0"))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// The counts per turn of this very encoder by its file: of 6001 if 6000 says that it is
@@ -379,15 +368,14 @@ impl Encoder {
         &mut self,
         at: usize,
         data: &[u8],
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<Script<EncoderStart>>,
-        out: &mut Decoded,
     ) {
         let Some(mapping) = self.mappings.get(at).copied() else {
             return;
         };
         let Some(counts) = mapping.bits.of(data) else {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         };
         let Some(counts_per_turn) = session.questions.plan.known() else {
             return session.questions.missed();
@@ -400,7 +388,7 @@ impl Encoder {
             _ => Some((frame.t, frame.stamp)),
         };
         let Some((acquired, stamp)) = measured else {
-            return session.lost(Counter::Unpaired, 1, frame, out);
+            return session.lost(Counter::Unpaired, 1, frame);
         };
         let mut quality = Quality::GOOD;
         if self.state.error != 0 {
@@ -410,28 +398,19 @@ impl Encoder {
             position: counts as f64 / counts_per_turn * TAU,
             ..JointState::ABSENT
         });
-        let stamped = StampedReading {
-            acquired,
-            stamp,
-            ..StampedReading::new(0, frame, quality, reading)
-        };
-        session.add(stamped, frame, out);
+        let stamped = StampedReading::new(0, frame, quality, reading).at(acquired, stamp);
+        session.add(stamped, frame);
     }
 }
 
 impl Family for Encoder {
     type Questions = Script<EncoderStart>;
 
-    fn on_frame(
-        &mut self,
-        frame: &Frame,
-        session: &mut Session<Script<EncoderStart>>,
-        out: &mut Decoded,
-    ) {
-        if self.state.on_frame(self.node, frame, session, out) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session<Script<EncoderStart>>) {
+        if self.state.on_frame(self.node, frame, session) {
             return;
         }
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = frame.payload() else {
             return;
         };
         if frame.id == SYNC {
@@ -441,7 +420,7 @@ impl Family for Encoder {
             .iter()
             .position(|mapping| mapping.id == frame.id)
         {
-            self.position(at, data, frame, session, out);
+            self.position(at, data, frame, session);
         }
     }
 

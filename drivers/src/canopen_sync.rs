@@ -7,7 +7,8 @@ mod board;
 use crate::bringup::{Bringup, NoInquiry};
 use crate::canopen::{self, SYNC};
 use crate::family::{Family, Session, Supervised, next_in_step};
-use crate::{Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError};
+use crate::received::Received;
+use crate::{Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError, keys};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::Nanos;
@@ -30,17 +31,11 @@ impl Default for CanopenSyncOptions {
 
 impl CanopenSyncOptions {
     fn period(&self, spec: &Spec) -> Result<Nanos, SpecError> {
-        let key = |expected| SpecError::Key {
-            key: "period_ms",
-            value: self.period_ms,
-            expected,
-        };
-        if !(self.period_ms >= 0.5 && self.period_ms <= 1000.0) {
-            return Err(key("0.5 to 1000"));
-        }
-        let period = Nanos::from_seconds(self.period_ms * 1e-3);
+        let key = "period_ms";
+        let ms = keys::within(key, self.period_ms, 0.5..=1000.0, "0.5 to 1000")?;
+        let period = Nanos::from_seconds(ms * 1e-3);
         if period >= spec.max_silence {
-            return Err(key("less than max_silence_ms"));
+            return Err(SpecError::key(key, ms, "less than max_silence_ms"));
         }
         Ok(period)
     }
@@ -74,14 +69,9 @@ struct Producer {
 impl Family for Producer {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, _frame: &Frame, _session: &mut Session<NoInquiry>, _out: &mut Decoded) {}
+    fn on_frame(&mut self, _frame: &mut Received<'_>, _session: &mut Session) {}
 
-    fn request(
-        &mut self,
-        now: Nanos,
-        session: &mut Session<NoInquiry>,
-        _out: &mut Decoded,
-    ) -> Option<Frame> {
+    fn request(&mut self, now: Nanos, session: &mut Session, _out: &mut Decoded) -> Option<Frame> {
         if now < self.next {
             return None;
         }

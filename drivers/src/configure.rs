@@ -2,7 +2,8 @@
 //! do not acknowledge a configuration.
 
 use crate::bringup::{Ask, Attempts, Inquiry, Timing};
-use crate::{Decoded, Frame, Mode, NotSent, Spec};
+use crate::received::Received;
+use crate::{Frame, Mode, NotSent, Spec};
 use core::ops::Range;
 use proprio_topics::{Counter, Nanos, Refusal};
 
@@ -49,15 +50,15 @@ impl Configure {
     }
 
     /// Takes the board's answer in `frame`.
-    pub(crate) fn answer(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    pub(crate) fn answer(&mut self, data: &[u8], frame: &mut Received<'_>) {
         let Some(setting) = &self.setting else {
             return;
         };
         if data.len() != setting.set.len() {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         }
         if !self.attempts.counts(frame.t) {
-            return out.fault(Counter::Unexpected, 1, frame.id);
+            return frame.fault(Counter::Unexpected);
         }
         let compared = &setting.compared;
         let agrees = data.get(compared.clone()) == setting.set.data().get(compared.clone());
@@ -72,7 +73,7 @@ impl Configure {
             self.told = false;
             self.attempts.again();
             if self.settled {
-                out.fault(Counter::Changed, 1, frame.id);
+                frame.fault(Counter::Changed);
             }
         }
     }

@@ -50,10 +50,7 @@ impl Claim {
     /// Whether `id` is in the set.
     #[must_use]
     pub fn matches(&self, id: Id) -> bool {
-        matches!(
-            (self.id, id),
-            (Id::Standard(_), Id::Standard(_)) | (Id::Extended(_), Id::Extended(_))
-        ) && (self.id.raw() ^ id.raw()) & self.mask == 0
+        self.overlaps(&Self::shared(id))
     }
 
     /// Whether some identifier is in both sets.
@@ -100,6 +97,13 @@ impl StampedReading {
             quality,
             reading,
         }
+    }
+
+    /// The same reading with the stamp `acquired`.
+    #[must_use]
+    pub(crate) const fn at(mut self, acquired: Nanos, stamp: StampKind) -> Self {
+        (self.acquired, self.stamp) = (acquired, stamp);
+        self
     }
 }
 
@@ -349,6 +353,17 @@ pub struct Spec {
     pub outputs: Outputs,
 }
 
+impl Spec {
+    /// The same in another mode.
+    #[must_use]
+    pub fn in_mode(&self, mode: Mode) -> Self {
+        Self {
+            mode,
+            ..self.clone()
+        }
+    }
+}
+
 /// A configuration that a driver cannot use.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -405,6 +420,23 @@ pub enum SpecError {
     /// A joint device without a joint, or a sensor with joints.
     #[error("{0}")]
     Joints(&'static str),
+}
+
+impl SpecError {
+    /// [`SpecError::Key`].
+    pub(crate) fn key(key: &'static str, value: impl Into<f64>, expected: &'static str) -> Self {
+        let value = value.into();
+        Self::Key {
+            key,
+            value,
+            expected,
+        }
+    }
+
+    /// [`SpecError::Keys`].
+    pub(crate) const fn keys(key: &'static str, expected: &'static str) -> Self {
+        Self::Keys { key, expected }
+    }
 }
 
 /// The host's side of a device: decoder and bring-up in one state machine.

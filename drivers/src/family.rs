@@ -5,14 +5,15 @@
 //! `bringup.rs`, which needs their start and stop commands and the questions that they must answer.
 //! A family whose boards do not stream also says when to ask for the next reading.
 
-use crate::bringup::{Bringup, Inquiry};
+use crate::bringup::{Bringup, Inquiry, NoInquiry};
+use crate::received::Received;
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Frame, Mode,
     NotSent, StampedReading, State, Transmit,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Refusal, Temperature};
+use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Refusal};
 
 /// What the host's side of a family has of its own.
 pub(crate) trait Family: Send {
@@ -20,12 +21,7 @@ pub(crate) trait Family: Send {
     type Questions: Inquiry + Send;
 
     /// As [`Device::on_frame`], until the board is stopped.
-    fn on_frame(
-        &mut self,
-        frame: &Frame,
-        session: &mut Session<Self::Questions>,
-        out: &mut Decoded,
-    );
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session<Self::Questions>);
 
     /// The board was silent, or may have been reset: an incomplete reading stays incomplete.
     fn reset(&mut self) {}
@@ -145,31 +141,9 @@ pub(crate) fn quality_of(faults: u32, position: u32) -> Quality {
     quality
 }
 
-/// Counts the faults in `quality`.
-pub(crate) fn count_faults(quality: Quality, frame: &Frame, out: &mut Decoded) {
-    for (flag, counter) in [
-        (Quality::SATURATED, Counter::Saturated),
-        (Quality::DEVICE_FAULT, Counter::DeviceFault),
-        (Quality::DRIVE_FAULT, Counter::DriveFault),
-    ] {
-        if quality.contains(flag) {
-            out.fault(counter, 1, frame.id);
-        }
-    }
-}
-
-/// The reading of a thermometer, if there is one.
-pub(crate) fn temperature(output: u8, celsius: f64, frame: &Frame, out: &mut Decoded) {
-    if celsius.is_finite() {
-        let reading = Reading::Temperature(Temperature { celsius });
-        let stamped = StampedReading::new(output, frame, Quality::GOOD, reading);
-        out.push(stamped, frame.id);
-    }
-}
-
 /// The session with a board: its bring-up, and what it has been asked.
 #[derive(Debug)]
-pub(crate) struct Session<Q> {
+pub(crate) struct Session<Q = NoInquiry> {
     pub(crate) bringup: Bringup,
     pub(crate) questions: Q,
 }
@@ -183,31 +157,30 @@ impl<Q: Inquiry> Session<Q> {
     pub(crate) fn joint(
         &mut self,
         output: u8,
-        frame: &Frame,
+        frame: &mut Received<'_>,
         quality: Quality,
         state: JointState,
-        out: &mut Decoded,
     ) {
         let reading = Reading::Joint(state);
         let stamped = StampedReading::new(output, frame, quality, reading);
-        self.add(stamped, frame, out);
+        self.add(stamped, frame);
     }
 
     /// Adds a main reading that `frame` completes, counts the faults in its quality, and marks the
     /// first one after a gap.
-    pub(crate) fn add(&mut self, mut stamped: StampedReading, frame: &Frame, out: &mut Decoded) {
-        count_faults(stamped.quality, frame, out);
+    pub(crate) fn add(&mut self, mut stamped: StampedReading, frame: &mut Received<'_>) {
+        frame.faults_in(stamped.quality);
         if self.bringup.reading(frame.t) {
             stamped.quality |= Quality::GAP_BEFORE;
         }
-        out.push(stamped, frame.id);
+        frame.push(stamped);
     }
 
     /// Readings were lost: they are counted, and the next one is marked.
-    pub(crate) fn lost(&mut self, counter: Counter, count: u32, frame: &Frame, out: &mut Decoded) {
+    pub(crate) fn lost(&mut self, counter: Counter, count: u32, frame: &mut Received<'_>) {
         if count > 0 {
             self.bringup.lost();
-            out.fault(counter, count, frame.id);
+            frame.faults(counter, count);
         }
     }
 
@@ -258,7 +231,8 @@ impl<F: Family> Device for Supervised<F> {
 
     fn on_frame(&mut self, frame: &Frame, out: &mut Decoded) {
         if self.session.bringup.active() {
-            self.family.on_frame(frame, &mut self.session, out);
+            let frame = &mut Received::new(frame, out);
+            self.family.on_frame(frame, &mut self.session);
         }
     }
 

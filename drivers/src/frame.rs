@@ -97,6 +97,17 @@ pub struct Frame {
     data: [u8; 64],
 }
 
+impl Format {
+    /// CAN FD with these two bits.
+    #[must_use]
+    pub const fn fd(bit_rate_switch: bool, error_state: bool) -> Self {
+        Self::Fd {
+            bit_rate_switch,
+            error_state,
+        }
+    }
+}
+
 impl Frame {
     /// The longest payload \[bytes\].
     pub const MAX_LEN: usize = 64;

@@ -32,7 +32,7 @@ impl HeldValue {
 
     /// The value for a reading in `frame`; NaN if it is older than `hold`, or later.
     pub(crate) fn at(self, frame: &Frame, hold: Nanos) -> f64 {
-        if within((self.t, self.stamp), (frame.t, frame.stamp), hold) {
+        if within((self.t, self.stamp), frame, hold) {
             self.value
         } else {
             f64::NAN
@@ -53,9 +53,9 @@ impl<T: PartialEq + Copy> OnChange<T> {
 
     /// Whether `state`, in `frame`, is to be told.
     pub(crate) fn is_due(&mut self, state: T, frame: &Frame) -> bool {
-        let known = self.0.is_some_and(|(told, t, stamp)| {
-            told == state && within((t, stamp), (frame.t, frame.stamp), TOLD)
-        });
+        let known = self
+            .0
+            .is_some_and(|(told, t, stamp)| told == state && within((t, stamp), frame, TOLD));
         if !known {
             self.0 = Some((state, frame.t, frame.stamp));
         }

@@ -37,9 +37,9 @@ pub(crate) use management::answer_management;
 pub(crate) use recognise::{questions, recognise};
 
 use crate::bringup::Timing;
-use crate::{Claim, Id, Spec, SpecError};
-use arrayvec::ArrayVec;
-use proprio_topics::Nanos;
+use crate::{Claim, Id, Spec, SpecError, keys};
+use alloc::vec::Vec;
+use proprio_topics::{Nanos, Quality};
 
 /// The classes of messages: bits 10:8 of the identifier.
 pub mod class {
@@ -175,7 +175,7 @@ pub mod board {
 /// The address that all boards listen to.
 pub const BROADCAST: u8 = 15;
 /// The lowest and the highest address of a board.
-pub const ADDRESSES: core::ops::RangeInclusive<u32> = 1..=14;
+pub const ADDRESSES: core::ops::RangeInclusive<u8> = 1..=14;
 
 /// A command from the host to board `address` in a command class.
 #[must_use]
@@ -200,15 +200,7 @@ pub const fn stream(class: u16, address: u8, kind: u8) -> Id {
 /// # Errors
 /// [`SpecError::Address`].
 pub fn address(spec: &Spec) -> Result<u8, SpecError> {
-    let (least, most) = (*ADDRESSES.start(), *ADDRESSES.end());
-    match u8::try_from(spec.address) {
-        Ok(address) if ADDRESSES.contains(&spec.address) => Ok(address),
-        _ => Err(SpecError::Address {
-            address: spec.address,
-            least,
-            most,
-        }),
-    }
+    keys::address(spec, ADDRESSES)
 }
 
 /// [`Timing::USUAL`] with the silence after power-on of the key `power_on_silence_ms`. (A board
@@ -218,15 +210,8 @@ pub fn address(spec: &Spec) -> Result<u8, SpecError> {
 /// # Errors
 /// [`SpecError::Key`] above a minute.
 pub(crate) fn timing(ms: u32) -> Result<Timing, SpecError> {
-    if ms > 60_000 {
-        return Err(SpecError::Key {
-            key: "power_on_silence_ms",
-            value: f64::from(ms),
-            expected: "at most 60000",
-        });
-    }
     Ok(Timing {
-        power_on_silence: Nanos::from_millis(i64::from(ms)),
+        power_on_silence: keys::ms("power_on_silence_ms", ms, 0..=60_000, "at most 60000")?,
         ..Timing::USUAL
     })
 }
@@ -238,11 +223,7 @@ pub(crate) fn timing(ms: u32) -> Result<Timing, SpecError> {
 pub(crate) fn period_ms(key: &'static str, ms: u32) -> Result<u8, SpecError> {
     match u8::try_from(ms) {
         Ok(byte) if byte > 0 => Ok(byte),
-        _ => Err(SpecError::Key {
-            key,
-            value: f64::from(ms),
-            expected: "an integer from 1 to 255",
-        }),
+        _ => Err(SpecError::key(key, ms, "an integer from 1 to 255")),
     }
 }
 
@@ -260,10 +241,39 @@ pub(crate) const fn stream_type(id: Id, class: u16, address: u8) -> Option<u8> {
 }
 
 /// Claims on the streams `kinds` of a class.
-pub(crate) fn claims<const N: usize>(class: u16, address: u8, kinds: &[u8]) -> ArrayVec<Claim, N> {
-    kinds
-        .iter()
-        .map(|&kind| Claim::exclusive(stream(class, address, kind)))
-        .take(N)
-        .collect()
+pub(crate) fn claims(class: u16, address: u8, kinds: &[u8]) -> Vec<Claim> {
+    let claim = |kind: &u8| Claim::exclusive(stream(class, address, *kind));
+    kinds.iter().map(claim).collect()
+}
+
+/// Which of the up to 16 outputs of a board follow a gap with their next reading, one bit each.
+#[derive(Debug, Default)]
+pub(crate) struct OutputGaps {
+    gap: u16,
+    /// Those that have been read.
+    seen: u16,
+}
+
+impl OutputGaps {
+    /// The board was silent.
+    pub(crate) const fn all(&mut self) {
+        self.gap = self.seen;
+    }
+
+    /// Something of output `output` was lost.
+    pub(crate) const fn one(&mut self, output: u8) {
+        self.gap |= 1 << output & self.seen;
+    }
+
+    /// GAP_BEFORE, if the reading of output `output` is the first after a gap.
+    pub(crate) const fn take(&mut self, output: u8) -> Quality {
+        let bit = 1 << output;
+        let quality = match self.gap & bit {
+            0 => Quality::GOOD,
+            _ => Quality::GAP_BEFORE,
+        };
+        self.gap &= !bit;
+        self.seen |= bit;
+        quality
+    }
 }

@@ -8,15 +8,12 @@ mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::family::{Family, Session, Supervised};
-use crate::icub::{self, class, command};
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, OutputInfo, Outputs, Spec, SpecError, StampedReading,
-    bytes,
-};
+use crate::icub::{self, OutputGaps, class, command};
+use crate::received::Received;
+use crate::{Device, Driver, OutputInfo, Outputs, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use arrayvec::ArrayVec;
-use proprio_topics::{JointState, Kind, Quality, Reading};
+use proprio_topics::{JointState, Kind, Reading};
 use serde::Deserialize;
 
 /// Types of the streams.
@@ -68,13 +65,11 @@ impl Driver for IcubMaisOptions {
         bringup.start_with(id, &[command::SET_CANDATARATE, period]);
         bringup.start_with(id, &[command::SET_TXMODE, 0]);
         bringup.stop_with(id, &[command::SET_TXMODE, 1]);
-        let claims: ArrayVec<Claim, 2> =
-            icub::claims(class::PERIODIC_ANALOG, address, &[HES0TO6, HES7TO14]);
+        let claims = icub::claims(class::PERIODIC_ANALOG, address, &[HES0TO6, HES7TO14]);
         let this = Mais {
             address,
             outputs: spec.outputs.clone(),
-            gap: 0,
-            seen: 0,
+            gaps: OutputGaps::default(),
         };
         Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
     }
@@ -85,45 +80,34 @@ impl Driver for IcubMaisOptions {
 struct Mais {
     address: u8,
     outputs: Outputs,
-    /// Sensors whose next reading follows a gap, one bit each.
-    gap: u16,
-    /// Sensors that have been read, one bit each.
-    seen: u16,
+    gaps: OutputGaps,
 }
 
 impl Family for Mais {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address);
         let (first, length) = match stream {
             Some(HES0TO6) => (0, SECOND),
             Some(HES7TO14) => (SECOND, SENSORS - SECOND),
             _ => return,
         };
-        let Some(data) = bytes::payload_of(usize::from(length), frame, out) else {
+        let Some(data) = frame.payload_of(usize::from(length)) else {
             return;
         };
         if session.bringup.reading(frame.t) {
-            self.gap = self.seen;
+            self.gaps.all();
         }
         for (output, count) in (first..).zip(data) {
             if !self.outputs.0.contains(&output) {
                 continue;
             }
-            let bit = 1 << output;
-            let quality = match self.gap & bit {
-                0 => Quality::GOOD,
-                _ => Quality::GAP_BEFORE,
-            };
-            self.gap &= !bit;
-            self.seen |= bit;
             let reading = Reading::Joint(JointState {
                 position: f64::from(*count),
                 ..JointState::ABSENT
             });
-            let stamped = StampedReading::new(output, frame, quality, reading);
-            out.push(stamped, frame.id);
+            frame.tell(output, self.gaps.take(output), reading);
         }
     }
 }

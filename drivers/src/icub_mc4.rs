@@ -7,17 +7,14 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Session, Supervised, count_faults, quality_of};
+use crate::family::{Family, Session, Supervised, quality_of};
 use crate::held::HeldValue;
 use crate::icub::{self, class};
 use crate::icub_motor::mode;
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Outputs, Spec, SpecError,
-    StampedReading, bytes,
-};
+use crate::received::Received;
+use crate::{Device, Driver, Mode, OutputInfo, Outputs, Spec, SpecError, bytes, keys};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
 use proprio_topics::{Actuator, JointState, Kind, Nanos, Quality, Reading};
 use serde::Deserialize;
@@ -87,24 +84,16 @@ struct StepSizes {
 }
 
 impl IcubMc4Options {
+    fn hold(&self) -> Result<Nanos, SpecError> {
+        keys::ms("hold_ms", self.hold_ms, 1..=1000, "1 to 1000")
+    }
+
     fn scales(&self) -> Result<[StepSizes; JOINTS], SpecError> {
-        let error = |key, value, expected| SpecError::Key {
-            key,
-            value,
-            expected,
-        };
-        if !(1..=1000).contains(&self.hold_ms) {
-            return Err(error("hold_ms", f64::from(self.hold_ms), "1 to 1000"));
-        }
         for ticks in self.ticks_per_turn {
-            if !(ticks > 0.0 && ticks.is_finite()) {
-                return Err(error("ticks_per_turn", ticks, "a number above 0"));
-            }
+            keys::above_zero("ticks_per_turn", ticks)?;
         }
         for shift in self.velocity_shift {
-            if shift > 15 {
-                return Err(error("velocity_shift", f64::from(shift), "0 to 15"));
-            }
+            keys::within("velocity_shift", shift, 0..=15, "0 to 15")?;
         }
         let [ticks0, ticks1] = self.ticks_per_turn;
         let [shift0, shift1] = self.velocity_shift;
@@ -128,19 +117,20 @@ impl Driver for IcubMc4Options {
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
         let address = icub::address(spec)?;
         icub::period_ms("period_ms", self.period_ms)?;
+        let hold = self.hold()?;
         let joints = self.scales()?.map(|scale| Mc4Joint {
             scale,
             velocity: HeldValue::ABSENT,
             status: Quality::GOOD,
         });
         let kinds = [kind::POSITION, kind::STATUS, kind::VELOCITY];
-        let claims: ArrayVec<Claim, 3> = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
+        let claims = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
         let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::POSITION);
         let bringup = Bringup::new(spec, Mode::Listen, Timing::USUAL, watched);
         let this = Mc4 {
             address,
             outputs: spec.outputs.clone(),
-            hold: Nanos::from_millis(i64::from(self.hold_ms)),
+            hold,
             joints,
         };
         Ok(Supervised::boxed(claims, bringup, NoInquiry, this))
@@ -178,20 +168,14 @@ struct Mc4 {
 }
 
 impl Mc4 {
-    fn positions(
-        &self,
-        data: &[u8],
-        frame: &Frame,
-        session: &mut Session<NoInquiry>,
-        out: &mut Decoded,
-    ) {
+    fn positions(&self, data: &[u8], frame: &mut Received<'_>, session: &mut Session) {
         let gap = session.bringup.reading(frame.t);
         for (joint, output) in self.joints.iter().zip(0_u8..) {
             if !self.outputs.0.contains(&output) {
                 continue;
             }
             let mut quality = joint.status;
-            count_faults(quality, frame, out);
+            frame.faults_in(quality);
             if gap {
                 quality |= Quality::GAP_BEFORE;
             }
@@ -201,12 +185,11 @@ impl Mc4 {
                 velocity: joint.velocity.at(frame, self.hold),
                 ..JointState::ABSENT
             });
-            let stamped = StampedReading::new(output, frame, quality, reading);
-            out.push(stamped, frame.id);
+            frame.tell(output, quality, reading);
         }
     }
 
-    fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn status(&mut self, data: &[u8], frame: &mut Received<'_>) {
         let &[faults0, mode0, faults1, mode1, _, shared, ..] = data else {
             return;
         };
@@ -223,8 +206,7 @@ impl Mc4 {
                 faults,
             });
             if self.outputs.0.contains(&output) {
-                let stamped = StampedReading::new(output, frame, joint.status, reading);
-                out.push(stamped, frame.id);
+                frame.tell(output, joint.status, reading);
             }
         }
     }
@@ -233,17 +215,17 @@ impl Mc4 {
 impl Family for Mc4 {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_MOTOR, self.address);
         let Some(kind @ (kind::POSITION | kind::STATUS | kind::VELOCITY)) = stream else {
             return;
         };
-        let Some(data) = bytes::payload_of(FRAME, frame, out) else {
+        let Some(data) = frame.payload_of(FRAME) else {
             return;
         };
         match kind {
-            kind::POSITION => self.positions(data, frame, session, out),
-            kind::STATUS => self.status(data, frame, out),
+            kind::POSITION => self.positions(data, frame, session),
+            kind::STATUS => self.status(data, frame),
             _ => {
                 for (joint, at) in self.joints.iter_mut().zip([0, 2]) {
                     let steps = f64::from(bytes::i16_le(data, at));

@@ -9,12 +9,10 @@ mod recognise;
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class};
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading, bytes,
-};
+use crate::received::Received;
+use crate::{Device, Driver, Mode, OutputInfo, Spec, SpecError, bytes};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
 use proprio_topics::{Actuator, Counter, JointState, Kind, Quality, Reading};
 use serde::Deserialize;
@@ -120,7 +118,7 @@ impl Driver for IcubMotorOptions {
             kind::OVERFLOW,
         ];
         let watched = icub::stream(class::PERIODIC_MOTOR, address, kind::TWO_FOC);
-        let claims: ArrayVec<Claim, 4> = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
+        let claims = icub::claims(class::PERIODIC_MOTOR, address, &kinds);
         let bringup = Bringup::new(spec, Mode::Listen, Timing::USUAL, watched);
         let this = TwoFoc {
             address,
@@ -156,13 +154,7 @@ struct TwoFoc {
 }
 
 impl TwoFoc {
-    fn motion(
-        &self,
-        data: &[u8],
-        frame: &Frame,
-        session: &mut Session<NoInquiry>,
-        out: &mut Decoded,
-    ) {
+    fn motion(&self, data: &[u8], frame: &mut Received<'_>, session: &mut Session) {
         let velocity = f64::from(bytes::i16_le(data, 2)) * RAD_PER_S_PER_LSB;
         let joint = JointState {
             position: f64::from(bytes::u32_le(data, 4).cast_signed()) * RAD_PER_LSB,
@@ -170,10 +162,10 @@ impl TwoFoc {
             current: f64::from(bytes::i16_le(data, 0)) * AMPERE_PER_LSB,
             ..JointState::ABSENT
         };
-        session.joint(0, frame, self.status, joint, out);
+        session.joint(0, frame, self.status, joint);
     }
 
-    fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn status(&mut self, data: &[u8], frame: &mut Received<'_>) {
         let &[mode, encoder, ..] = data else { return };
         let actuator = Actuator {
             duty: f64::from(bytes::i16_le(data, 2)) * DUTY_PER_LSB,
@@ -182,15 +174,14 @@ impl TwoFoc {
             faults: bytes::u32_le(data, 4),
         };
         self.status = quality_of(&actuator);
-        let stamped = StampedReading::new(0, frame, self.status, Reading::Actuator(actuator));
-        out.push(stamped, frame.id);
+        frame.tell(0, self.status, Reading::Actuator(actuator));
     }
 }
 
 impl Family for TwoFoc {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         let Some(stream) = icub::stream_type(frame.id, class::PERIODIC_MOTOR, self.address) else {
             return;
         };
@@ -200,15 +191,15 @@ impl Family for TwoFoc {
         ) {
             return;
         }
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = frame.payload() else {
             return;
         };
         match (stream, data.len()) {
-            (kind::TWO_FOC, 8) => self.motion(data, frame, session, out),
-            (kind::STATUS, 8) => self.status(data, frame, out),
+            (kind::TWO_FOC, 8) => self.motion(data, frame, session),
+            (kind::STATUS, 8) => self.status(data, frame),
             (kind::ADDITIONAL_STATUS, 4) => {}
-            (kind::OVERFLOW, _) => out.fault(Counter::DeviceFault, 1, frame.id),
-            _ => out.fault(Counter::Length, 1, frame.id),
+            (kind::OVERFLOW, _) => frame.fault(Counter::DeviceFault),
+            _ => frame.fault(Counter::Length),
         }
     }
 

@@ -9,14 +9,11 @@ mod recognise;
 use crate::bringup::{Bringup, Timing};
 use crate::configure::{Configure, Setting};
 use crate::family::{Family, Session, Supervised};
-use crate::icub::{self, class, command};
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, OutputInfo, Outputs, Spec, SpecError, StampedReading,
-    bytes,
-};
+use crate::icub::{self, OutputGaps, class, command};
+use crate::received::Received;
+use crate::{Claim, Device, Driver, Frame, OutputInfo, Outputs, Spec, SpecError, bytes, keys};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
 use proprio_topics::{Counter, JointState, Kind, Quality, Reading};
 use serde::Deserialize;
@@ -79,30 +76,15 @@ impl PosSensor {
             -90 => 3,
             other => {
                 let expected = "0, 90, 180 or -90";
-                return Err(SpecError::Key {
-                    key: "rotation_deg",
-                    value: f64::from(other),
-                    expected,
-                });
+                return Err(SpecError::key("rotation_deg", other, expected));
             }
         };
-        if self.label > LABEL_MOST {
-            return Err(SpecError::Key {
-                key: "label",
-                value: f64::from(self.label),
-                expected: "at most 15",
-            });
-        }
-        if !(self.zero_deg >= -360.0 && self.zero_deg <= 360.0) {
-            return Err(SpecError::Key {
-                key: "zero_deg",
-                value: self.zero_deg,
-                expected: "from -360 to 360",
-            });
-        }
-        let [low, high] = bytes::quantise_i16(self.zero_deg, 0.1).to_le_bytes();
+        let label = keys::within("label", self.label, 0..=LABEL_MOST, "at most 15")?;
+        let degrees = -360.0..=360.0;
+        let zero = keys::within("zero_deg", self.zero_deg, degrees, "from -360 to 360")?;
+        let [low, high] = bytes::quantise_i16(zero, 0.1).to_le_bytes();
         Ok([
-            0x80 | u8::from(self.inverted) << 6 | rotation << 4 | self.label,
+            0x80 | u8::from(self.inverted) << 6 | rotation << 4 | label,
             low,
             high,
         ])
@@ -145,10 +127,7 @@ impl IcubPosOptions {
             [first] => (first.bytes()?, [0; 3]),
             [first, second] => (first.bytes()?, second.bytes()?),
             _ => {
-                return Err(SpecError::Keys {
-                    key: "sensors",
-                    expected: "a list of one or two sensors",
-                });
+                return Err(SpecError::keys("sensors", "a list of one or two sensors"));
             }
         };
         let ([a, b, c], [d, e, f]) = (first, second);
@@ -192,7 +171,7 @@ impl Driver for IcubPosOptions {
         });
         bringup.start_with(id, &[command::POS_TRANSMIT, period]);
         bringup.stop_with(id, &[command::POS_TRANSMIT, 0]);
-        let mut claims: ArrayVec<Claim, 2> = icub::claims(class::PERIODIC_ANALOG, address, &[POS]);
+        let mut claims = icub::claims(class::PERIODIC_ANALOG, address, &[POS]);
         if setting.is_some() {
             claims.push(Claim::shared(icub::to_host(class::POLLING_ANALOG, address)));
         }
@@ -201,8 +180,7 @@ impl Driver for IcubPosOptions {
             address,
             quantity: self.quantity,
             outputs: spec.outputs.clone(),
-            gap: 0,
-            seen: 0,
+            gaps: OutputGaps::default(),
         };
         Ok(Supervised::boxed(claims, bringup, configure, this))
     }
@@ -214,44 +192,41 @@ struct Pos {
     address: u8,
     quantity: PosQuantity,
     outputs: Outputs,
-    /// Labels whose next reading follows a gap, one bit each.
-    gap: u16,
-    /// Labels that have been read, one bit each.
-    seen: u16,
+    gaps: OutputGaps,
 }
 
 impl Family for Pos {
     type Questions = Configure;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<Configure>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session<Configure>) {
         if frame.id == icub::to_host(class::POLLING_ANALOG, self.address) {
             // Answers to other questions are for other devices.
-            if let Some(data) = bytes::payload(frame, out)
+            if let Some(data) = frame.payload()
                 && data.first() == Some(&command::POS_CONFIG_GET)
             {
-                session.questions.answer(data, frame, out);
+                session.questions.answer(data, frame);
             }
             return;
         }
         if icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) != Some(POS) {
             return;
         }
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = frame.payload() else {
             return;
         };
         let &[quantity, label_and_count, ref values @ ..] = data else {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         };
         if values.len() != 2 * usize::from(VALUES) {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         }
         let (label, count) = (label_and_count >> 4, label_and_count & 0xF);
         let (code, lsb) = self.quantity.code_and_lsb();
         if quantity != code || !(1..=VALUES).contains(&count) || label + count - 1 > LABEL_MOST {
-            return out.fault(Counter::Value, 1, frame.id);
+            return frame.fault(Counter::Value);
         }
         if session.bringup.reading(frame.t) {
-            self.gap = self.seen;
+            self.gaps.all();
         }
         for (output, value) in (label..)
             .zip(values.chunks_exact(2))
@@ -260,23 +235,16 @@ impl Family for Pos {
             if !self.outputs.0.contains(&output) {
                 continue;
             }
-            let bit = 1 << output;
-            let mut quality = Quality::GOOD;
-            if self.gap & bit != 0 {
-                quality |= Quality::GAP_BEFORE;
-            }
+            let mut quality = self.gaps.take(output);
             if !session.questions.confirmed() {
                 quality |= Quality::NOT_CALIBRATED;
             }
-            self.gap &= !bit;
-            self.seen |= bit;
             let position = f64::from(bytes::i16_le(value, 0)) * lsb;
             let reading = Reading::Joint(JointState {
                 position,
                 ..JointState::ABSENT
             });
-            let stamped = StampedReading::new(output, frame, quality, reading);
-            out.push(stamped, frame.id);
+            frame.tell(output, quality, reading);
         }
     }
 }

@@ -8,11 +8,10 @@ mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry};
 use crate::family::{Family, Session, Supervised};
-use crate::icub::{self, class, command};
+use crate::icub::{self, OutputGaps, class, command};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError, StampedReading, bytes,
-};
+use crate::received::Received;
+use crate::{Claim, Device, Driver, OutputInfo, Spec, SpecError, StampedReading};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Counter, Kind, Nanos, Quality, Reading, Skin};
@@ -93,10 +92,10 @@ impl IcubSkinOptions {
     fn check(&self) -> Result<(), SpecError> {
         match self.triangles {
             [first, last] if first <= last && usize::from(last) < TRIANGLES => Ok(()),
-            _ => Err(SpecError::Keys {
-                key: "triangles",
-                expected: "the first and the last of 0 to 15",
-            }),
+            _ => {
+                let expected = "the first and the last of 0 to 15";
+                Err(SpecError::keys("triangles", expected))
+            }
         }
     }
 }
@@ -116,11 +115,8 @@ impl Driver for IcubSkinOptions {
             None => Limit::of_period(Nanos::from_millis(i64::from(period))),
             Some(ms) if ms > 0.0 && ms <= 1000.0 => Limit::fixed(Nanos::from_seconds(ms * 1e-3)),
             Some(value) => {
-                return Err(SpecError::Key {
-                    key: "pair_timeout_ms",
-                    value,
-                    expected: "above 0, at most 1000",
-                });
+                let expected = "above 0, at most 1000";
+                return Err(SpecError::key("pair_timeout_ms", value, expected));
             }
         };
         let timing = icub::timing(self.power_on_silence_ms)?;
@@ -149,8 +145,7 @@ impl Driver for IcubSkinOptions {
             no_load: self.no_load,
             triangles: self.triangles,
             pairing: core::array::from_fn(|_| Pairing::new(limit, HalfOrder::Usual)),
-            gap: 0,
-            seen: 0,
+            gaps: OutputGaps::default(),
         };
         Ok(Supervised::boxed([claim], bringup, NoInquiry, this))
     }
@@ -163,10 +158,8 @@ struct SkinPatch {
     no_load: u8,
     triangles: [u8; 2],
     pairing: [Pairing<[u8; 7]>; TRIANGLES],
-    /// Triangles whose next reading follows a gap, one bit each.
-    gap: u16,
-    /// Triangles that have been read, one bit each.
-    seen: u16,
+    /// Of the triangles.
+    gaps: OutputGaps,
 }
 
 impl SkinPatch {
@@ -193,53 +186,45 @@ impl SkinPatch {
 impl Family for SkinPatch {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         let stream = icub::stream_type(frame.id, class::PERIODIC_SKIN, self.address);
         let Some(triangle) = stream else { return };
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = frame.payload() else {
             return;
         };
         let &[kind, ref rest @ ..] = data else {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         };
         let Ok(half) = <[u8; 7]>::try_from(rest) else {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         };
         let [first, last] = self.triangles;
         if !matches!(kind, FIRST | SECOND) || !(first..=last).contains(&triangle) {
-            return out.fault(Counter::Value, 1, frame.id);
+            return frame.fault(Counter::Value);
         }
         let Some(pairing) = self.pairing.get_mut(usize::from(triangle)) else {
             return;
         };
         let mut unpaired = 0;
         let paired = pairing.push(kind == SECOND, frame, half, &mut unpaired);
-        let bit = 1 << triangle;
         if unpaired > 0 {
-            self.gap |= bit & self.seen;
-            out.fault(Counter::Unpaired, unpaired, frame.id);
+            self.gaps.one(triangle);
+            frame.faults(Counter::Unpaired, unpaired);
         }
         let Paired::With(acquired, stamp, [first, second]) = paired else {
             return;
         };
         if session.bringup.reading(frame.t) {
-            self.gap = self.seen;
+            self.gaps.all();
         }
         let (skin, mut quality) = self.skin(triangle, first, second);
         if quality.contains(Quality::DEVICE_FAULT) {
-            out.fault(Counter::DeviceFault, 1, frame.id);
+            frame.fault(Counter::DeviceFault);
         }
-        if self.gap & bit != 0 {
-            quality |= Quality::GAP_BEFORE;
-        }
-        self.gap &= !bit;
-        self.seen |= bit;
-        let stamped = StampedReading {
-            acquired,
-            stamp,
-            ..StampedReading::new(0, frame, quality, Reading::Skin(skin))
-        };
-        out.push(stamped, frame.id);
+        quality |= self.gaps.take(triangle);
+        let stamped =
+            StampedReading::new(0, frame, quality, Reading::Skin(skin)).at(acquired, stamp);
+        frame.push(stamped);
     }
 
     fn reset(&mut self) {

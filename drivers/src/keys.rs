@@ -8,19 +8,37 @@ use proprio_topics::Nanos;
 ///
 /// # Errors
 /// [`SpecError::Address`].
-pub(crate) fn address(spec: &Spec, legal: RangeInclusive<u16>) -> Result<u16, SpecError> {
-    match u16::try_from(spec.address) {
+pub(crate) fn address<T>(spec: &Spec, legal: RangeInclusive<T>) -> Result<T, SpecError>
+where
+    T: TryFrom<u32> + Into<u32> + PartialOrd + Copy,
+{
+    match T::try_from(spec.address) {
         Ok(address) if legal.contains(&address) => Ok(address),
         _ => Err(SpecError::Address {
             address: spec.address,
-            least: u32::from(*legal.start()),
-            most: u32::from(*legal.end()),
+            least: (*legal.start()).into(),
+            most: (*legal.end()).into(),
         }),
     }
 }
 
-/// The standard identifier `raw` of key `key`, if it is one of `legal`; `expected` is in words what
-/// is legal.
+/// The value of key `key`, if it is one of `legal`; `expected` is in words what is legal.
+///
+/// # Errors
+/// [`SpecError::Key`].
+pub(crate) fn within<T: PartialOrd + Into<f64>>(
+    key: &'static str,
+    value: T,
+    legal: RangeInclusive<T>,
+    expected: &'static str,
+) -> Result<T, SpecError> {
+    match legal.contains(&value) {
+        true => Ok(value),
+        false => Err(SpecError::key(key, value, expected)),
+    }
+}
+
+/// As [`within`], as a standard identifier.
 ///
 /// # Errors
 /// [`SpecError::Key`].
@@ -30,30 +48,39 @@ pub(crate) fn id(
     legal: RangeInclusive<u16>,
     expected: &'static str,
 ) -> Result<Id, SpecError> {
-    if legal.contains(&raw) {
-        return Ok(Id::standard(raw));
-    }
-    let value = f64::from(raw);
-    Err(SpecError::Key {
-        key,
-        value,
-        expected,
-    })
+    within(key, raw, legal, expected).map(Id::standard)
+}
+
+/// As [`within`], as a duration in milliseconds.
+///
+/// # Errors
+/// [`SpecError::Key`].
+pub(crate) fn ms(
+    key: &'static str,
+    ms: u32,
+    legal: RangeInclusive<u32>,
+    expected: &'static str,
+) -> Result<Nanos, SpecError> {
+    within(key, ms, legal, expected).map(|ms| Nanos::from_millis(i64::from(ms)))
 }
 
 /// The value of key `key` as a duration of 1 ms to 1 minute.
 ///
 /// # Errors
 /// [`SpecError::Key`].
-pub(crate) fn duration(key: &'static str, ms: u32) -> Result<Nanos, SpecError> {
-    if !(1..=60_000).contains(&ms) {
-        return Err(SpecError::Key {
-            key,
-            value: f64::from(ms),
-            expected: "1 to 60000",
-        });
-    }
-    Ok(Nanos::from_millis(i64::from(ms)))
+pub(crate) fn duration(key: &'static str, value: u32) -> Result<Nanos, SpecError> {
+    ms(key, value, 1..=60_000, "1 to 60000")
+}
+
+/// As [`duration`], of a key that may be left out.
+///
+/// # Errors
+/// [`SpecError::Key`].
+pub(crate) fn stated_duration(
+    key: &'static str,
+    given: Option<u32>,
+) -> Result<Option<Nanos>, SpecError> {
+    given.map(|ms| duration(key, ms)).transpose()
 }
 
 /// The value of key `key`: a number above 0.
@@ -64,12 +91,15 @@ pub(crate) fn above_zero(key: &'static str, value: f64) -> Result<f64, SpecError
     if value > 0.0 && value.is_finite() {
         return Ok(value);
     }
-    let expected = "a number above 0";
-    Err(SpecError::Key {
-        key,
-        value,
-        expected,
-    })
+    Err(SpecError::key(key, value, "a number above 0"))
+}
+
+/// As [`above_zero`], of a key that may be left out.
+///
+/// # Errors
+/// [`SpecError::Key`].
+pub(crate) fn stated(key: &'static str, given: Option<f64>) -> Result<Option<f64>, SpecError> {
+    given.map(|value| above_zero(key, value)).transpose()
 }
 
 /// The value of key `key`, or the model's: a number above 0.
@@ -83,9 +113,6 @@ pub(crate) fn known(
 ) -> Result<f64, SpecError> {
     match given.or(of_model) {
         Some(value) => above_zero(key, value),
-        None => Err(SpecError::Keys {
-            key,
-            expected: "given where the model is not",
-        }),
+        None => Err(SpecError::keys(key, "given where the model is not")),
     }
 }

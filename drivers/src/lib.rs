@@ -48,6 +48,7 @@ pub mod odrive;
 pub mod openimu;
 pub mod optoforce_daq;
 mod pairing;
+mod received;
 #[cfg(feature = "recognise")]
 pub mod recognise;
 mod registry;

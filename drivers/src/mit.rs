@@ -49,6 +49,15 @@ impl Scale {
     }
 }
 
+/// The scales of position, velocity and torque, from minus these ends to them.
+pub(crate) fn scales([position, velocity, torque]: [f64; 3]) -> [Scale; 3] {
+    [
+        Scale::range(position, 16),
+        Scale::range(velocity, 12),
+        Scale::range(torque, 12),
+    ]
+}
+
 /// The state that these raw values of position, velocity and torque tell; SATURATED if one is at an
 /// end of its range.
 pub(crate) fn measured(scales: [Scale; 3], raw: [i64; 3]) -> (JointState, Quality) {

@@ -7,12 +7,13 @@ mod board;
 mod recognise;
 
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::bytes::{self, i16_le, u32_le};
+use crate::bytes::{i16_le, u32_le};
 use crate::family::{Family, Session, Supervised, next_in_step};
 use crate::held::OnChange;
+use crate::received::Received;
 use crate::{
     Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, NotSent, OutputInfo, Spec, SpecError,
-    StampedReading,
+    keys,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -73,28 +74,13 @@ impl Default for MoteusOptions {
 impl MoteusOptions {
     /// The controller's address and the period.
     fn check(&self, spec: &Spec) -> Result<(u8, Nanos), SpecError> {
-        let address = spec.address;
-        let (least, most) = (1, 127);
-        let range = SpecError::Address {
-            address,
-            least,
-            most,
-        };
-        let node = u8::try_from(address).ok();
-        let node = node.filter(|n| (1..=127).contains(n)).ok_or(range)?;
-        let key = |key, value, expected| SpecError::Key {
-            key,
-            value,
-            expected,
-        };
-        if !(1..=1000).contains(&self.period_ms) {
-            return Err(key("period_ms", f64::from(self.period_ms), "1 to 1000"));
-        }
+        let node = keys::address(spec, 1..=127)?;
+        let period = keys::ms("period_ms", self.period_ms, 1..=1000, "1 to 1000")?;
         if self.host > 127 || self.host == node {
             let expected = "0 to 127, and not the controller's address";
-            return Err(key("host", f64::from(self.host), expected));
+            return Err(SpecError::key("host", self.host, expected));
         }
-        Ok((node, Nanos::from_millis(i64::from(self.period_ms))))
+        Ok((node, period))
     }
 }
 
@@ -155,10 +141,7 @@ fn fd(id: Id, data: &[u8]) -> Option<Frame> {
     while filled.len() < length {
         filled.push(NOTHING);
     }
-    let format = Format::Fd {
-        bit_rate_switch: true,
-        error_state: false,
-    };
+    let format = Format::fd(true, false);
     Frame::with_format(id, format, &filled)
 }
 
@@ -354,20 +337,20 @@ impl MoteusController {
 impl Family for MoteusController {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         // Short frames are sent as classic ones by some programs.
-        let Some(data) = bytes::fd_payload(frame, out) else {
+        let Some(data) = frame.fd_payload() else {
             return;
         };
         if frame.id != self.reply {
             return;
         }
         let Some(told) = Reply::parse(data) else {
-            return out.fault(Counter::Value, 1, frame.id);
+            return frame.fault(Counter::Value);
         };
         // A reply to nobody is an old one, which a queue of an adapter has held back.
         if session.bringup.mode() == Mode::Supervise && !core::mem::take(&mut self.asked) {
-            return out.fault(Counter::Unexpected, 1, frame.id);
+            return frame.fault(Counter::Unexpected);
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // casts saturate
         let code = |value: f64| value.max(0.0) as u32;
@@ -386,21 +369,19 @@ impl Family for MoteusController {
                 encoder: 0,
                 faults: self.fault,
             });
-            let stamped = StampedReading::new(0, frame, self.quality(), reading);
-            out.push(stamped, frame.id);
+            frame.tell(0, self.quality(), reading);
         }
         if let Some(celsius) = told.temperature.filter(|celsius| celsius.is_finite())
             && self.temperature.is_due((), frame)
         {
             let reading = Reading::Temperature(Temperature { celsius });
-            let stamped = StampedReading::new(0, frame, Quality::GOOD, reading);
-            out.push(stamped, frame.id);
+            frame.tell(0, Quality::GOOD, reading);
         }
         let Some(position) = told.position else {
             return;
         };
         if !position.is_finite() {
-            return out.fault(Counter::Value, 1, frame.id);
+            return frame.fault(Counter::Value);
         }
         let finite = |value: Option<f64>| value.filter(|v| v.is_finite()).unwrap_or(f64::NAN);
         let state = JointState {
@@ -409,7 +390,7 @@ impl Family for MoteusController {
             torque: finite(told.torque),
             ..JointState::ABSENT
         };
-        session.joint(0, frame, self.quality(), state, out);
+        session.joint(0, frame, self.quality(), state);
     }
 
     fn reset(&mut self) {
@@ -417,12 +398,7 @@ impl Family for MoteusController {
         (self.actuator, self.temperature) = (OnChange::NOTHING, OnChange::NOTHING);
     }
 
-    fn request(
-        &mut self,
-        now: Nanos,
-        _session: &mut Session<NoInquiry>,
-        _out: &mut Decoded,
-    ) -> Option<Frame> {
+    fn request(&mut self, now: Nanos, _session: &mut Session, _out: &mut Decoded) -> Option<Frame> {
         if now < self.next {
             return None;
         }

@@ -49,12 +49,12 @@
 use crate::Frame;
 use proprio_topics::{Nanos, StampKind};
 
-/// Whether `later` is at most `most` after `earlier`. Without stamps nothing expires.
-pub(crate) fn within(earlier: (Nanos, StampKind), later: (Nanos, StampKind), most: Nanos) -> bool {
-    if earlier.1 == StampKind::None || later.1 == StampKind::None {
+/// Whether `frame` is at most `most` after `earlier`. Without stamps nothing expires.
+pub(crate) fn within(earlier: (Nanos, StampKind), frame: &Frame, most: Nanos) -> bool {
+    if earlier.1 == StampKind::None || frame.stamp == StampKind::None {
         return true;
     }
-    let passed = later.0 - earlier.0;
+    let passed = frame.t - earlier.0;
     passed >= Nanos::ZERO && passed <= most
 }
 
@@ -178,8 +178,7 @@ impl<T: Copy> Pairing<T> {
         let waiting = (second, frame.t, frame.stamp, half);
         let has_stamp = frame.stamp != StampKind::None;
         if let Some((t, stamp, other)) = self.ahead.take() {
-            let now = (frame.t, frame.stamp);
-            if !second && has_stamp && within((t, stamp), now, self.limit.exchanged) {
+            if !second && has_stamp && within((t, stamp), frame, self.limit.exchanged) {
                 self.calm = self.calm.saturating_add(1);
                 return Paired::With(t, stamp, [half, other]);
             }
@@ -214,22 +213,19 @@ impl<T: Copy> Pairing<T> {
         } else {
             self.limit.jittering
         };
-        let in_time = within((t, stamp), (frame.t, frame.stamp), limit);
+        let in_time = within((t, stamp), frame, limit);
         let usual = match self.usual {
             Some(usual) => usual + usual + USUAL_SLACK,
             None => Nanos(limit.0 / 2),
         };
         if !self.owed {
-            self.calm = if within((t, stamp), (frame.t, frame.stamp), self.limit.soon) {
+            self.calm = if within((t, stamp), frame, self.limit.soon) {
                 self.calm.saturating_add(1)
             } else {
                 self.calm.saturating_sub(CALM_LATE)
             };
         }
-        if in_time
-            && !self.owed
-            && (!self.doubt || within((t, stamp), (frame.t, frame.stamp), usual))
-        {
+        if in_time && !self.owed && (!self.doubt || within((t, stamp), frame, usual)) {
             self.doubt = false;
             let (passed, usual) = ((frame.t - t).0, self.usual.unwrap_or(frame.t - t).0);
             self.usual = Some(Nanos(usual + (passed - usual) / 8));

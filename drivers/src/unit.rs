@@ -46,164 +46,106 @@ use Quantity::{
     MagneticField, Number, Pressure, Temperature, Torque, Velocity,
 };
 
-/// The spellings of each unit as [`plain`] writes them, the usual one first. Rates are left out:
-/// they are an angle or a length over times.
-const UNITS: &[(&[&str], Quantity, f64, f64)] = &[
-    (&["rad", "rads", "radian", "radians"], Angle, 1.0, 0.0),
-    (&["mrad"], Angle, 1e-3, 0.0),
-    (&["deg", "degs", "degree", "degrees"], Angle, DEGREE, 0.0),
-    (&["mdeg"], Angle, DEGREE * 1e-3, 0.0),
+/// The spellings of each unit as [`plain`] writes them, the usual one first (that of a number is
+/// empty), its factor and its offset. Rates are left out: they are an angle or a length over times.
+const UNITS: &[(&str, Quantity, f64, f64)] = &[
+    ("rad rads radian radians", Angle, 1.0, 0.0),
+    ("mrad", Angle, 1e-3, 0.0),
+    ("deg degs degree degrees", Angle, DEGREE, 0.0),
+    ("mdeg", Angle, DEGREE * 1e-3, 0.0),
     (
-        &[
-            "rev",
-            "revs",
-            "revolution",
-            "revolutions",
-            "turn",
-            "turns",
-            "r",
-            "u",
-        ],
+        "rev revs revolution revolutions turn turns r u",
         Angle,
         TURN,
         0.0,
     ),
+    ("rpm 1/min /min upm rpms", AngularVelocity, TURN / 60.0, 0.0),
+    ("krpm", AngularVelocity, TURN / 60.0 * 1e3, 0.0),
+    ("dps", AngularVelocity, DEGREE, 0.0),
+    ("mdps", AngularVelocity, DEGREE * 1e-3, 0.0),
+    ("m meter meters metre metres", Length, 1.0, 0.0),
+    ("cm", Length, 1e-2, 0.0),
+    ("mm", Length, 1e-3, 0.0),
+    ("um", Length, 1e-6, 0.0),
+    ("km", Length, 1e3, 0.0),
+    ("in inch inches", Length, INCH, 0.0),
+    ("ft foot feet", Length, FOOT, 0.0),
+    ("kph kmh kmph", Velocity, 1e3 / 3600.0, 0.0),
+    ("mph", Velocity, 5280.0 * FOOT / 3600.0, 0.0),
+    ("g gs", Acceleration, G, 0.0),
+    ("mg", Acceleration, G * 1e-3, 0.0),
+    ("n newton newtons", Force, 1.0, 0.0),
+    ("mn", Force, 1e-3, 0.0),
+    ("kn", Force, 1e3, 0.0),
+    ("dan", Force, 10.0, 0.0),
+    ("kgf", Force, G, 0.0),
+    ("gf", Force, G * 1e-3, 0.0),
+    ("lbf", Force, POUND * G, 0.0),
     (
-        &["rpm", "1/min", "/min", "upm", "rpms"],
-        AngularVelocity,
-        TURN / 60.0,
-        0.0,
-    ),
-    (&["krpm"], AngularVelocity, TURN / 60.0 * 1e3, 0.0),
-    (&["dps"], AngularVelocity, DEGREE, 0.0),
-    (&["mdps"], AngularVelocity, DEGREE * 1e-3, 0.0),
-    (
-        &["m", "meter", "meters", "metre", "metres"],
-        Length,
-        1.0,
-        0.0,
-    ),
-    (&["cm"], Length, 1e-2, 0.0),
-    (&["mm"], Length, 1e-3, 0.0),
-    (&["um"], Length, 1e-6, 0.0),
-    (&["km"], Length, 1e3, 0.0),
-    (&["in", "inch", "inches"], Length, INCH, 0.0),
-    (&["ft", "foot", "feet"], Length, FOOT, 0.0),
-    (&["kph", "kmh", "kmph"], Velocity, 1e3 / 3600.0, 0.0),
-    (&["mph"], Velocity, 5280.0 * FOOT / 3600.0, 0.0),
-    (&["g", "gs"], Acceleration, G, 0.0),
-    (&["mg"], Acceleration, G * 1e-3, 0.0),
-    (&["n", "newton", "newtons"], Force, 1.0, 0.0),
-    (&["mn"], Force, 1e-3, 0.0),
-    (&["kn"], Force, 1e3, 0.0),
-    (&["dan"], Force, 10.0, 0.0),
-    (&["kgf"], Force, G, 0.0),
-    (&["gf"], Force, G * 1e-3, 0.0),
-    (&["lbf"], Force, POUND * G, 0.0),
-    (
-        &[
-            "nm",
-            "newtonmeter",
-            "newtonmeters",
-            "newtonmetre",
-            "newtonmetres",
-        ],
+        "nm newtonmeter newtonmeters newtonmetre newtonmetres",
         Torque,
         1.0,
         0.0,
     ),
-    (&["mnm", "nmm"], Torque, 1e-3, 0.0),
-    (&["unm"], Torque, 1e-6, 0.0),
-    (&["ncm"], Torque, 1e-2, 0.0),
-    (&["knm"], Torque, 1e3, 0.0),
-    (&["kgfcm"], Torque, G * 1e-2, 0.0),
-    (&["kgfm"], Torque, G, 0.0),
+    ("mnm nmm", Torque, 1e-3, 0.0),
+    ("unm", Torque, 1e-6, 0.0),
+    ("ncm", Torque, 1e-2, 0.0),
+    ("knm", Torque, 1e3, 0.0),
+    ("kgfcm", Torque, G * 1e-2, 0.0),
+    ("kgfm", Torque, G, 0.0),
+    ("lbfin inlbf inlb inlbs", Torque, POUND * G * INCH, 0.0),
+    ("lbfft ftlbf ftlb ftlbs", Torque, POUND * G * FOOT, 0.0),
+    ("ozfin ozin inoz", Torque, POUND / 16.0 * G * INCH, 0.0),
     (
-        &["lbfin", "inlbf", "inlb", "inlbs"],
-        Torque,
-        POUND * G * INCH,
-        0.0,
-    ),
-    (
-        &["lbfft", "ftlbf", "ftlb", "ftlbs"],
-        Torque,
-        POUND * G * FOOT,
-        0.0,
-    ),
-    (
-        &["ozfin", "ozin", "inoz"],
-        Torque,
-        POUND / 16.0 * G * INCH,
-        0.0,
-    ),
-    (
-        &[
-            "a", "amp", "amps", "ampere", "amperes", "arms", "apk", "adc", "aac",
-        ],
+        "a amp amps ampere amperes arms apk adc aac",
         Current,
         1.0,
         0.0,
     ),
+    ("ma mamp mamps milliamp milliamps", Current, 1e-3, 0.0),
+    ("ua", Current, 1e-6, 0.0),
+    ("ka", Current, 1e3, 0.0),
+    ("t tesla", MagneticField, 1.0, 0.0),
+    ("mt", MagneticField, 1e-3, 0.0),
+    ("ut", MagneticField, 1e-6, 0.0),
+    ("nt", MagneticField, 1e-9, 0.0),
+    ("gauss gs g", MagneticField, 1e-4, 0.0),
+    ("mgauss mg", MagneticField, 1e-7, 0.0),
     (
-        &["ma", "mamp", "mamps", "milliamp", "milliamps"],
-        Current,
-        1e-3,
-        0.0,
-    ),
-    (&["ua"], Current, 1e-6, 0.0),
-    (&["ka"], Current, 1e3, 0.0),
-    (&["t", "tesla"], MagneticField, 1.0, 0.0),
-    (&["mt"], MagneticField, 1e-3, 0.0),
-    (&["ut"], MagneticField, 1e-6, 0.0),
-    (&["nt"], MagneticField, 1e-9, 0.0),
-    (&["gauss", "gs", "g"], MagneticField, 1e-4, 0.0),
-    (&["mgauss", "mg"], MagneticField, 1e-7, 0.0),
-    (
-        &[
-            "degc",
-            "c",
-            "celsius",
-            "degcelsius",
-            "degreec",
-            "degreesc",
-            "degreecelsius",
-            "degreescelsius",
-        ],
+        "degc c celsius degcelsius degreec degreesc degreecelsius degreescelsius",
         Temperature,
         1.0,
         0.0,
     ),
-    (&["k", "degk", "kelvin"], Temperature, 1.0, -273.15),
+    ("k degk kelvin", Temperature, 1.0, -273.15),
     (
-        &["degf", "f", "fahrenheit", "degfahrenheit", "degreesf"],
+        "degf f fahrenheit degfahrenheit degreesf",
         Temperature,
         5.0 / 9.0,
         -160.0 / 9.0,
     ),
-    (&["pa", "pascal"], Pressure, 1.0, 0.0),
-    (&["hpa"], Pressure, 1e2, 0.0),
-    (&["kpa"], Pressure, 1e3, 0.0),
-    (&["Mpa"], Pressure, 1e6, 0.0),
-    (&["bar", "bars"], Pressure, 1e5, 0.0),
-    (&["mbar"], Pressure, 1e2, 0.0),
-    (&["psi"], Pressure, POUND * G / (INCH * INCH), 0.0),
+    ("pa pascal", Pressure, 1.0, 0.0),
+    ("hpa", Pressure, 1e2, 0.0),
+    ("kpa", Pressure, 1e3, 0.0),
+    ("Mpa", Pressure, 1e6, 0.0),
+    ("bar bars", Pressure, 1e5, 0.0),
+    ("mbar", Pressure, 1e2, 0.0),
+    ("psi", Pressure, POUND * G / (INCH * INCH), 0.0),
     (
-        &[
-            "", "1", "count", "counts", "cnt", "tick", "ticks", "bit", "bits", "lsb", "raw",
-        ],
+        " 1 count counts cnt tick ticks bit bits lsb raw",
         Number,
         1.0,
         0.0,
     ),
-    (&["%", "percent", "pct"], Number, 1e-2, 0.0),
+    ("% percent pct", Number, 1e-2, 0.0),
 ];
 
 /// The spellings of times \[s\].
-const TIMES: &[(&[&str], f64)] = &[
-    (&["s", "sec", "secs", "second", "seconds"], 1.0),
-    (&["ms"], 1e-3),
-    (&["min", "minute", "minutes"], 60.0),
-    (&["h", "hr", "hour", "hours"], 3600.0),
+const TIMES: &[(&str, f64)] = &[
+    ("s sec secs second seconds", 1.0),
+    ("ms", 1e-3),
+    ("min minute minutes", 60.0),
+    ("h hr hour hours", 3600.0),
 ];
 
 /// What a quantity over a time is.
@@ -262,9 +204,11 @@ fn is_spelled<'s>(text: &str, spelling: &str, mut all: impl Iterator<Item = &'s 
 /// The time that a unit is divided by, one or two factors: how many, and their product \[s\].
 fn times(text: &str) -> Option<(usize, f64)> {
     let time = |text: &str| {
-        let all = || TIMES.iter().flat_map(|(spellings, _)| *spellings).copied();
-        let is = |spelling: &&str| is_spelled(text, spelling, all());
-        let found = TIMES.iter().find(|(spellings, _)| spellings.iter().any(is));
+        let all = || TIMES.iter().flat_map(|(spellings, _)| spellings.split(' '));
+        let is = |spelling: &str| is_spelled(text, spelling, all());
+        let found = TIMES
+            .iter()
+            .find(|(spellings, _)| spellings.split(' ').any(is));
         found.map(|(_, seconds)| *seconds)
     };
     if let Some((first, second)) = text.split_once('/') {
@@ -285,11 +229,11 @@ pub(crate) fn unit(word: &str, legal: &[Quantity]) -> Option<Unit> {
         return None;
     }
     let spelled = |text: &str, legal: &[Quantity]| {
-        let words = || UNITS.iter().flat_map(|unit| unit.0).copied();
-        let is = |spelling: &&str| is_spelled(text, spelling, words());
+        let words = || UNITS.iter().flat_map(|unit| unit.0.split(' '));
+        let is = |spelling: &str| is_spelled(text, spelling, words());
         let mut units = UNITS.iter();
-        let found = units.find(|u| legal.contains(&u.1) && u.0.iter().any(is));
-        let all = || UNITS.iter().find(|unit| unit.0.iter().any(is));
+        let found = units.find(|u| legal.contains(&u.1) && u.0.split(' ').any(is));
+        let all = || UNITS.iter().find(|unit| unit.0.split(' ').any(is));
         found
             .or_else(all)
             .map(|&(_, quantity, factor, offset)| Unit {
@@ -342,7 +286,7 @@ pub(crate) fn spellings(quantities: &[Quantity]) -> Vec<String> {
         };
         let named = |quantity| {
             let units = UNITS.iter().filter(move |unit| unit.1 == quantity);
-            units.filter_map(|unit| unit.0.first())
+            units.filter_map(|unit| unit.0.split(' ').next())
         };
         words.extend(named(of).map(|word| format!("{word}{over}")));
         if of != *quantity {
@@ -537,8 +481,9 @@ mod tests {
     fn no_spelling_has_two_meanings() {
         for (at, one) in UNITS.iter().enumerate() {
             let others = UNITS.iter().skip(at + 1).filter(|other| other.1 == one.1);
-            for spelling in others.flat_map(|other| other.0) {
-                assert!(!one.0.contains(spelling), "{spelling:?}");
+            for spelling in others.flat_map(|other| other.0.split(' ')) {
+                let known = one.0.split(' ').any(|known| known == spelling);
+                assert!(!known, "{spelling:?}");
             }
         }
         assert_eq!(

@@ -47,11 +47,7 @@ pub(crate) fn full_scale(
             } else {
                 "full_scale_nm"
             };
-            return Err(SpecError::Key {
-                key,
-                value,
-                expected: "above 0 and at most 65535",
-            });
+            return Err(SpecError::key(key, value, "above 0 and at most 65535"));
         }
     }
     Ok(Some(all))

@@ -62,9 +62,8 @@ enum OpenRequest {
 /// # Errors
 /// [`SpecError`]: a device that its driver cannot build.
 pub fn build(device: &DevicePlan, mode: Option<Mode>) -> Result<Box<dyn Device>, SpecError> {
-    let mut spec = device.spec.clone();
-    spec.mode = mode.unwrap_or(spec.mode);
-    device.options.device(&spec)
+    let mode = mode.unwrap_or(device.spec.mode);
+    device.options.device(&device.spec.in_mode(mode))
 }
 
 /// The axes whose value is beyond the sensor's full scale, if that is known: bit k for axis k.

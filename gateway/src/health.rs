@@ -280,9 +280,8 @@ impl HealthLog {
                 use Counter::{Frames, Frozen, OutOfRange, Readings, Starts};
                 !matches!(c, Frames | Frozen | OutOfRange | Readings | Starts)
             }) {
-                let total = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
-                let count = total(device).unwrap_or(0);
-                let new = increase(count, before.and_then(total));
+                let count = device.count(counter);
+                let new = increase(count, before.map(|b| b.count(counter)));
                 // Who joins a stream hears parts of groups that began before.
                 let joins = before.is_none_or(|b| b.state != DeviceState::Streaming);
                 if joins && counter == Counter::Unpaired {
@@ -367,8 +366,7 @@ fn log_doubts(device: &DeviceHealth, before: Option<&DeviceHealth>, runs: &mut D
         ),
     ];
     for ((counter, mask, what), doubted) in doubts.into_iter().zip(&mut runs.doubted) {
-        let total = |d: &DeviceHealth| d.counters.get(counter as usize).copied();
-        let new = increase(total(device).unwrap_or(0), before.and_then(total));
+        let new = increase(device.count(counter), before.map(|b| b.count(counter)));
         let Some(run) = runs.faults.get_mut(counter as usize) else {
             continue;
         };
@@ -439,8 +437,10 @@ fn log_load(bus: &BusHealth, full: &mut bool) {
 
 /// What to check of a silent board.
 fn remedy(device: &DeviceHealth) -> String {
-    let count = |counter: Counter| device.counters.get(counter as usize).copied().unwrap_or(0);
-    let (starts, readings) = (count(Counter::Starts), count(Counter::Readings));
+    let (starts, readings) = (
+        device.count(Counter::Starts),
+        device.count(Counter::Readings),
+    );
     let what = match (starts, readings) {
         (0, 0) => "nothing is received from it".to_owned(),
         (_, 0) => format!("no reading after {starts} starts"),

@@ -247,11 +247,7 @@ pub fn of_bus(members: &[Participant<'_>], rates: BitRates) -> Result<BusLoad, S
     let known = members.iter().filter(|m| m.options.states_period());
     for member in known {
         // A board that has been started.
-        let mode = Mode::Listen;
-        let mut board = member.options.board(&Spec {
-            mode,
-            ..member.spec.clone()
-        })?;
+        let mut board = member.options.board(&member.spec.in_mode(Mode::Listen))?;
         match board.period() {
             Some(period) => add(&at_once(&member.outputs, &mut *board), period.seconds()),
             None => polled.push(member),
@@ -297,11 +293,7 @@ fn conversation(members: &[&Participant<'_>]) -> Result<Vec<Frame>, SpecError> {
     const END: i64 = BEGIN + 2_000;
     let (mut hosts, mut boards) = (Vec::new(), Vec::new());
     for member in members {
-        let mode = Mode::Supervise;
-        let spec = Spec {
-            mode,
-            ..member.spec.clone()
-        };
+        let spec = member.spec.in_mode(Mode::Supervise);
         hosts.push(member.options.device(&spec)?);
         let mut board = member.options.board(&spec)?;
         for &(output, kind) in &member.outputs {

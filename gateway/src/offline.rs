@@ -7,7 +7,7 @@ use crate::link::replay::{self, Matching};
 use crate::log::{self, LogFormat, Stamps, candump};
 use crate::plan::{BusPlan, ChannelPlan, DevicePlan, Plan};
 use crate::status::BusStatus;
-use proprio_drivers::{Board, Format, Frame, Frames, Mode, Spec};
+use proprio_drivers::{Board, Format, Frame, Frames, Mode};
 use proprio_topics::csv::{self, Columns, Series, SeriesValue, Value, What};
 use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Refusal, Sample, StampKind};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -291,12 +291,12 @@ impl LogBus {
         devices
             .zip(self.devices.states())
             .map(|((device, health), state)| {
-                let count = |c: Counter| health.counters.get(c as usize).copied().unwrap_or(0);
-                let others = Counter::ALL.into_iter().skip(2).map(|c| (c, count(c)));
+                let counters = Counter::ALL.into_iter();
+                let others = counters.skip(2).map(|c| (c, health.count(c)));
                 DeviceReport {
                     name: device.name.clone(),
-                    frames: count(Counter::Frames),
-                    readings: count(Counter::Readings),
+                    frames: health.count(Counter::Frames),
+                    readings: health.count(Counter::Readings),
                     counts: others.filter(|(_, n)| *n > 0).collect(),
                     refusal: state.refusal().map(|refusal| refusal.to_string()),
                     lack: Refusal::from_code(health.refusal)
@@ -574,12 +574,8 @@ struct TableEncoder<'p, W> {
 impl<'p, W: Write> TableEncoder<'p, W> {
     fn new(plan: &'p Plan, log: W) -> Result<Self, ConversionError> {
         let board = |device: &DevicePlan| {
-            let spec = Spec {
-                // Nobody has started it: it encodes what the table holds, not a stream.
-                mode: Mode::Supervise,
-                ..device.spec.clone()
-            };
-            let board = device.options.board(&spec);
+            // Nobody has started it: it encodes what the table holds, not a stream.
+            let board = device.options.board(&device.spec.in_mode(Mode::Supervise));
             board.map_err(|cause| ConversionError::Device {
                 device: device.name.clone(),
                 cause,

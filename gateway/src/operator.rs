@@ -330,14 +330,14 @@ impl Operator {
                     .filter_map(|output| self.plan.channels.get(output.channel as usize))
                     .map(|channel| channel.name.as_str())
                     .collect();
-                let count = |counter: Counter| health.counters.get(counter as usize);
                 json!({
                     "name": device.name, "bus": bus.name, "driver": device.driver,
                     "address": device.spec.address,
                     "listen_only": mode == Mode::Listen,
                     "state": health.state.get().map(DeviceState::word),
                     "refusal": Refusal::from_code(health.refusal).map(|r| r.to_string()),
-                    "frames": count(Counter::Frames), "readings": count(Counter::Readings),
+                    "frames": health.count(Counter::Frames),
+                    "readings": health.count(Counter::Readings),
                     "frozen": axes(health.frozen_axes).to_string(),
                     "out_of_range": axes(health.beyond_axes).to_string(),
                     "channels": channels,

@@ -10,6 +10,7 @@
 mod found;
 mod tables;
 
+pub(crate) use found::contested;
 pub use found::{FoundDevice, devices};
 pub(crate) use tables::FILL_IN;
 pub use tables::{ScannedBus, file, placeholders, tables};
@@ -127,16 +128,8 @@ pub fn log(
         let why = reader.why_empty();
         return Err(io::Error::new(io::ErrorKind::InvalidData, why));
     }
-    let mut notes = Vec::new();
-    if let Some(first) = reader.bad().next() {
-        let parts = reader.format().map_or("lines", log::LogFormat::parts);
-        let bad = reader.report().bad;
-        notes.push(format!(
-            "{bad} {parts} of the log were skipped; the first is {first}"
-        ));
-    }
-    notes.extend(reader.doubt(log::STAMPS_OPTION));
-    Ok((buses, notes))
+    let notes = [reader.skipped(), reader.doubt(log::STAMPS_OPTION)];
+    Ok((buses, notes.into_iter().flatten().collect()))
 }
 
 #[cfg(test)]

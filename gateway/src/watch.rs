@@ -26,7 +26,7 @@ use crate::link::{Link, ListenOnly, Received};
 use crate::plan::{BusPlan, Plan};
 use crate::scan::devices;
 use crate::status::BusStatus;
-use proprio_drivers::{Certainty, Claim, Frame, Mode, Spec, Traffic};
+use proprio_drivers::{Certainty, Claim, Frame, Mode, Traffic};
 use proprio_topics::{Nanos, Reading, realtime};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -117,18 +117,11 @@ fn look(plan: &Plan, number: usize, frames: &[Frame]) -> Vec<String> {
     all
 }
 
-fn listening(spec: &Spec) -> Spec {
-    Spec {
-        mode: Mode::Listen,
-        ..spec.clone()
-    }
-}
-
 fn strangers(bus: &BusPlan, frames: &[Frame]) -> Vec<String> {
     let mut heard = Traffic::new();
     frames.iter().for_each(|frame| heard.on_frame(frame));
     let built = bus.devices.iter().filter_map(|device| {
-        let device = device.options.device(&listening(&device.spec));
+        let device = device.options.device(&device.spec.in_mode(Mode::Listen));
         device.ok().map(|device| device.claims().to_vec())
     });
     let claims: Vec<Claim> = built.flatten().collect();
@@ -212,7 +205,10 @@ fn doubled(plan: &Plan, number: usize, bus: &BusPlan, frames: &[Frame]) -> Vec<S
     }
     let mut all = Vec::new();
     for (device, place) in bus.devices.iter().zip(0..) {
-        let board = device.options.board(&listening(&device.spec)).ok();
+        let board = device
+            .options
+            .board(&device.spec.in_mode(Mode::Listen))
+            .ok();
         let Some(period) = board.and_then(|board| board.period()) else {
             continue;
         };
@@ -245,7 +241,7 @@ fn doubled(plan: &Plan, number: usize, bus: &BusPlan, frames: &[Frame]) -> Vec<S
 #[cfg(test)]
 mod tests {
     use super::*;
-    use proprio_drivers::{Board, Frames, Options};
+    use proprio_drivers::{Board, Frames, Options, Spec};
     use proprio_topics::{JointState, Quality, StampKind, Wrench};
 
     const ARM: &str = "schema = 1\nrobot = \"r\"\n[[bus]]\nname = \"b\"\n\

@@ -157,14 +157,12 @@ pub enum FaultError {
         kind: String,
     },
     /// Its form is wrong.
-    #[error("fault {text:?}: it must have the form {form}, for example {example}")]
+    #[error("fault {text:?}: it must have the form {form}")]
     Form {
         /// What was typed.
         text: String,
-        /// The legal form.
+        /// The legal form, with an example.
         form: &'static str,
-        /// An example.
-        example: &'static str,
     },
     /// The robot has no such board.
     #[error(
@@ -261,50 +259,19 @@ fn vector(text: &str) -> Option<[f64; 3]> {
     numbers?.try_into().ok()
 }
 
-/// The kinds of faults, their forms, and an example of each.
-const FORMS: [(&str, &str, &str); 10] = [
-    (
-        "lost",
-        "lost:PROBABILITY[@FROM..UNTIL] with a probability from 0 to 1",
-        "\"lost:0.01\"",
-    ),
-    (
-        "silent",
-        "silent:BOARD@FROM..UNTIL",
-        "\"silent:l_arm_ft_sensor@3..4\"",
-    ),
-    (
-        "reboot",
-        "reboot:BOARD@TIME",
-        "\"reboot:l_arm_ft_sensor@5\"",
-    ),
-    (
-        "saturate",
-        "saturate:BOARD@FROM..UNTIL",
-        "\"saturate:l_arm_ft_sensor@5..5.5\"",
-    ),
-    (
-        "freeze",
-        "freeze:BOARD@FROM..UNTIL",
-        "\"freeze:l_arm_ft_sensor@5..6\"",
-    ),
-    ("spike", "spike:BOARD@TIME", "\"spike:l_arm_ft_sensor@6\""),
-    (
-        "late",
-        "late:BOARD=SECONDS@FROM..UNTIL",
-        "\"late:l_arm_ft_sensor=0.02@5..8\"",
-    ),
-    (
-        "late_half",
-        "late_half:BOARD@FROM..UNTIL or late_half:BOARD@TIME",
-        "\"late_half:l_arm_ft_sensor@2..8\"",
-    ),
-    (
-        "push",
-        "push:LINK=NEWTONS[:X,Y,Z[:DX,DY,DZ]]@FROM..UNTIL",
-        "\"push:l_forearm=20@8..9\"",
-    ),
-    ("still", "still:JOINT[=RAD]", "\"still:l_elbow=0.8\""),
+/// The form of each kind of fault, and an example.
+const FORMS: [&str; 10] = [
+    "lost:PROBABILITY[@FROM..UNTIL] with a probability from 0 to 1, for example \"lost:0.01\"",
+    "silent:BOARD@FROM..UNTIL, for example \"silent:l_arm_ft_sensor@3..4\"",
+    "reboot:BOARD@TIME, for example \"reboot:l_arm_ft_sensor@5\"",
+    "saturate:BOARD@FROM..UNTIL, for example \"saturate:l_arm_ft_sensor@5..5.5\"",
+    "freeze:BOARD@FROM..UNTIL, for example \"freeze:l_arm_ft_sensor@5..6\"",
+    "spike:BOARD@TIME, for example \"spike:l_arm_ft_sensor@6\"",
+    "late:BOARD=SECONDS@FROM..UNTIL, for example \"late:l_arm_ft_sensor=0.02@5..8\"",
+    "late_half:BOARD@FROM..UNTIL or late_half:BOARD@TIME, for example \
+     \"late_half:l_arm_ft_sensor@2..8\"",
+    "push:LINK=NEWTONS[:X,Y,Z[:DX,DY,DZ]]@FROM..UNTIL, for example \"push:l_forearm=20@8..9\"",
+    "still:JOINT[=RAD], for example \"still:l_elbow=0.8\"",
 ];
 
 impl FromStr for InjectedFault {
@@ -316,15 +283,15 @@ impl FromStr for InjectedFault {
             Some((what, when)) => (what, Some(when)),
             None => (rest, None),
         };
-        let known = FORMS.into_iter().find(|(own, ..)| *own == kind);
-        let (_, form, example) = known.ok_or_else(|| FaultError::Kind {
+        let of_kind = |form: &&str| form.split(':').next() == Some(kind);
+        let known = FORMS.into_iter().find(of_kind);
+        let form = known.ok_or_else(|| FaultError::Kind {
             text: text.to_owned(),
             kind: kind.to_owned(),
         })?;
         Self::parse(kind, what, when).ok_or_else(|| FaultError::Form {
             text: text.to_owned(),
             form,
-            example,
         })
     }
 }
@@ -336,40 +303,25 @@ impl InjectedFault {
         let is_named = !what.is_empty();
         let span = when.and_then(window).filter(|_| is_named);
         let moment = when.and_then(instant).filter(|_| is_named);
-        Some(match kind {
-            "lost" => Self::Lost {
+        Some(match (kind, span, moment) {
+            ("lost", ..) => Self::Lost {
                 probability: number(what).filter(|p| (0.0..=1.0).contains(p))?,
                 window: when.map_or(Some(TimeWindow::ALWAYS), window)?,
             },
-            "silent" => Self::Silent {
-                device,
-                window: span?,
-            },
-            "saturate" => Self::Saturate {
-                device,
-                window: span?,
-            },
-            "freeze" => Self::Freeze {
-                device,
-                window: span?,
-            },
-            "reboot" => Self::Reboot {
-                device,
-                at: moment?,
-            },
-            "spike" => Self::Spike {
-                device,
-                at: moment?,
-            },
-            "late" => {
+            ("silent", Some(window), _) => Self::Silent { device, window },
+            ("saturate", Some(window), _) => Self::Saturate { device, window },
+            ("freeze", Some(window), _) => Self::Freeze { device, window },
+            ("reboot", _, Some(at)) => Self::Reboot { device, at },
+            ("spike", _, Some(at)) => Self::Spike { device, at },
+            ("late", Some(window), _) => {
                 let (device, age) = named(what)?;
                 Self::Late {
                     device,
                     age: number(age.trim()).filter(|age| *age > 0.0)?,
-                    window: span?,
+                    window,
                 }
             }
-            "late_half" => Self::LateHalf {
+            ("late_half", ..) => Self::LateHalf {
                 device,
                 window: span.or(moment.map(|from| TimeWindow {
                     from,
@@ -377,7 +329,7 @@ impl InjectedFault {
                 }))?,
                 once: span.is_none(),
             },
-            "push" => {
+            ("push", Some(window), _) => {
                 let (link, rest) = named(what)?;
                 let mut parts = rest.split(':');
                 let force = number(parts.next()?.trim())?;
@@ -393,10 +345,10 @@ impl InjectedFault {
                     force,
                     at: given(at)?,
                     along: given(along)?,
-                    window: span?,
+                    window,
                 }
             }
-            "still" => {
+            ("still", ..) => {
                 let (joint, at) = match what.split_once('=') {
                     Some((joint, at)) => (joint, Some(number(at.trim())?)),
                     None => (what, None),

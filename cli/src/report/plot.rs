@@ -136,6 +136,13 @@ impl PlotAxis {
         }
     }
 
+    pub(crate) fn within(label: &str, range: (f64, f64)) -> Self {
+        Self {
+            range: Some(range),
+            ..Self::new(label)
+        }
+    }
+
     pub(crate) fn log(label: &str) -> Self {
         Self {
             scale: AxisScale::Log,

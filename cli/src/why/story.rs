@@ -68,6 +68,16 @@ pub(super) struct Story {
     pub(super) advice: String,
 }
 
+impl Story {
+    fn new(head: impl Into<String>, because: &[&str], advice: impl Into<String>) -> Self {
+        Self {
+            head: head.into(),
+            because: because.iter().map(|text| (*text).to_owned()).collect(),
+            advice: advice.into(),
+        }
+    }
+}
+
 /// A part of a budget, as it is shown.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct VarianceShare {
@@ -144,16 +154,13 @@ impl TorqueCase {
                     own.name
                 )
             });
-            return Story {
-                head: format!(
-                    "{joint} is valid: {} +- {} {}",
-                    digits(budget.torque.torque),
-                    digits(budget.deviation),
-                    budget.unit()
-                ),
-                because: because.into_iter().collect(),
-                advice: String::new(),
-            };
+            let head = format!(
+                "{joint} is valid: {} +- {} {}",
+                digits(budget.torque.torque),
+                digits(budget.deviation),
+                budget.unit()
+            );
+            return Story::new(head, because.as_deref().as_slice(), "");
         }
         let mut story = self.withheld(budget, reason);
         story.head = format!("{joint} is withheld: {}", story.head);
@@ -171,55 +178,50 @@ impl TorqueCase {
     fn withheld(&self, budget: &TorqueBudget, reason: Reason) -> Story {
         let channel = self.cause.as_deref().unwrap_or("a channel");
         let (likelier, residual) = (budget.likelier.as_str(), budget.unexplained.as_str());
-        let story = |head: String, because: &[&str], advice: &str| Story {
-            head,
-            because: because.iter().map(|text| (*text).to_owned()).collect(),
-            advice: advice.to_owned(),
-        };
         let story = match reason {
             Reason::NeverSeen | Reason::Stale => return self.silent(channel),
-            Reason::Saturated => story(
+            Reason::Saturated => Story::new(
                 format!("{channel} is saturated"),
                 &["a reading at the end of its range says only that the load is at least that"],
                 "lessen the load; if this load is usual, use a larger range of the sensor",
             ),
-            Reason::DeviceFault => story(
+            Reason::DeviceFault => Story::new(
                 format!("the board of {channel} reports a fault"),
                 &[],
                 "its manual tells what its fault means and how to clear it; `proprio status` has \
                  its counters",
             ),
-            Reason::Frozen => story(
+            Reason::Frozen => Story::new(
                 format!("{channel} is frozen: it repeats its readings instead of measuring"),
                 &[],
                 "switch its board off and on; if it freezes again, its firmware or its amplifier \
                  is at fault",
             ),
-            Reason::Implausible => story(
+            Reason::Implausible => Story::new(
                 format!("{channel} sends readings that contradict the ones before and after"),
                 &[],
                 "look for loose connectors at the sensor, and for error frames on its bus \
                  (`proprio status`)",
             ),
-            Reason::Starting => story(
+            Reason::Starting => Story::new(
                 format!(
                     "{channel} has too few samples without a gap for velocity and acceleration"
                 ),
                 &[],
                 "wait for some tens of samples; if it lasts, the channel loses samples or is slow",
             ),
-            Reason::NoStance => story(
-                "no link is known to stand still".to_owned(),
+            Reason::NoStance => Story::new(
+                "no link is known to stand still",
                 &["the base moves, and no IMU measures how"],
                 "declare the foot that stands (<robot>/contact/declared), or configure an IMU",
             ),
-            Reason::NotFinite => story(
-                "the result is no finite number".to_owned(),
+            Reason::NotFinite => Story::new(
+                "the result is no finite number",
                 &[],
                 "look for readings or parameters without sense: `proprio echo`, `proprio \
                  estimator --check`",
             ),
-            Reason::Undetermined => story(
+            Reason::Undetermined => Story::new(
                 format!(
                     "the contacts that are present have more unknowns than the F/T sensors have \
                      equations: {}",
@@ -231,7 +233,7 @@ impl TorqueCase {
                  those that can not exert a torque",
             ),
             Reason::Uncertain => self.uncertain(budget),
-            Reason::Unexplained => story(
+            Reason::Unexplained => Story::new(
                 format!(
                     "an undeclared contact or load, another F/T offset, or F/T readings that are \
                      late: {residual}"
@@ -240,12 +242,12 @@ impl TorqueCase {
                 "let go of the robot; if something may touch it there, configure a [[contact]]; \
                  if nothing does, tare the sensor or identify again",
             ),
-            Reason::Contradicted if !likelier.is_empty() => story(
+            Reason::Contradicted if !likelier.is_empty() => Story::new(
                 format!("the readings contradict the configuration: {likelier}"),
                 &["this explains them far better than what is configured"],
                 "correct the configuration or the wiring, and restart the estimator",
             ),
-            Reason::Contradicted => story(
+            Reason::Contradicted => Story::new(
                 format!(
                     "the readings have contradicted the configuration since the start: {residual}"
                 ),
@@ -256,7 +258,7 @@ impl TorqueCase {
                 "move the robot without a contact for some seconds; if it stays, check the F/T \
                  offset, then base and mounting in estimator.toml",
             ),
-            Reason::Absent | Reason::None => story(reason.word().to_owned(), &[], ""),
+            Reason::Absent | Reason::None => Story::new(reason.word(), &[], ""),
         };
         self.with_board(story)
     }
@@ -280,28 +282,25 @@ impl TorqueCase {
             .map(|part| part.name.as_str())
             .collect();
         if let Some(channel) = &self.cause {
-            return Story {
-                head: format!("the zero of {channel} is a new one, so that its offset is unknown"),
-                because: vec!["its board was restarted or tared".to_owned()],
-                advice: self.moving(&unmoved),
-            };
+            return Story::new(
+                format!("the zero of {channel} is a new one, so that its offset is unknown"),
+                &["its board was restarted or tared"],
+                self.moving(&unmoved),
+            );
         }
         if budget.deviation.is_infinite() {
             let unmoved_too = match unmoved.as_slice() {
                 [] => String::new(),
                 all => format!(": {} hardly moved", list_has(all)),
             };
-            return Story {
-                head: format!(
-                    "it is not known yet whether the setup is as configured{unmoved_too}"
-                ),
-                because: vec![
+            return Story::new(
+                format!("it is not known yet whether the setup is as configured{unmoved_too}"),
+                &[
                     "identification compares the configured setup with others, such as a reversed \
-                     encoder or a turned sensor; that takes some seconds of motion"
-                        .to_owned(),
+                     encoder or a turned sensor; that takes some seconds of motion",
                 ],
-                advice: self.moving(&unmoved),
-            };
+                self.moving(&unmoved),
+            );
         }
         let largest = shares(budget).into_iter().next();
         let advice = self.lessening(largest.as_ref().map(|share| share.source), &unmoved);
@@ -315,24 +314,19 @@ impl TorqueCase {
         if !unmoved.is_empty() && self.identifies {
             part += &format!("; {} hardly moved", list_has(&unmoved));
         }
-        let still = match unmoved.is_empty() {
-            true => None,
-            false => Some(format!(
-                "hardly moved since the estimator's start: {}",
-                list(&unmoved)
-            )),
-        };
-        Story {
-            head: format!(
-                "its deviation of {} {unit} exceeds the bound of {} {unit} \
-                 (output.max_torque_std_nm){part}",
-                digits(budget.deviation),
-                digits(budget.bound),
-                unit = budget.unit()
-            ),
-            because: still.into_iter().collect(),
-            advice,
-        }
+        let still = format!(
+            "hardly moved since the estimator's start: {}",
+            list(&unmoved)
+        );
+        let head = format!(
+            "its deviation of {} {unit} exceeds the bound of {} {unit} \
+             (output.max_torque_std_nm){part}",
+            digits(budget.deviation),
+            digits(budget.bound),
+            unit = budget.unit()
+        );
+        let because: &[&str] = if unmoved.is_empty() { &[] } else { &[&still] };
+        Story::new(head, because, advice)
     }
 
     /// What to move, so that identification learns; `unmoved` are the joints that hardly did.
@@ -378,23 +372,16 @@ impl TorqueCase {
             None => format!("no sample of {name}"),
         };
         let Some(channel) = channel else {
-            return Story {
-                head: since,
-                because: Vec::new(),
-                advice: "compare the two configurations: `proprio estimator --check --gateway`"
-                    .to_owned(),
-            };
+            let advice = "compare the two configurations: `proprio estimator --check --gateway`";
+            return Story::new(since, &[], advice);
         };
         if !channel.is_silent && channel.age.is_some() {
-            return Story {
-                head: format!("samples of {name} come too rarely"),
-                because: vec![
-                    "between two of them was more than input.max_silence_ms allows".to_owned(),
-                ],
-                advice: "compare its rate in `proprio status` with max_silence_ms: three periods \
-                         are a good maximum; a bus that is full, or lost frames, make gaps"
-                    .to_owned(),
-            };
+            return Story::new(
+                format!("samples of {name} come too rarely"),
+                &["between two of them was more than input.max_silence_ms allows"],
+                "compare its rate in `proprio status` with max_silence_ms: three periods are a \
+                 good maximum; a bus that is full, or lost frames, make gaps",
+            );
         }
         let mut because = vec![since.clone()];
         if !channel.device.is_empty() {
@@ -453,11 +440,7 @@ impl TorqueCase {
     fn no_estimate(&self) -> Story {
         let system = &self.system;
         if let Some(trouble) = &system.trouble {
-            return Story {
-                head: trouble.clone(),
-                because: Vec::new(),
-                advice: RESTART.to_owned(),
-            };
+            return Story::new(trouble, &[], RESTART);
         }
         let trigger = self.cause.as_deref().and_then(|name| system.channel(name));
         match trigger.filter(|trigger| trigger.is_silent) {
@@ -469,13 +452,12 @@ impl TorqueCase {
                 ));
                 story
             }
-            None => Story {
-                head: "the estimator makes no estimate".to_owned(),
-                because: Vec::new(),
-                advice: "its log tells which channels it lacks; `proprio estimator --check \
-                         --gateway` compares the two configurations"
-                    .to_owned(),
-            },
+            None => Story::new(
+                "the estimator makes no estimate",
+                &[],
+                "its log tells which channels it lacks; `proprio estimator --check --gateway` \
+                 compares the two configurations",
+            ),
         }
     }
 }

@@ -74,7 +74,7 @@ impl Board for AftBoard {
                 };
                 to.copy_from_slice(&count.to_be_bytes());
             }
-            let _ = out.try_push(Frame::new(id, &data));
+            board::send(id, &data, out);
         }
         Ok(())
     }

@@ -1,5 +1,6 @@
 //! The board's own side: tells its calibration, and answers requests with the gauges of its load.
 
+use super::calibration::per_count;
 use super::frames::{STATUS_ANY, id, opcode, opcode_of};
 use super::options::AtiNetcanoemOptions;
 use crate::calibration::inverse;
@@ -40,7 +41,7 @@ struct NetcanoemBoard {
 
 impl NetcanoemBoard {
     fn reply(&self, opcode: u8, data: &[u8], out: &mut Frames) {
-        let _ = out.try_push(Frame::new(id(self.base, opcode), data));
+        board::send(id(self.base, opcode), data, out);
     }
 
     /// Both halves of the reading of `load`.
@@ -74,26 +75,13 @@ impl Simulate for AtiNetcanoemOptions {
             (Some(force), Some(torque)) => [force as u8, torque as u8],
             _ => UNITS,
         };
-        let [newton, newton_metre] = self.units().unwrap_or([1.0; 2]);
-        let mut per_count = matrix;
-        for (axis, row) in per_count.iter_mut().enumerate() {
-            let [force, torque] = counts;
-            let unit = if axis < 3 {
-                newton / force
-            } else {
-                newton_metre / torque
-            };
-            *row = row.map(|x| x * unit);
-        }
+        let per_count = per_count(matrix, counts, self.units().unwrap_or([1.0; 2]));
         Ok(Box::new(NetcanoemBoard {
             base,
             matrix,
             counts,
             units,
-            gauges: inverse(per_count).ok_or(SpecError::Keys {
-                key: "matrix",
-                expected: "invertible",
-            })?,
+            gauges: inverse(per_count).ok_or(SpecError::keys("matrix", "invertible"))?,
             load: Wrench {
                 force: [0.0; 3],
                 torque: [0.0; 3],

@@ -5,7 +5,8 @@ use super::frames::{ForceUnit, TorqueUnit, id, opcode};
 use super::options::{AtiNetcanoemOptions, is_row};
 use crate::bringup::{Ask, Attempts, Inquiry, Timing};
 use crate::bytes::u32_be;
-use crate::{Decoded, Frame, Mode, NotSent};
+use crate::received::Received;
+use crate::{Frame, Mode, NotSent};
 use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Nanos, Refusal};
 
@@ -13,6 +14,19 @@ pub(super) const TIMING: Timing = Timing {
     send_within: Nanos::from_millis(50),
     ..Timing::POLLED
 };
+
+/// \[N or Nm per gauge count\], by axis and gauge.
+pub(super) fn per_count(
+    mut matrix: [[f64; 6]; 6],
+    [force, torque]: [f64; 2],
+    [newton, newton_metre]: [f64; 2],
+) -> [[f64; 6]; 6] {
+    let (f, t) = (newton / force, newton_metre / torque);
+    for (row, unit) in matrix.iter_mut().zip([f, f, f, t, t, t]) {
+        *row = row.map(|entry| entry * unit);
+    }
+    matrix
+}
 
 /// The requests, in their order: select a calibration, counts, units, six rows.
 const SELECT: u8 = 0;
@@ -110,7 +124,7 @@ impl CalibrationQuery {
     }
 
     /// A reply to one of the requests for the calibration.
-    pub(super) fn answer(&mut self, opcode: u8, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    pub(super) fn answer(&mut self, opcode: u8, data: &[u8], frame: &mut Received<'_>) {
         let expected = match (self.mode, opcode) {
             (Mode::Listen, _) => true,
             (Mode::Supervise, opcode::SELECT) => self.question == SELECT,
@@ -120,7 +134,7 @@ impl CalibrationQuery {
         };
         let mine = self.mode == Mode::Listen || (self.sent > 0 && self.attempts.counts(frame.t));
         if !expected || !mine {
-            return out.fault(Counter::Unexpected, 1, frame.id);
+            return frame.fault(Counter::Unexpected);
         }
         match (opcode, data.len()) {
             (opcode::SELECT, 1) if data.first().copied() == self.select => {
@@ -129,26 +143,26 @@ impl CalibrationQuery {
             }
             // Another program selects another calibration: what was read before is void.
             (opcode::SELECT, 1) if self.mode == Mode::Listen => self.forget(),
-            (opcode::SELECT, 1) => out.fault(Counter::Value, 1, frame.id),
+            (opcode::SELECT, 1) => frame.fault(Counter::Value),
             (opcode::COUNTS, 8) => {
                 let counts = [u32_be(data, 0), u32_be(data, 4)].map(f64::from);
-                self.take(0, counts.map(|c| (c > 0.0).then_some(c)), frame, out);
+                self.take(0, counts.map(|c| (c > 0.0).then_some(c)), frame);
             }
             (opcode::UNITS, 2) => {
                 let &[force, torque] = data else { return };
                 let force = ForceUnit::from_code(force).map(ForceUnit::newton);
                 let torque = TorqueUnit::from_code(torque).map(TorqueUnit::newton_metre);
-                self.take(1, [force, torque], frame, out);
+                self.take(1, [force, torque], frame);
             }
             (opcode::MATRIX..=opcode::MATRIX_LAST, 8) => {
-                self.columns(usize::from(opcode - opcode::MATRIX), data, frame, out);
+                self.columns(usize::from(opcode - opcode::MATRIX), data, frame);
             }
-            _ => out.fault(Counter::Length, 1, frame.id),
+            _ => frame.fault(Counter::Length),
         }
     }
 
     /// Counts (0) or units (1); `None` is a value that cannot be used.
-    fn take(&mut self, which: usize, told: [Option<f64>; 2], frame: &Frame, out: &mut Decoded) {
+    fn take(&mut self, which: usize, told: [Option<f64>; 2], frame: &mut Received<'_>) {
         let is_configured = self.configured.get(which) == Some(&true);
         let known = match which {
             0 => &mut self.counts,
@@ -158,7 +172,7 @@ impl CalibrationQuery {
             if !is_configured {
                 *known = None;
             }
-            out.fault(Counter::Value, 1, frame.id);
+            frame.fault(Counter::Value);
             let channel = if told[0].is_none() { 0 } else { 3 };
             return self.refuse(Refusal::BadCalibration { channel }, frame);
         };
@@ -168,7 +182,7 @@ impl CalibrationQuery {
         }
         match *known {
             Some(earlier) if earlier != [force, torque] => {
-                out.fault(Counter::Changed, 1, frame.id);
+                frame.fault(Counter::Changed);
                 self.refuse(Refusal::Changed, frame);
             }
             _ => {
@@ -179,14 +193,14 @@ impl CalibrationQuery {
     }
 
     /// The pair of columns `pair` of the row that was asked for first.
-    fn columns(&mut self, pair: usize, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn columns(&mut self, pair: usize, data: &[u8], frame: &mut Received<'_>) {
         let rows = self.asked_rows.get_mut(pair);
         let Some(row) = rows.and_then(|rows| rows.pop_at(0)) else {
             if self.mode == Mode::Supervise {
                 // The second answer to a request that was repeated.
                 return;
             }
-            out.fault(Counter::Unexpected, 1, frame.id);
+            frame.fault(Counter::Unexpected);
             // Then earlier replies may have been taken for those of another row.
             if !self.configured[2] && self.per_count.is_none() {
                 self.known = [0; 6];
@@ -217,9 +231,9 @@ impl CalibrationQuery {
                     self.answered = false;
                     self.asked_rows.iter_mut().for_each(ArrayVec::clear);
                     self.attempts.slow_down(frame.t);
-                    return out.fault(Counter::Unexpected, 1, frame.id);
+                    return frame.fault(Counter::Unexpected);
                 }
-                out.fault(Counter::Changed, 1, frame.id);
+                frame.fault(Counter::Changed);
                 return self.refuse(Refusal::Changed, frame);
             }
             columns.copy_from_slice(&entries);
@@ -233,7 +247,7 @@ impl CalibrationQuery {
             self.complete();
         } else {
             *known = 0;
-            out.fault(Counter::Value, 1, frame.id);
+            frame.fault(Counter::Value);
             self.refuse(Refusal::BadCalibration { channel: row }, frame);
         }
     }
@@ -272,18 +286,7 @@ impl CalibrationQuery {
             return;
         }
         self.refusal = None;
-        let ([force, torque], [newton, newton_metre]) = (counts, units);
-        let [fx, fy, fz, tx, ty, tz] = self.matrix;
-        let scaled = |row: [f64; 6], unit: f64| row.map(|x| x * unit);
-        let (f, t) = (newton / force, newton_metre / torque);
-        self.per_count = Some([
-            scaled(fx, f),
-            scaled(fy, f),
-            scaled(fz, f),
-            scaled(tx, t),
-            scaled(ty, t),
-            scaled(tz, t),
-        ]);
+        self.per_count = Some(per_count(self.matrix, counts, units));
     }
 
     /// Whether the current request is not needed.

@@ -4,9 +4,10 @@ use super::calibration::{CalibrationQuery, TIMING};
 use super::frames::{STATUS_ANY, STATUS_BUS, STATUS_FAULTS, id, opcode, opcode_of};
 use super::options::AtiNetcanoemOptions;
 use crate::bringup::Bringup;
-use crate::bytes::{self, i16_be, u16_be};
+use crate::bytes::{i16_be, u16_be};
 use crate::family::{Family, Session, Supervised, next_in_step};
 use crate::pairing::within;
+use crate::received::Received;
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Driver, Frame,
     Mode, NotSent, OutputInfo, Spec, SpecError, StampedReading,
@@ -62,20 +63,11 @@ pub(super) struct Netcanoem {
 
 impl Netcanoem {
     /// Drops the halves that wait.
-    fn drop_all(
-        &mut self,
-        session: &mut Session<CalibrationQuery>,
-        frame: &Frame,
-        out: &mut Decoded,
-    ) {
+    fn drop_all(&mut self, session: &mut Session<CalibrationQuery>, frame: &mut Received<'_>) {
         let halves = self.firsts.len() + self.seconds.len();
         if halves > 0 {
             session.bringup.lost();
-            out.fault(
-                Counter::Unpaired,
-                u32::try_from(halves).unwrap_or(1),
-                frame.id,
-            );
+            frame.faults(Counter::Unpaired, u32::try_from(halves).unwrap_or(1));
         }
         self.firsts.clear();
         self.seconds.clear();
@@ -84,16 +76,15 @@ impl Netcanoem {
     fn first(
         &mut self,
         data: &[u8],
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<CalibrationQuery>,
-        out: &mut Decoded,
     ) {
         self.joined = false;
         match &mut self.asked {
             // Which of the replies is that to the last request is not known.
             Some(0) => {
                 self.untrusted = frame.t + UNTRUSTED;
-                out.fault(Counter::Unexpected, 1, frame.id);
+                frame.fault(Counter::Unexpected);
             }
             Some(asked) => *asked -= 1,
             None => {}
@@ -101,9 +92,9 @@ impl Netcanoem {
         let in_time = self
             .firsts
             .first()
-            .is_none_or(|first| within((first.t, first.stamp), (frame.t, frame.stamp), LIMIT));
+            .is_none_or(|first| within((first.t, first.stamp), frame, LIMIT));
         if self.firsts.is_full() || !in_time {
-            self.drop_all(session, frame, out);
+            self.drop_all(session, frame);
         }
         let first = First {
             t: frame.t,
@@ -117,19 +108,18 @@ impl Netcanoem {
     fn second(
         &mut self,
         data: &[u8],
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<CalibrationQuery>,
-        out: &mut Decoded,
     ) {
         let in_time = self
             .firsts
             .first()
-            .is_some_and(|first| within((first.t, first.stamp), (frame.t, frame.stamp), LIMIT));
+            .is_some_and(|first| within((first.t, first.stamp), frame, LIMIT));
         if !in_time {
             if !core::mem::take(&mut self.joined) {
-                session.lost(Counter::Unpaired, 1, frame, out);
+                session.lost(Counter::Unpaired, 1, frame);
             }
-            return self.drop_all(session, frame, out);
+            return self.drop_all(session, frame);
         }
         let _ = self.seconds.try_push([0, 2, 4].map(|at| i16_be(data, at)));
         if self.seconds.len() < self.firsts.len() {
@@ -139,7 +129,7 @@ impl Netcanoem {
         let (firsts, seconds) = (self.firsts.take(), self.seconds.take());
         for (first, second) in firsts.into_iter().zip(seconds) {
             let is_trusted = frame.t >= self.untrusted;
-            add(first, second, is_trusted, frame, session, out);
+            add(first, second, is_trusted, frame, session);
         }
     }
 }
@@ -149,9 +139,8 @@ fn add(
     first: First,
     second: [i16; 3],
     is_trusted: bool,
-    frame: &Frame,
+    frame: &mut Received<'_>,
     session: &mut Session<CalibrationQuery>,
-    out: &mut Decoded,
 ) {
     let Some(per_count) = session.questions.per_count() else {
         if session.bringup.mode() == Mode::Listen {
@@ -175,12 +164,8 @@ fn add(
     if first.status & STATUS_FAULTS != 0 || unnamed || !is_trusted {
         quality |= Quality::DEVICE_FAULT;
     }
-    let stamped = StampedReading {
-        acquired: first.t,
-        stamp: first.stamp,
-        ..StampedReading::new(0, frame, quality, reading)
-    };
-    session.add(stamped, frame, out);
+    let stamped = StampedReading::new(0, frame, quality, reading).at(first.t, first.stamp);
+    session.add(stamped, frame);
 }
 
 impl Driver for AtiNetcanoemOptions {
@@ -219,30 +204,25 @@ impl Driver for AtiNetcanoemOptions {
 impl Family for Netcanoem {
     type Questions = CalibrationQuery;
 
-    fn on_frame(
-        &mut self,
-        frame: &Frame,
-        session: &mut Session<CalibrationQuery>,
-        out: &mut Decoded,
-    ) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session<CalibrationQuery>) {
         let Some(opcode) = opcode_of(frame.id, self.base) else {
             return;
         };
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = frame.payload() else {
             return;
         };
         match (opcode, data) {
             (opcode::GAUGES, []) => self.asked = Some((self.asked.unwrap_or(0) + 1).min(DEPTH)),
             (opcode::COUNTS | opcode::UNITS, []) => {}
-            (opcode::GAUGES, data) if data.len() == 8 => self.first(data, frame, session, out),
+            (opcode::GAUGES, data) if data.len() == 8 => self.first(data, frame, session),
             (opcode::GAUGES_SECOND, data) if data.len() == 6 => {
-                self.second(data, frame, session, out);
+                self.second(data, frame, session);
             }
-            (opcode::GAUGES | opcode::GAUGES_SECOND, _) => out.fault(Counter::Length, 1, frame.id),
+            (opcode::GAUGES | opcode::GAUGES_SECOND, _) => frame.fault(Counter::Length),
             (opcode::MATRIX, &[row]) if self.mode == Mode::Listen => session.questions.asked(row),
             (opcode::MATRIX, [_]) => {}
             (opcode::MATRIX..=opcode::MATRIX_LAST | opcode::SELECT..=opcode::UNITS, data) => {
-                session.questions.answer(opcode, data, frame, out);
+                session.questions.answer(opcode, data, frame);
             }
             // Serial number, diagnosis, and what others change.
             _ => {}

@@ -1,7 +1,7 @@
 //! The keys of the sensor in gateway.toml.
 
 use super::frames::{BASE_MOST, ForceUnit, TorqueUnit};
-use crate::{Spec, SpecError};
+use crate::{Spec, SpecError, keys};
 use alloc::boxed::Box;
 use proprio_topics::Nanos;
 use serde::Deserialize;
@@ -44,31 +44,17 @@ impl Default for AtiNetcanoemOptions {
 impl AtiNetcanoemOptions {
     /// Base and period.
     pub(super) fn check(&self, spec: &Spec) -> Result<(u8, Nanos), SpecError> {
-        let address = spec.address;
-        let base = u8::try_from(address).ok().filter(|base| *base <= BASE_MOST);
-        let base = base.ok_or(SpecError::Address {
-            address,
-            least: 0,
-            most: u32::from(BASE_MOST),
-        })?;
-        let key = |key, value, expected| SpecError::Key {
-            key,
-            value,
-            expected,
-        };
-        if !(1..=1000).contains(&self.period_ms) {
-            let value = f64::from(self.period_ms);
-            return Err(key("period_ms", value, "1 to 1000"));
-        }
-        if let Some(calibration) = self.calibration.filter(|number| *number > 15) {
-            return Err(key("calibration", f64::from(calibration), "0 to 15"));
+        let base = keys::address(spec, 0..=BASE_MOST)?;
+        let period = keys::ms("period_ms", self.period_ms, 1..=1000, "1 to 1000")?;
+        if let Some(calibration) = self.calibration {
+            keys::within("calibration", calibration, 0..=15, "0 to 15")?;
         }
         for (name, value) in [
             ("counts_per_force", self.counts_per_force),
             ("counts_per_torque", self.counts_per_torque),
         ] {
             if let Some(value) = value.filter(|value| !(*value > 0.0 && value.is_finite())) {
-                return Err(key(name, value, "above 0"));
+                return Err(SpecError::key(name, value, "above 0"));
             }
         }
         pair(
@@ -82,12 +68,10 @@ impl AtiNetcanoemOptions {
         if let Some(matrix) = &self.matrix
             && !matrix.iter().all(is_row)
         {
-            return Err(SpecError::Keys {
-                key: "matrix",
-                expected: "six rows of six finite numbers, none of them only zeros",
-            });
+            let expected = "six rows of six finite numbers, none of them only zeros";
+            return Err(SpecError::keys("matrix", expected));
         }
-        Ok((base, Nanos::from_millis(i64::from(self.period_ms))))
+        Ok((base, period))
     }
 
     /// Both counts, if given.

@@ -4,7 +4,7 @@ use super::protocol::{
     NMT, Object, SYNC, TPDO_OFF, emcy, heartbeat, nmt, object, sdo_from, sdo_to,
 };
 use crate::bytes::{u16_le, u32_le};
-use crate::{Format, Frame, Frames, Id};
+use crate::{Format, Frame, Frames, Id, board};
 use alloc::collections::BTreeMap;
 use proprio_topics::Nanos;
 
@@ -85,7 +85,7 @@ impl SimulatedNode {
             let [low, high] = code.to_le_bytes();
             let register = u8::from(code != 0);
             let data = [low, high, register, 0, 0, 0, 0, 0];
-            let _ = out.try_push(Frame::new(emcy(self.id), &data));
+            board::send(emcy(self.id), &data, out);
         }
     }
 
@@ -110,7 +110,7 @@ impl SimulatedNode {
             nmt::RESET_NODE | nmt::RESET_COMMUNICATION => {
                 self.operational = false;
                 self.entries = self.memory.clone();
-                let _ = out.try_push(Frame::new(heartbeat(self.id), &[0]));
+                board::send(heartbeat(self.id), &[0], out);
             }
             _ => {}
         }
@@ -153,6 +153,6 @@ impl SimulatedNode {
         };
         let [a, b, c, d] = value.to_le_bytes();
         let data = [reply, low, high, sub, a, b, c, d];
-        let _ = out.try_push(Frame::new(sdo_from(self.id), &data));
+        board::send(sdo_from(self.id), &data, out);
     }
 }

@@ -3,7 +3,8 @@
 use super::protocol::{NMT, Object, TIMING, sdo_to};
 use crate::bringup::{Ask, Attempts, Inquiry};
 use crate::bytes::{u16_le, u32_le};
-use crate::{Decoded, Frame, Mode, NotSent};
+use crate::received::Received;
+use crate::{Frame, Mode, NotSent};
 use proprio_topics::{Counter, Nanos, Refusal};
 
 /// One step.
@@ -119,12 +120,12 @@ impl<P: StartPlan> Script<P> {
     }
 
     /// Takes an SDO frame of the node.
-    pub(crate) fn answer(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    pub(crate) fn answer(&mut self, data: &[u8], frame: &mut Received<'_>) {
         let &[command, _, _, sub, ..] = data else {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         };
         if data.len() != 8 {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         }
         let object = Object::new(u16_le(data, 1), sub);
         let value = u32_le(data, 4);
@@ -166,7 +167,7 @@ impl<P: StartPlan> Script<P> {
                 }
             }
             Err(refusal) => {
-                out.fault(Counter::Value, 1, frame.id);
+                frame.fault(Counter::Value);
                 self.refusal = Some(refusal);
                 self.attempts.slow_down(frame.t);
             }

@@ -72,13 +72,7 @@ impl DriveBoard {
     }
 
     const fn error(&self) -> u16 {
-        if self.quality.contains(Quality::DEVICE_FAULT) {
-            SENSOR
-        } else if self.quality.contains(Quality::DRIVE_FAULT) {
-            OVERCURRENT
-        } else {
-            0
-        }
+        board::fault_code(self.quality, [0, SENSOR, OVERCURRENT])
     }
 
     /// Sends the TPDOs in `which`, one bit each.
@@ -95,7 +89,7 @@ impl DriveBoard {
                 field.bits.set(raw, &mut data);
             }
             let data = data.get(..bytes).unwrap_or_default();
-            let _ = out.try_push(Frame::new(self.node.tpdo_id(number), data));
+            board::send(self.node.tpdo_id(number), data, out);
         }
     }
 }

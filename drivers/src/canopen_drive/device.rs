@@ -9,9 +9,8 @@ use crate::canopen::{
 };
 use crate::family::{Family, Session, Supervised};
 use crate::objects::Objects;
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, OutputInfo, Spec, SpecError, StampedReading, bytes,
-};
+use crate::received::Received;
+use crate::{Claim, Device, Driver, Id, OutputInfo, Spec, SpecError, StampedReading};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use arrayvec::ArrayVec;
@@ -160,10 +159,9 @@ impl CanopenDrive {
     }
 
     /// A reading ends without some of its values.
-    fn abandon(&mut self, id: Id, session: &mut Session<Script<DriveStart>>, out: &mut Decoded) {
+    fn abandon(&mut self, frame: &mut Received<'_>, session: &mut Session<Script<DriveStart>>) {
         if core::mem::take(&mut self.have) != 0 {
-            out.fault(Counter::Unpaired, 1, id);
-            session.bringup.lost();
+            session.lost(Counter::Unpaired, 1, frame);
             self.suspect = true;
         }
         self.measured = None;
@@ -172,9 +170,8 @@ impl CanopenDrive {
     fn pdo(
         &mut self,
         data: &[u8],
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<Script<DriveStart>>,
-        out: &mut Decoded,
     ) {
         if self.table.is_none() {
             self.prepare(&session.questions.plan);
@@ -187,7 +184,7 @@ impl CanopenDrive {
             return;
         };
         if data.len() < used.bytes {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         }
         // An adapter or a bridge that gives a frame twice: the second begins no reading.
         if table.group & used.bit != 0
@@ -198,7 +195,7 @@ impl CanopenDrive {
                 .is_some_and(|before| before.as_slice() == data);
             *before = data.try_into().ok();
             if has_sync && is_same {
-                return out.fault(Counter::Unexpected, 1, frame.id);
+                return frame.fault(Counter::Unexpected);
             }
         }
         let (bit, rank, group) = (used.bit, used.rank, table.group);
@@ -209,8 +206,7 @@ impl CanopenDrive {
                 encoder: self.last.status,
                 faults: self.last.error.unwrap_or(u32::from(self.state.error)),
             });
-            let stamped = StampedReading::new(0, frame, self.quality(), reading);
-            out.push(stamped, frame.id);
+            frame.tell(0, self.quality(), reading);
         }
         if table.alone & bit != 0 {
             let at = |bit: u8| bit.trailing_zeros() as usize;
@@ -218,10 +214,10 @@ impl CanopenDrive {
             let is_better = |other| rank_of(other).is_none_or(|other| rank > other.rank);
             let is_first = self.rates.is_first(at(bit), is_better);
             if is_first && !self.synced.is_some_and(|t| self.is_fresh(t, frame.t)) {
-                self.add(None, frame, session, out);
+                self.add(None, frame, session);
             }
         } else if group & bit != 0 {
-            self.add_to_group(bit, group, frame, session, out);
+            self.add_to_group(bit, group, frame, session);
         }
     }
 
@@ -230,13 +226,12 @@ impl CanopenDrive {
         &mut self,
         bit: u8,
         group: u8,
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<Script<DriveStart>>,
-        out: &mut Decoded,
     ) {
         let too_long = self.have != 0 && !self.is_fresh(self.began, frame.t);
         if self.have & bit != 0 || too_long {
-            self.abandon(frame.id, session, out);
+            self.abandon(frame, session);
         }
         if self.have == 0 {
             self.began = frame.t;
@@ -249,11 +244,11 @@ impl CanopenDrive {
         }
         self.have = 0;
         if core::mem::take(&mut self.suspect) {
-            return session.lost(Counter::Unpaired, 1, frame, out);
+            return session.lost(Counter::Unpaired, 1, frame);
         }
         self.synced = Some(frame.t);
         let measured = self.measured.take();
-        self.add(measured, frame, session, out);
+        self.add(measured, frame, session);
     }
 
     fn quality(&self) -> Quality {
@@ -277,9 +272,8 @@ impl CanopenDrive {
     fn add(
         &mut self,
         measured: Option<(Nanos, StampKind)>,
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<Script<DriveStart>>,
-        out: &mut Decoded,
     ) {
         let values = self.last.joint.map(|value| match value {
             Some((t, value)) if self.is_fresh(t, frame.t) => value,
@@ -287,7 +281,7 @@ impl CanopenDrive {
         });
         if !values[0].is_finite() {
             // Only where stamps run backward.
-            return out.fault(Counter::Value, 1, frame.id);
+            return frame.fault(Counter::Value);
         }
         let [position, velocity, torque, current] = values;
         let reading = Reading::Joint(JointState {
@@ -299,7 +293,7 @@ impl CanopenDrive {
         });
         let mut stamped = StampedReading::new(0, frame, self.quality(), reading);
         (stamped.acquired, stamped.stamp) = measured.unwrap_or((frame.t, frame.stamp));
-        session.add(stamped, frame, out);
+        session.add(stamped, frame);
     }
 }
 
@@ -354,31 +348,26 @@ impl Driver for CanopenDriveOptions {
 impl Family for CanopenDrive {
     type Questions = Script<DriveStart>;
 
-    fn on_frame(
-        &mut self,
-        frame: &Frame,
-        session: &mut Session<Script<DriveStart>>,
-        out: &mut Decoded,
-    ) {
-        if self.state.on_frame(self.node, frame, session, out) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session<Script<DriveStart>>) {
+        if self.state.on_frame(self.node, frame, session) {
             // An answer may have changed the mapping.
             if frame.id == sdo_from(self.node) {
                 self.table = None;
             }
             return;
         }
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = frame.payload() else {
             return;
         };
         if frame.id == SYNC {
             if self.table.as_ref().is_some_and(|table| table.group != 0) {
-                self.abandon(frame.id, session, out);
+                self.abandon(frame, session);
             }
             self.cycle.sync(frame);
             self.sync = Some(frame.t);
             self.since_sync = [const { None }; 4];
         } else {
-            self.pdo(data, frame, session, out);
+            self.pdo(data, frame, session);
         }
     }
 

@@ -99,10 +99,7 @@ impl PdoMapping {
     pub(super) fn of_keys(node: u8, pdos: &[PdoKeys]) -> Result<Self, SpecError> {
         let mut this = Self::default();
         for keys in pdos {
-            let error = |expected| SpecError::Keys {
-                key: "pdos",
-                expected,
-            };
+            let error = |expected| SpecError::keys("pdos", expected);
             let number = keys.number.wrapping_sub(1);
             let Some(pdo) = this.pdos.get_mut(usize::from(number)) else {
                 return Err(error("numbers 1 to 4"));
@@ -131,16 +128,11 @@ impl PdoMapping {
             }
         }
         if !pdos.is_empty() && this.position().is_none() {
-            return Err(SpecError::Keys {
-                key: "pdos",
-                expected: "with a position, 0x6064 or 0x6063",
-            });
+            return Err(SpecError::keys("pdos", "with a position, 0x6064 or 0x6063"));
         }
         if this.wrong_id().is_some() {
-            return Err(SpecError::Keys {
-                key: "pdos",
-                expected: "each with another id, from 0x181 to 0x580 or from 0x680 to 0x6DF",
-            });
+            let expected = "each with another id, from 0x181 to 0x580 or from 0x680 to 0x6DF";
+            return Err(SpecError::keys("pdos", expected));
         }
         Ok(this)
     }

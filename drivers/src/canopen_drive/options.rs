@@ -1,7 +1,7 @@
 //! The keys of a drive in gateway.toml.
 
-use crate::SpecError;
 use crate::objects::Objects;
+use crate::{SpecError, keys};
 use alloc::string::String;
 use alloc::vec::Vec;
 use core::f64::consts::TAU;
@@ -216,27 +216,12 @@ impl CanopenDriveOptions {
             ("rated_current", self.rated_current),
         ] {
             if let Some(value) = value.filter(|value| !(*value > 0.0 && value.is_finite())) {
-                let expected = "above 0";
-                return Err(SpecError::Key {
-                    key,
-                    value,
-                    expected,
-                });
+                return Err(SpecError::key(key, value, "above 0"));
             }
         }
-        let (key, value, expected) = if !(0.0..=60_000.0).contains(&self.hold_ms) {
-            ("hold_ms", self.hold_ms, "0 to 60000")
-        } else if !(1..=65_535).contains(&self.period_ms) {
-            ("period_ms", f64::from(self.period_ms), "1 to 65535")
-        } else if self.sync > 240 {
-            ("sync", f64::from(self.sync), "0 to 240")
-        } else {
-            return Ok(());
-        };
-        Err(SpecError::Key {
-            key,
-            value,
-            expected,
-        })
+        keys::within("hold_ms", self.hold_ms, 0.0..=60_000.0, "0 to 60000")?;
+        keys::within("period_ms", self.period_ms, 1..=65_535, "1 to 65535")?;
+        keys::within("sync", self.sync, 0..=240, "0 to 240")?;
+        Ok(())
     }
 }

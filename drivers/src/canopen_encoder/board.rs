@@ -39,7 +39,7 @@ impl EncoderBoard {
         let mut data = [0; 8];
         self.mapping.bits.set(self.counts.into(), &mut data);
         let data = data.get(..self.mapping.bits.reach()).unwrap_or_default();
-        let _ = out.try_push(Frame::new(self.mapping.id, data));
+        board::send(self.mapping.id, data, out);
     }
 }
 
@@ -51,10 +51,10 @@ impl Simulate for CanopenEncoderOptions {
         let id = node_of(spec)?;
         canopen::check_file(id, self.objects.as_ref())?;
         let mappings = PositionMapping::all(id, self)?;
-        let mapping = mappings.first().copied().ok_or(SpecError::Keys {
-            key: "eds",
-            expected: "a file in which a TPDO has the position (6004), if configure = false",
-        })?;
+        let mapping = mappings.first().copied().ok_or(SpecError::keys(
+            "eds",
+            "a file in which a TPDO has the position (6004), if configure = false",
+        ))?;
         let per_turn = self.counts_per_turn.or(self.counts_of_file());
         let per_turn = per_turn.map_or(USUAL_PER_TURN, |n| n as u32);
         // As another program, or the maker's tool, has left it.

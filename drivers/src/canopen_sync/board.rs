@@ -1,7 +1,7 @@
 //! The device's own side: there is none.
 
 use super::CanopenSyncOptions;
-use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError};
+use crate::{Board, EncodeError, Frames, Simulate, Spec, SpecError};
 use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading};
 
@@ -16,8 +16,6 @@ impl Simulate for CanopenSyncOptions {
 }
 
 impl Board for Nothing {
-    fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
-
     fn period(&self) -> Option<Nanos> {
         None
     }

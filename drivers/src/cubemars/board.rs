@@ -2,7 +2,7 @@
 
 use super::frames::{DRIVE, ENCODER_ERROR, JOINT, Stage, quality_of};
 use super::options::{CubemarsKeys, CubemarsOptions, Effort};
-use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board};
+use crate::{Board, EncodeError, Frames, Simulate, Spec, SpecError, board};
 use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading};
 
@@ -30,8 +30,6 @@ impl Simulate for CubemarsOptions {
 }
 
 impl Board for CubemarsBoard {
-    fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
-
     fn period(&self) -> Option<Nanos> {
         Some(self.keys.period)
     }
@@ -48,43 +46,31 @@ impl Board for CubemarsBoard {
     ) -> Result<(), EncodeError> {
         match (output, reading) {
             (JOINT, Reading::Joint(joint)) => {
-                let torque_constant = self.keys.torque_constant.unwrap_or(f64::NAN);
                 let effort = match self.keys.effort {
                     Effort::Torque => joint.torque,
-                    Effort::Current if joint.current.is_nan() => joint.torque / torque_constant,
-                    Effort::Current => joint.current,
+                    Effort::Current => board::current(joint, self.keys.torque_constant),
                 };
                 let effort = if effort.is_nan() { 0.0 } else { effort };
                 let values = [joint.position, joint.velocity, effort];
                 board::finite(&values)?;
-                let carried = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
-                if quality_of(self.stage.error).0 != quality.0 & carried.0 {
-                    self.stage.error = if quality.contains(Quality::DEVICE_FAULT) {
-                        ENCODER_ERROR
-                    } else if quality.contains(Quality::DRIVE_FAULT) {
-                        OVER_CURRENT
-                    } else {
-                        0
-                    };
+                if board::has_other_faults(quality, quality_of(self.stage.error)) {
+                    let codes = [0, ENCODER_ERROR, OVER_CURRENT];
+                    self.stage.error = board::fault_code(quality, codes);
                 }
                 let [p, v, e] = self.keys.scales;
                 let [position, velocity, effort] = values;
                 let raw = [p.raw(position), v.raw(velocity), e.raw(effort)];
                 let data = (self.keys.layout).pack(self.keys.number, raw, self.stage);
-                let _ = out.try_push(Frame::new(self.keys.id, &data));
-                Ok(())
+                board::send(self.keys.id, &data, out);
             }
-            (JOINT, Reading::Actuator(actuator)) => {
-                self.stage.error = actuator.faults as u8;
-                Ok(())
-            }
-            (DRIVE, Reading::Temperature(temperature)) if temperature.celsius.is_finite() => {
+            (JOINT, Reading::Actuator(actuator)) => self.stage.error = actuator.faults as u8,
+            (DRIVE, Reading::Temperature(temperature)) => {
+                board::finite(&[temperature.celsius])?;
                 self.stage.celsius = temperature.celsius;
-                Ok(())
             }
-            (DRIVE, Reading::Temperature(_)) => Err(EncodeError::NotFinite),
-            (JOINT | DRIVE, _) => Err(EncodeError::Kind),
-            _ => Err(EncodeError::Output(output)),
+            (JOINT | DRIVE, _) => return Err(EncodeError::Kind),
+            _ => return Err(EncodeError::Output(output)),
         }
+        Ok(())
     }
 }

@@ -3,12 +3,10 @@
 use super::frames::{DRIVE, ENCODER_ERROR, JOINT, PayloadLayout, Stage, quality_of};
 use super::options::{CubemarsKeys, CubemarsOptions, Effort};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Session, Supervised, temperature};
+use crate::family::{Family, Session, Supervised};
 use crate::held::OnChange;
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading,
-    bytes, mit,
-};
+use crate::received::Received;
+use crate::{Claim, Device, Driver, Mode, OutputInfo, Spec, SpecError, mit};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Actuator, Counter, Kind, Reading};
@@ -23,7 +21,7 @@ pub(super) struct CubemarsMotor {
 
 impl CubemarsMotor {
     /// Tells the state of the power stage if its error is new, and now and then.
-    fn stage(&mut self, stage: Stage, frame: &Frame, out: &mut Decoded) {
+    fn stage(&mut self, stage: Stage, frame: &mut Received<'_>) {
         if !self.told.is_due(stage.error, frame) {
             return;
         }
@@ -34,9 +32,8 @@ impl CubemarsMotor {
             faults: u32::from(stage.error),
         });
         let quality = quality_of(stage.error);
-        let stamped = StampedReading::new(JOINT, frame, quality, actuator);
-        out.push(stamped, frame.id);
-        temperature(DRIVE, stage.celsius, frame, out);
+        frame.tell(JOINT, quality, actuator);
+        frame.temperature(DRIVE, stage.celsius);
     }
 }
 
@@ -66,7 +63,7 @@ impl Driver for CubemarsOptions {
 impl Family for CubemarsMotor {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         if frame.id != self.keys.id {
             return;
         }
@@ -76,22 +73,22 @@ impl Family for CubemarsMotor {
         if others {
             return;
         }
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = frame.payload() else {
             return;
         };
         let Some((raw, stage)) = self.keys.layout.unpack(data) else {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         };
         let (mut state, mut quality) = mit::measured(self.keys.scales, raw);
         if let Some(stage) = stage {
             quality |= quality_of(stage.error);
-            self.stage(stage, frame, out);
+            self.stage(stage, frame);
         }
         if self.keys.effort == Effort::Current {
             state.current = state.torque;
             state.torque = self.keys.torque_constant.unwrap_or(f64::NAN) * state.current;
         }
-        session.joint(JOINT, frame, quality, state, out);
+        session.joint(JOINT, frame, quality, state);
     }
 
     fn reset(&mut self) {

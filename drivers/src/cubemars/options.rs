@@ -1,8 +1,8 @@
 //! The keys of a motor in gateway.toml, for both sides of the driver.
 
 use super::frames::{PayloadLayout, SERVO_STATUS};
-use crate::keys::{above_zero, address, duration, known};
-use crate::mit::Scale;
+use crate::keys::{above_zero, address, duration, id, known, stated, within};
+use crate::mit::{self, Scale};
 use crate::{Id, Spec, SpecError};
 use core::f64::consts::TAU;
 use proprio_topics::Nanos;
@@ -134,7 +134,7 @@ impl Default for CubemarsOptions {
 }
 
 /// The highest number of a motor. (The first byte of a special command is 255.)
-const NUMBER_MOST: u16 = 254;
+const NUMBER_MOST: u8 = 254;
 /// A tenth of a degree \[rad\].
 const RAD_PER_STEP: f64 = TAU / 3600.0;
 /// Ten revolutions per minute \[rad/s\].
@@ -158,23 +158,16 @@ pub(super) struct CubemarsKeys {
 
 impl CubemarsKeys {
     pub(super) fn new(spec: &Spec, options: &CubemarsOptions) -> Result<Self, SpecError> {
-        let number = address(spec, 0..=NUMBER_MOST)? as u8;
-        let error = |key, value, expected| SpecError::Key {
-            key,
-            value,
-            expected,
-        };
-        if options.host_id > 0x7FF {
-            let host_id = f64::from(options.host_id);
-            return Err(error("host_id", host_id, "0 to 2047"));
-        }
-        if !(-100.0..=100.0).contains(&options.celsius_at_zero) {
-            let celsius = options.celsius_at_zero;
-            return Err(error("celsius_at_zero", celsius, "-100 to 100"));
-        }
-        let torque_constant = (options.torque_constant)
-            .map(|constant| above_zero("torque_constant", constant))
-            .transpose()?;
+        let number = address(spec, 0..=NUMBER_MOST)?;
+        let host = id("host_id", options.host_id, 0..=0x7FF, "0 to 2047")?;
+        let celsius_at_zero = options.celsius_at_zero;
+        within(
+            "celsius_at_zero",
+            celsius_at_zero,
+            -100.0..=100.0,
+            "-100 to 100",
+        )?;
+        let torque_constant = stated("torque_constant", options.torque_constant)?;
         let model = options.model.map(CubemarsModel::numbers);
         let (id, layout, scales, effort) = match options.mode {
             CubemarsMode::Mit => {
@@ -185,16 +178,9 @@ impl CubemarsKeys {
                 let of_model = model.map(|(_, torque, ..)| torque);
                 let of_model = of_model.filter(|_| options.effort == Effort::Torque);
                 let effort = known("effort_max", options.effort_max, of_model)?;
-                let scales = [
-                    Scale::range(position, 16),
-                    Scale::range(velocity, 12),
-                    Scale::range(effort, 12),
-                ];
-                let layout = PayloadLayout::Mit {
-                    celsius_at_zero: options.celsius_at_zero,
-                };
-                let id = Id::standard(options.host_id);
-                (id, layout, scales, options.effort)
+                let scales = mit::scales([position, velocity, effort]);
+                let layout = PayloadLayout::Mit { celsius_at_zero };
+                (host, layout, scales, options.effort)
             }
             CubemarsMode::Servo => {
                 let of_model = model.map(|(_, _, pairs, _)| f64::from(pairs));

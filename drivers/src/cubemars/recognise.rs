@@ -116,14 +116,7 @@ fn with_motion(evidence: &mut Evidence<'_>, stream: &Stream, number: u8) {
 
 /// The motors that reply on identifier 0.
 fn on_zero(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
-    let mut numbers: Vec<u8> = Vec::new();
-    for frame in stream.kept() {
-        if let Some(&number) = frame.data().first()
-            && !numbers.contains(&number)
-        {
-            numbers.push(number);
-        }
-    }
+    let numbers = stream.first_bytes();
     // Numbers are those that were heard: few of them tell something, and less than a rule.
     let few = stream.frames >= 8 * numbers.len() as u64;
     let find = |number: &u8| {

@@ -9,7 +9,7 @@ use super::options::{DamiaoKeys, DamiaoOptions};
 use crate::mit::{self, Scale};
 use crate::{Board, EncodeError, Format, Frame, Frames, Simulate, Spec, SpecError, board};
 use alloc::boxed::Box;
-use proprio_topics::{JointState, Nanos, Quality, Reading};
+use proprio_topics::{Nanos, Quality, Reading};
 
 /// The ranges of a motor that neither keys nor a model describe: those of a DM4310.
 const RANGES_USUAL: [f64; 3] = [12.5, 30.0, 10.0];
@@ -29,52 +29,6 @@ impl DamiaoBoard {
         let data = self.state.pack(self.keys.address);
         frame(self.keys.id, self.keys.fd, data)
     }
-
-    fn measure(&mut self, joint: &JointState, quality: Quality) -> Result<(), EncodeError> {
-        board::finite(&[joint.position, joint.velocity])?;
-        board::finite_or_absent(&[joint.torque])?;
-        let carried = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
-        if quality_of(self.state.state).0 != quality.0 & carried.0 {
-            self.state.state = if quality.contains(Quality::DEVICE_FAULT) {
-                SENSOR
-            } else if quality.contains(Quality::DRIVE_FAULT) {
-                OVERLOAD
-            } else {
-                ENABLED
-            };
-        }
-        self.state.raw = mit::raw(self.scales, joint);
-        Ok(())
-    }
-
-    /// Takes a reading; whether it is one that is sent at once.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // limited; casts saturate
-    fn take(
-        &mut self,
-        output: u8,
-        reading: &Reading,
-        quality: Quality,
-    ) -> Result<bool, EncodeError> {
-        match (output, reading) {
-            (JOINT, Reading::Joint(joint)) => return self.measure(joint, quality).map(|()| true),
-            (JOINT, Reading::Actuator(actuator)) => {
-                self.state.state = match (actuator.faults, actuator.mode) {
-                    (0, 0) => DISABLED,
-                    (0, _) => ENABLED,
-                    (faults, _) => faults.min(0xF) as u8,
-                };
-            }
-            (MOTOR | FET, Reading::Temperature(temperature)) => {
-                board::finite(&[temperature.celsius])?;
-                let [fet, rotor] = &mut self.state.celsius;
-                let place = if output == MOTOR { rotor } else { fet };
-                *place = libm::round(temperature.celsius) as u8;
-            }
-            (JOINT..=FET, _) => return Err(EncodeError::Kind),
-            _ => return Err(EncodeError::Output(output)),
-        }
-        Ok(false)
-    }
 }
 
 impl Simulate for DamiaoOptions {
@@ -86,12 +40,7 @@ impl Simulate for DamiaoOptions {
         for (end, (stated, model)) in ends.iter_mut().zip(known) {
             *end = stated.or(*model).unwrap_or(*end);
         }
-        let [position, velocity, torque] = ends;
-        let scales = [
-            Scale::range(position, 16),
-            Scale::range(velocity, 12),
-            Scale::range(torque, 12),
-        ];
+        let scales = mit::scales(ends);
         let state = DamiaoState {
             state: ENABLED,
             raw: scales.map(|scale| scale.raw(0.0)),
@@ -148,10 +97,11 @@ impl Board for DamiaoBoard {
     }
 
     fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {
-        let _ = self.take(output, reading, quality);
+        let _ = self.encode(output, reading, quality, &mut Frames::new());
     }
 
     /// Temperatures and state are sent with the next joint reading. An absent torque is sent as 0.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // limited; casts saturate
     fn encode(
         &mut self,
         output: u8,
@@ -159,8 +109,31 @@ impl Board for DamiaoBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        if self.take(output, reading, quality)? {
-            let _ = out.try_push(self.frame());
+        match (output, reading) {
+            (JOINT, Reading::Joint(joint)) => {
+                board::finite(&[joint.position, joint.velocity])?;
+                board::finite_or_absent(&[joint.torque])?;
+                if board::has_other_faults(quality, quality_of(self.state.state)) {
+                    self.state.state = board::fault_code(quality, [ENABLED, SENSOR, OVERLOAD]);
+                }
+                self.state.raw = mit::raw(self.scales, joint);
+                let _ = out.try_push(self.frame());
+            }
+            (JOINT, Reading::Actuator(actuator)) => {
+                self.state.state = match (actuator.faults, actuator.mode) {
+                    (0, 0) => DISABLED,
+                    (0, _) => ENABLED,
+                    (faults, _) => faults.min(0xF) as u8,
+                };
+            }
+            (MOTOR | FET, Reading::Temperature(temperature)) => {
+                board::finite(&[temperature.celsius])?;
+                let [fet, rotor] = &mut self.state.celsius;
+                let place = if output == MOTOR { rotor } else { fet };
+                *place = libm::round(temperature.celsius) as u8;
+            }
+            (JOINT..=FET, _) => return Err(EncodeError::Kind),
+            _ => return Err(EncodeError::Output(output)),
         }
         Ok(())
     }

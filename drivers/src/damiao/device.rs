@@ -5,13 +5,11 @@ use super::frames::{
 };
 use super::options::{DamiaoKeys, DamiaoOptions};
 use super::ranges::Ranges;
-use crate::bringup::{Bringup, Timing};
-use crate::family::{Family, Rounds, Session, Supervised, temperature};
+use crate::bringup::Bringup;
+use crate::family::{Family, Rounds, Session, Supervised};
 use crate::held::OnChange;
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading,
-    bytes, mit,
-};
+use crate::received::Received;
+use crate::{Claim, Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError, mit};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Actuator, Counter, Kind, Nanos, Quality, Reading};
@@ -29,12 +27,11 @@ impl DamiaoMotor {
     fn state(
         &mut self,
         told: &DamiaoState,
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<Ranges>,
-        out: &mut Decoded,
     ) {
         let Some(scales) = session.questions.scales() else {
-            return out.fault(Counter::Unexpected, 1, frame.id);
+            return frame.fault(Counter::Unexpected);
         };
         let state = told.state;
         let quality = quality_of(state);
@@ -46,14 +43,13 @@ impl DamiaoMotor {
                 encoder: u32::from(state == SENSOR),
                 faults: u32::from(faults),
             });
-            let stamped = StampedReading::new(JOINT, frame, quality, actuator);
-            out.push(stamped, frame.id);
+            frame.tell(JOINT, quality, actuator);
             for (output, celsius) in [FET, MOTOR].into_iter().zip(told.celsius) {
-                temperature(output, f64::from(celsius), frame, out);
+                frame.temperature(output, f64::from(celsius));
             }
         }
         let (state, saturated) = mit::measured(scales, told.raw);
-        session.joint(JOINT, frame, quality | saturated, state, out);
+        session.joint(JOINT, frame, quality | saturated, state);
     }
 }
 
@@ -72,18 +68,14 @@ impl Driver for DamiaoOptions {
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
         let keys = DamiaoKeys::new(spec, self)?;
-        let (mode, timing) = match keys.request_period {
-            Some(_) => (spec.mode, Timing::POLLED),
-            None => (Mode::Listen, Timing::LISTENED),
-        };
-        let bringup = Bringup::new(spec, mode, timing, keys.id);
+        let bringup = Bringup::polled(spec, keys.request_period, keys.id);
         let this = DamiaoMotor {
             keys,
             told: OnChange::NOTHING,
             questions: Rounds::new(keys.request_period),
         };
         let claims = [Claim::shared(keys.id)];
-        let ranges = Ranges::new(keys, mode);
+        let ranges = Ranges::new(keys, bringup.mode());
         Ok(Supervised::boxed(claims, bringup, ranges, this))
     }
 }
@@ -91,20 +83,20 @@ impl Driver for DamiaoOptions {
 impl Family for DamiaoMotor {
     type Questions = Ranges;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<Ranges>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session<Ranges>) {
         if frame.id != self.keys.id {
             return;
         }
-        let Some(data) = bytes::fd_payload(frame, out) else {
+        let Some(data) = frame.fd_payload() else {
             return;
         };
         if data.len() != 8 {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         }
         match DamiaoMessage::parse(self.keys.address, data) {
-            Some(DamiaoMessage::State(state)) => self.state(&state, frame, session, out),
+            Some(DamiaoMessage::State(state)) => self.state(&state, frame, session),
             Some(DamiaoMessage::Register(register, value)) => {
-                session.questions.answer(register, value, frame, out);
+                session.questions.answer(register, value, frame);
             }
             // Answers to other programs, and frames of other motors.
             Some(DamiaoMessage::Other) | None => {}

@@ -35,10 +35,7 @@ pub(super) const fn quality_of(state: u8) -> Quality {
 
 /// A frame of 8 bytes, in CAN FD if `fd`.
 pub(super) fn frame(id: Id, fd: bool, data: [u8; 8]) -> Frame {
-    let format = Format::Fd {
-        bit_rate_switch: true,
-        error_state: false,
-    };
+    let format = Format::fd(true, false);
     let frame = fd.then(|| Frame::with_format(id, format, &data)).flatten();
     frame.unwrap_or_else(|| Frame::new(id, &data))
 }

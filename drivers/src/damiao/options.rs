@@ -1,6 +1,6 @@
 //! The keys of a motor in gateway.toml, for both sides of the driver.
 
-use crate::keys::{above_zero, address, duration};
+use crate::keys::{address, duration, stated, stated_duration};
 use crate::{Id, Spec, SpecError};
 use proprio_topics::Nanos;
 use serde::Deserialize;
@@ -99,15 +99,11 @@ pub(super) struct DamiaoKeys {
 
 impl DamiaoKeys {
     pub(super) fn new(spec: &Spec, options: &DamiaoOptions) -> Result<Self, SpecError> {
-        let [address, _] = address(spec, 1..=0xFF)?.to_le_bytes();
+        let address = address(spec, 1..=0xFF)?;
         if options.host_id > 0x7FE || options.host_id == u16::from(address) {
-            return Err(SpecError::Key {
-                key: "host_id",
-                value: f64::from(options.host_id),
-                expected: "0 to 0x7FE (2046), and not the motor's address",
-            });
+            let expected = "0 to 0x7FE (2046), and not the motor's address";
+            return Err(SpecError::key("host_id", options.host_id, expected));
         }
-        let stated = |key, given: Option<f64>| given.map(|end| above_zero(key, end)).transpose();
         let stated = [
             stated("position_max", options.position_max)?,
             stated("velocity_max", options.velocity_max)?,
@@ -117,9 +113,7 @@ impl DamiaoKeys {
             Some(model) => model.ranges().map(Some),
             None => [None; 3],
         };
-        let request_period = (options.request_period_ms)
-            .map(|ms| duration("request_period_ms", ms))
-            .transpose()?;
+        let request_period = stated_duration("request_period_ms", options.request_period_ms)?;
         let known = |(stated, model): (&Option<f64>, &Option<f64>)| stated.or(*model).is_some();
         if request_period.is_none() && !stated.iter().zip(&of_model).all(known) {
             return Err(SpecError::Keys {

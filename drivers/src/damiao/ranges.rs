@@ -3,8 +3,9 @@
 use super::frames::{RANGES, READ, question};
 use super::options::DamiaoKeys;
 use crate::bringup::{Ask, Attempts, Inquiry, Timing};
-use crate::mit::Scale;
-use crate::{Decoded, Frame, Mode, NotSent};
+use crate::mit::{self, Scale};
+use crate::received::Received;
+use crate::{Mode, NotSent};
 use proprio_topics::{Counter, Nanos, Refusal};
 
 /// Asks a motor for the ranges that no key states.
@@ -40,22 +41,17 @@ impl Ranges {
 
     /// Position, velocity and torque, if all are known.
     pub(super) fn scales(&self) -> Option<[Scale; 3]> {
-        let [position, velocity, torque] = [self.end(0)?, self.end(1)?, self.end(2)?];
-        Some([
-            Scale::range(position, 16),
-            Scale::range(velocity, 12),
-            Scale::range(torque, 12),
-        ])
+        Some(mit::scales([self.end(0)?, self.end(1)?, self.end(2)?]))
     }
 
     /// The motor has told the value of a register in `frame`.
-    pub(super) fn answer(&mut self, register: u8, value: f32, frame: &Frame, out: &mut Decoded) {
+    pub(super) fn answer(&mut self, register: u8, value: f32, frame: &mut Received<'_>) {
         let Some(index) = RANGES.iter().position(|range| *range == register) else {
             // Another program's question.
             return;
         };
         if !(value > 0.0 && value.is_finite()) {
-            return out.fault(Counter::Value, 1, frame.id);
+            return frame.fault(Counter::Value);
         }
         let value = f64::from(value);
         let before = self
@@ -63,7 +59,7 @@ impl Ranges {
             .get_mut(index)
             .and_then(|told| told.replace(value));
         if before.is_some_and(|told| told != value) {
-            out.fault(Counter::Changed, 1, frame.id);
+            frame.fault(Counter::Changed);
         }
         if index == self.next && self.mode == Mode::Supervise {
             self.next += 1;

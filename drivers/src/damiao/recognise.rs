@@ -76,11 +76,9 @@ fn on(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
     };
     // The low halves of their numbers.
     let mut halves: Vec<u8> = Vec::new();
-    for frame in stream.kept() {
-        if let Some(first) = frame.data().first()
-            && !halves.contains(&(first & 0xF))
-        {
-            halves.push(first & 0xF);
+    for half in stream.first_bytes().iter().map(|first| first & 0xF) {
+        if !halves.contains(&half) {
+            halves.push(half);
         }
     }
     if halves.len() > 8 {

@@ -2,7 +2,7 @@
 
 use super::layout::{DbcLayout, SignalGroup, SignalRole, implies, shared};
 use super::options::DbcOptions;
-use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError};
+use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, keys};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Nanos, Quality, Reading};
@@ -33,14 +33,7 @@ impl Simulate for DbcOptions {
     /// A device after power-on.
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
         let layout = DbcLayout::new(spec, self)?;
-        let period_ms = self.period_ms.unwrap_or(10);
-        if !(1..=60_000).contains(&period_ms) {
-            return Err(SpecError::Key {
-                key: "period_ms",
-                value: f64::from(period_ms),
-                expected: "1 to 60000",
-            });
-        }
+        let period = keys::duration("period_ms", self.period_ms.unwrap_or(10))?;
         let mut frames: Vec<Pending> = Vec::new();
         for (message, layout) in layout.messages.iter().enumerate() {
             for conditions in shared(layout.parts.iter().map(|part| &part.conditions)) {
@@ -66,15 +59,13 @@ impl Simulate for DbcOptions {
                 .collect(),
             counts: readings.map(|_| 0).collect(),
             layout,
-            period: Nanos::from_millis(i64::from(period_ms)),
+            period,
             frames,
         }))
     }
 }
 
 impl Board for DbcBoard {
-    fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
-
     fn period(&self) -> Option<Nanos> {
         Some(self.period)
     }

@@ -6,11 +6,9 @@ use super::options::{DbcOptions, ReadingKeys};
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Session, Supervised};
 use crate::pairing::within;
+use crate::received::Received;
 use crate::signal::Message;
-use crate::{
-    Claim, Decoded, Device, Driver, Format, Frame, Id, Mode, OutputInfo, Spec, SpecError,
-    StampedReading,
-};
+use crate::{Claim, Device, Driver, Format, Id, Mode, OutputInfo, Spec, SpecError, StampedReading};
 use alloc::borrow::Cow;
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -104,31 +102,25 @@ impl Assembly {
     }
 
     /// Takes the values of a frame. True if the reading is complete.
-    fn take(
-        &mut self,
-        part: &SignalGroup,
-        sender: Option<u8>,
-        frame: &Frame,
-        out: &mut Decoded,
-    ) -> bool {
+    fn take(&mut self, part: &SignalGroup, sender: Option<u8>, frame: &mut Received<'_>) -> bool {
         let begun = (self.t, self.stamp);
-        let in_time = within(begun, (frame.t, frame.stamp), self.layout.limit);
+        let in_time = within(begun, frame, self.layout.limit);
         if self.have != 0 && in_time && sender.zip(self.sender).is_some_and(|(a, b)| a != b) {
             // Of another device that sends the same message.
-            out.fault(Counter::Unexpected, 1, frame.id);
+            frame.fault(Counter::Unexpected);
             return false;
         }
         let Some(FrameValues {
             values,
             come,
             along,
-        }) = self.values_of(part, frame, out)
+        }) = self.values_of(part, frame)
         else {
             return false;
         };
         let again = self.have & come != 0;
         if self.have != 0 && (again || !in_time) {
-            self.drop_one(frame, out);
+            self.drop_one(frame);
             self.suspect = again;
         }
         if self.have == 0 {
@@ -136,7 +128,7 @@ impl Assembly {
                 // Its first frame was lost, or it is the late rest of a reading that was dropped.
                 self.suspect = false;
                 if !self.joined {
-                    self.drop_one(frame, out);
+                    self.drop_one(frame);
                 }
                 return false;
             }
@@ -153,7 +145,7 @@ impl Assembly {
             return false;
         }
         if core::mem::take(&mut self.suspect) {
-            self.drop_one(frame, out);
+            self.drop_one(frame);
             return false;
         }
         self.have = 0;
@@ -162,12 +154,7 @@ impl Assembly {
 
     /// Takes counter, fault and held values of a frame, and returns its other values; `None`: it
     /// has none, or one that is no number.
-    fn values_of(
-        &mut self,
-        part: &SignalGroup,
-        frame: &Frame,
-        out: &mut Decoded,
-    ) -> Option<FrameValues> {
+    fn values_of(&mut self, part: &SignalGroup, frame: &mut Received<'_>) -> Option<FrameValues> {
         let mut found = FrameValues::default();
         for field in &part.fields {
             let UsedSignal { bits, raw, .. } = *field;
@@ -189,7 +176,7 @@ impl Assembly {
                     let absent = self.absent.get(index).copied();
                     let value = absent.filter(|_| is_none).unwrap_or(number);
                     if !value.is_finite() && !is_none {
-                        out.fault(Counter::Value, 1, frame.id);
+                        frame.fault(Counter::Value);
                         hold?;
                     } else if let Some(hold) = hold {
                         if let Some(held) = self.held.get_mut(index) {
@@ -209,10 +196,10 @@ impl Assembly {
         (found.come != 0).then_some(found)
     }
 
-    fn drop_one(&mut self, frame: &Frame, out: &mut Decoded) {
+    fn drop_one(&mut self, frame: &mut Received<'_>) {
         self.have = 0;
         self.gap = true;
-        out.fault(Counter::Unpaired, 1, frame.id);
+        frame.fault(Counter::Unpaired);
     }
 
     /// The complete reading; `after_silence` says whether the device was silent before it. `None`
@@ -221,13 +208,12 @@ impl Assembly {
         &mut self,
         number: u8,
         after_silence: bool,
-        frame: &Frame,
-        out: &mut Decoded,
+        frame: &mut Received<'_>,
     ) -> Option<StampedReading> {
         let mut quality = Quality::GOOD;
         if self.fault {
             quality |= Quality::DEVICE_FAULT;
-            out.fault(Counter::DeviceFault, 1, frame.id);
+            frame.fault(Counter::DeviceFault);
         }
         let mut values = self.values;
         for (held, (value, absent)) in self.held.iter().zip(values.iter_mut().zip(self.absent)) {
@@ -239,14 +225,14 @@ impl Assembly {
             quality |= Quality::DEVICE_COUNTER;
             if let Some(last) = self.last_count.replace(count).filter(|_| !after_silence) {
                 if count == last {
-                    out.fault(Counter::Unexpected, 1, frame.id);
+                    frame.fault(Counter::Unexpected);
                     return None;
                 }
                 let lost = count.wrapping_sub(last).wrapping_sub(1) & self.most;
                 if lost > 0 {
                     self.gap = true;
                     let lost = u32::try_from(lost).unwrap_or(u32::MAX);
-                    out.fault(Counter::Lost, lost, frame.id);
+                    frame.faults(Counter::Lost, lost);
                 }
             }
         }
@@ -261,7 +247,7 @@ impl Assembly {
         };
         let reading = Reading::from_values(self.layout.kind, &values);
         let Some(reading) = reading.filter(|_| !means_nothing) else {
-            out.fault(Counter::Value, 1, frame.id);
+            frame.fault(Counter::Value);
             return None;
         };
         #[allow(clippy::cast_possible_truncation)] // the number of such a device's readings
@@ -330,17 +316,17 @@ impl Driver for DbcOptions {
 impl Family for DbcDevice {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         // Who asks for a frame of the device says nothing of it.
         if matches!(frame.format, Format::Error | Format::Remote) {
             return;
         }
-        let data = frame.data();
+        let (id, data) = (frame.id, frame.data());
         let messages = self.layout.messages.iter();
-        let messages = messages.filter(|message| message.frames.matches(frame.id));
+        let messages = messages.filter(|message| message.frames.matches(id));
         let mut is_short = false;
         let parts = messages.flat_map(|message| {
-            let sender = message.sender(frame.id);
+            let sender = message.sender(id);
             message.parts.iter().map(move |part| (part, sender))
         });
         for (part, sender) in parts {
@@ -355,17 +341,17 @@ impl Family for DbcDevice {
                 .conditions
                 .iter()
                 .all(|condition| condition.holds(data));
-            if !has || !assembly.take(part, sender, frame, out) {
+            if !has || !assembly.take(part, sender, frame) {
                 continue;
             }
             let after_silence = session.bringup.reading(frame.t);
             let number = u8::try_from(part.reading).unwrap_or(u8::MAX);
-            if let Some(stamped) = assembly.finish(number, after_silence, frame, out) {
-                out.push(stamped, frame.id);
+            if let Some(stamped) = assembly.finish(number, after_silence, frame) {
+                frame.push(stamped);
             }
         }
         if is_short {
-            out.fault(Counter::Length, 1, frame.id);
+            frame.fault(Counter::Length);
         }
     }
 

@@ -230,10 +230,7 @@ impl MessageLayout {
     pub(super) const fn format(&self) -> Format {
         match self.size {
             ..=8 => Format::Classic,
-            _ => Format::Fd {
-                bit_rate_switch: true,
-                error_state: false,
-            },
+            _ => Format::fd(true, false),
         }
     }
 }

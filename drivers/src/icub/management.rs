@@ -1,7 +1,7 @@
 //! What every simulated board of the protocol answers: its type, its firmware, the text in it.
 
 use super::{BROADCAST, class, command, to_board, to_host};
-use crate::{Format, Frame, Frames};
+use crate::{Format, Frame, Frames, board};
 
 /// The bytes of a command of class `class` to board `address` in `frame`, starting with the command
 /// byte.
@@ -27,16 +27,13 @@ pub(crate) fn answer_management<'f>(
     let [major, minor, build] = FIRMWARE;
     if let Some([command::DISCOVER]) = command_for(frame, class::MANAGEMENT, address) {
         let id = to_host(class::MANAGEMENT, address);
-        let _ = out.try_push(Frame::new(
-            id,
-            &[command::DISCOVER, board, major, minor, build],
-        ));
+        board::send(id, &[command::DISCOVER, board, major, minor, build], out);
     }
     if let Some([command::GET_ADDITIONAL_INFO]) = command_for(frame, class::MANAGEMENT, address) {
         for (number, text) in (0..).zip(INFO.as_chunks::<4>().0) {
             let [a, b, c, d] = *text;
             let data = [command::GET_ADDITIONAL_INFO, number, a, b, c, d];
-            let _ = out.try_push(Frame::new(to_host(class::MANAGEMENT, address), &data));
+            board::send(to_host(class::MANAGEMENT, address), &data, out);
         }
     }
     let version = if class == class::POLLING_MOTOR {
@@ -49,10 +46,11 @@ pub(crate) fn answer_management<'f>(
         && asked == version
     {
         let fits = u8::from(want_major == 2 && want_minor == 0);
-        let _ = out.try_push(Frame::new(
+        board::send(
             to_host(class, address),
             &[version, board, major, minor, build, 2, 0, fits],
-        ));
+            out,
+        );
     }
     command
 }

@@ -132,7 +132,6 @@ pub(crate) fn recognise(
     maybe: &[u8],
     streams: impl Fn(&mut Evidence<'_>, u8, Option<u8>) -> (Vec<Key>, Vec<u8>),
 ) -> Vec<Finding> {
-    let addresses = ADDRESSES.filter_map(|address| u8::try_from(address).ok());
     let find = |address: u8| {
         let mut evidence = Evidence::new(seen, ADDRESSES.count());
         let identity = identity(&mut evidence, address, types).ok()?;
@@ -162,14 +161,14 @@ pub(crate) fn recognise(
         let finding = evidence.finding(driver, address.into(), what)?;
         Some(finding.with_keys(keys).with_joints(joints))
     };
-    addresses.filter_map(find).collect()
+    ADDRESSES.filter_map(find).collect()
 }
 
 /// All boards are asked who they are, and those that answer for the text in them.
 pub(crate) fn questions(seen: &Traffic) -> Vec<Frame> {
     let everyone = to_board(class::MANAGEMENT, BROADCAST);
     let mut questions = Vec::from([Frame::new(everyone, &[command::DISCOVER])]);
-    for address in ADDRESSES.filter_map(|address| u8::try_from(address).ok()) {
+    for address in ADDRESSES {
         let heard = seen.stream(to_host(class::MANAGEMENT, address));
         let mut frames = heard.into_iter().flat_map(Stream::kept);
         // A bootloader is left alone.

@@ -48,10 +48,11 @@ impl ImuBoard {
     }
 
     fn send(&self, kind: u8, data: &[u8], out: &mut Frames) {
-        let _ = out.try_push(Frame::new(
+        board::send(
             icub::stream(class::PERIODIC_INERTIAL, self.plan.address, kind),
             data,
-        ));
+            out,
+        );
     }
 }
 
@@ -93,10 +94,11 @@ impl Board for ImuBoard {
                 if let Some(first) = answer.first_mut() {
                     *first = command::IMU_CONFIG_GET;
                 }
-                let _ = out.try_push(Frame::new(
+                board::send(
                     icub::to_host(class::POLLING_ANALOG, self.plan.address),
                     &answer,
-                ));
+                    out,
+                );
             }
             [command::IMU_TRANSMIT, ms] if !is_legacy => {
                 // A board without a configuration sends nothing.

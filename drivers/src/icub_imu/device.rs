@@ -10,13 +10,12 @@ use crate::configure::{Configure, Setting};
 use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{self, HalfOrder, Limit, Paired, Pairing};
+use crate::received::Received;
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, NotSent, OutputInfo, Spec, SpecError, StampedReading,
-    bytes,
+    Claim, Device, Driver, Frame, NotSent, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use arrayvec::ArrayVec;
 use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, StampKind};
 
 /// A frame up to this many sequence numbers back is late; further back, the counter has restarted
@@ -69,24 +68,24 @@ pub(super) struct ImuDevice {
 impl ImuDevice {
     /// Whether a frame with `sequence` belongs to the open acquisition; a later `sequence` opens a
     /// new one.
-    fn belongs(&mut self, sequence: u8, frame: &Frame, out: &mut Decoded) -> bool {
+    fn belongs(&mut self, sequence: u8, frame: &mut Received<'_>) -> bool {
         let joined = self.sequence.is_none();
         if let Some(last) = self.sequence {
             match sequence.wrapping_sub(last) {
                 // If it is not open, it is complete, and this frame is not needed.
                 0 => return self.acquisition.open,
-                1 => self.abandon(frame, out),
+                1 => self.abandon(frame),
                 _ if frame.t <= self.may_jump => {
                     self.may_jump = Nanos::MIN;
                     self.gap |= self.seen;
                 }
                 ahead if ahead <= u8::MAX - LATE => {
-                    self.abandon(frame, out);
-                    out.fault(Counter::Lost, u32::from(ahead) - 1, frame.id);
+                    self.abandon(frame);
+                    frame.faults(Counter::Lost, u32::from(ahead) - 1);
                     self.gap = true;
                 }
                 _ => {
-                    out.fault(Counter::Unpaired, 1, frame.id);
+                    frame.fault(Counter::Unpaired);
                     self.gap = true;
                     return false;
                 }
@@ -104,22 +103,16 @@ impl ImuDevice {
     }
 
     /// Drops an incomplete acquisition.
-    fn abandon(&mut self, frame: &Frame, out: &mut Decoded) {
+    fn abandon(&mut self, frame: &mut Received<'_>) {
         if core::mem::take(&mut self.acquisition.open) && !self.acquisition.joined {
-            out.fault(Counter::Unpaired, 1, frame.id);
+            frame.fault(Counter::Unpaired);
             self.gap = true;
         }
     }
 
     /// Records that the acquisition has `bit`; outputs the reading when all wanted quantities are
     /// present.
-    fn hold(
-        &mut self,
-        bit: u16,
-        frame: &Frame,
-        session: &mut Session<Configure>,
-        out: &mut Decoded,
-    ) {
+    fn hold(&mut self, bit: u16, frame: &mut Received<'_>, session: &mut Session<Configure>) {
         self.acquisition.have |= bit;
         if self.acquisition.have & self.plan.want != self.plan.want {
             return;
@@ -141,31 +134,24 @@ impl ImuDevice {
             device_counter: u32::from(self.sequence.unwrap_or(0)),
             ..StampedReading::new(0, frame, quality, Reading::Imu(imu))
         };
-        self.add(stamped, frame, session, out);
+        self.add(stamped, frame, session);
     }
 
     /// Adds a reading; the first one after something was lost is marked.
     fn add(
         &mut self,
         mut stamped: StampedReading,
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<Configure>,
-        out: &mut Decoded,
     ) {
         if core::mem::take(&mut self.gap) {
             stamped.quality |= Quality::GAP_BEFORE;
         }
         self.seen = true;
-        session.add(stamped, frame, out);
+        session.add(stamped, frame);
     }
 
-    fn triple(
-        &mut self,
-        data: &[u8],
-        frame: &Frame,
-        session: &mut Session<Configure>,
-        out: &mut Decoded,
-    ) {
+    fn triple(&mut self, data: &[u8], frame: &mut Received<'_>, session: &mut Session<Configure>) {
         let &[sequence, sensor, ..] = data else {
             return;
         };
@@ -173,10 +159,10 @@ impl ImuDevice {
             sensor,
             sensor::ACCELERATION..=sensor::EULER | sensor::LINEAR_ACCELERATION | sensor::GRAVITY
         ) {
-            return out.fault(Counter::Value, 1, frame.id);
+            return frame.fault(Counter::Value);
         }
         let bit = 1_u16 << sensor;
-        if !self.belongs(sequence, frame, out) || self.plan.want & bit == 0 {
+        if !self.belongs(sequence, frame) || self.plan.want & bit == 0 {
             return;
         }
         let imu = &mut self.acquisition.imu;
@@ -187,15 +173,14 @@ impl ImuDevice {
             _ => (&mut imu.angular_velocity, RATE_LSB),
         };
         *field = vector(data, 2).map(|count| f64::from(count) * lsb);
-        self.hold(bit, frame, session, out);
+        self.hold(bit, frame, session);
     }
 
     fn quaternion(
         &mut self,
         data: &[u8],
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<Configure>,
-        out: &mut Decoded,
     ) {
         let bit = ImuQuantity::Orientation.bit();
         // Before the first acquisition that is heard it belongs to an earlier one.
@@ -203,9 +188,8 @@ impl ImuDevice {
             return;
         }
         let begun = (self.acquisition.acquired, self.acquisition.stamp);
-        if !self.acquisition.open || !pairing::within(begun, (frame.t, frame.stamp), self.together)
-        {
-            out.fault(Counter::Unpaired, 1, frame.id);
+        if !self.acquisition.open || !pairing::within(begun, frame, self.together) {
+            frame.fault(Counter::Unpaired);
             self.gap = true;
             return;
         }
@@ -213,24 +197,18 @@ impl ImuDevice {
         let w = bytes::i16_le(data, 0);
         self.acquisition.imu.orientation =
             [w, x, y, z].map(|count| f64::from(count) * QUATERNION_LSB);
-        self.hold(bit, frame, session, out);
+        self.hold(bit, frame, session);
     }
 
-    fn status(
-        &mut self,
-        data: &[u8],
-        frame: &Frame,
-        session: &mut Session<Configure>,
-        out: &mut Decoded,
-    ) {
+    fn status(&mut self, data: &[u8], frame: &mut Received<'_>, session: &mut Session<Configure>) {
         let &[sequence, gyroscope, accelerometer, magnetometer, ..] = data else {
             return;
         };
         if gyroscope > 3 || accelerometer > 3 || magnetometer > 3 {
-            return out.fault(Counter::Value, 1, frame.id);
+            return frame.fault(Counter::Value);
         }
         let bit = ImuQuantity::Status.bit();
-        if self.plan.want & bit == 0 || !self.belongs(sequence, frame, out) {
+        if self.plan.want & bit == 0 || !self.belongs(sequence, frame) {
             return;
         }
         let lacks = |quantity: ImuQuantity, calibration| {
@@ -239,16 +217,15 @@ impl ImuDevice {
         self.not_calibrated = lacks(ImuQuantity::Acceleration, accelerometer)
             || lacks(ImuQuantity::AngularVelocity, gyroscope)
             || lacks(ImuQuantity::MagneticField, magnetometer);
-        self.hold(bit, frame, session, out);
+        self.hold(bit, frame, session);
     }
 
     fn legacy(
         &mut self,
         is_gyroscope: bool,
         data: &[u8],
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<Configure>,
-        out: &mut Decoded,
     ) {
         let quantity = if is_gyroscope {
             ImuQuantity::AngularVelocity
@@ -275,7 +252,7 @@ impl ImuDevice {
             let mut unpaired = 0;
             let paired = self.legacy.push(is_gyroscope, frame, counts, &mut unpaired);
             if unpaired > 0 {
-                out.fault(Counter::Unpaired, unpaired, frame.id);
+                frame.faults(Counter::Unpaired, unpaired);
                 self.gap = true;
             }
             let Paired::With(t, kind, [acceleration, rate]) = paired else {
@@ -285,12 +262,9 @@ impl ImuDevice {
             set(true, rate);
             (acquired, stamp) = (t, kind);
         }
-        let stamped = StampedReading {
-            acquired,
-            stamp,
-            ..StampedReading::new(0, frame, Quality::GOOD, Reading::Imu(imu))
-        };
-        self.add(stamped, frame, session, out);
+        let stamped =
+            StampedReading::new(0, frame, Quality::GOOD, Reading::Imu(imu)).at(acquired, stamp);
+        self.add(stamped, frame, session);
     }
 }
 
@@ -326,8 +300,7 @@ impl Driver for IcubImuOptions {
         );
         let mut bringup = Bringup::new(spec, spec.mode, timing, watched);
         let id = icub::to_board(class::POLLING_ANALOG, plan.address);
-        let mut claims: ArrayVec<Claim, 4> =
-            icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);
+        let mut claims = icub::claims(class::PERIODIC_INERTIAL, plan.address, kinds);
         if is_legacy {
             bringup.start_with(
                 id,
@@ -376,7 +349,7 @@ impl Driver for IcubImuOptions {
 impl Family for ImuDevice {
     type Questions = Configure;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<Configure>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session<Configure>) {
         let is_legacy = self.plan.legacy != Legacy::None;
         if let Some(stream) =
             icub::stream_type(frame.id, class::PERIODIC_INERTIAL, self.plan.address)
@@ -386,27 +359,27 @@ impl Family for ImuDevice {
                 kind::TRIPLE | kind::QUATERNION | kind::STATUS if !is_legacy => 8,
                 _ => return,
             };
-            let Some(data) = bytes::payload(frame, out) else {
+            let Some(data) = frame.payload() else {
                 return;
             };
             match stream {
-                _ if data.len() != expected => out.fault(Counter::Length, 1, frame.id),
-                kind::TRIPLE => self.triple(data, frame, session, out),
-                kind::QUATERNION => self.quaternion(data, frame, session, out),
-                kind::STATUS => self.status(data, frame, session, out),
-                _ => self.legacy(stream == kind::LEGACY_GYROSCOPE, data, frame, session, out),
+                _ if data.len() != expected => frame.fault(Counter::Length),
+                kind::TRIPLE => self.triple(data, frame, session),
+                kind::QUATERNION => self.quaternion(data, frame, session),
+                kind::STATUS => self.status(data, frame, session),
+                _ => self.legacy(stream == kind::LEGACY_GYROSCOPE, data, frame, session),
             }
         } else if !is_legacy
             && frame.id == icub::to_host(class::POLLING_ANALOG, self.plan.address)
-            && let Some(data) = bytes::payload(frame, out)
+            && let Some(data) = frame.payload()
         {
             match data.first() {
                 Some(&command::IMU_CONFIG_GET) => {
-                    session.questions.answer(data, frame, out);
+                    session.questions.answer(data, frame);
                 }
                 // Answers to other questions are for other devices.
                 Some(_) => {}
-                None => out.fault(Counter::Length, 1, frame.id),
+                None => frame.fault(Counter::Length),
             }
         }
     }

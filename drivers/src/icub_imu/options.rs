@@ -71,26 +71,17 @@ impl ImuKeys {
         if want & (inertial | ImuQuantity::MagneticField.bit()) == 0 {
             let expected =
                 "a list with at least one of acceleration, angular_velocity, magnetic_field";
-            return Err(SpecError::Keys {
-                key: "quantities",
-                expected,
-            });
+            return Err(SpecError::keys("quantities", expected));
         }
         let legacy_mask = options.legacy_mask.unwrap_or(LEGACY_MASK);
         if options.legacy == Legacy::None {
             if options.legacy_mask.is_some() {
-                return Err(SpecError::Keys {
-                    key: "legacy_mask",
-                    expected: "absent without legacy",
-                });
+                return Err(SpecError::keys("legacy_mask", "absent without legacy"));
             }
         } else {
             if want & !inertial != 0 {
                 let expected = "acceleration or angular_velocity or both, with legacy frames";
-                return Err(SpecError::Keys {
-                    key: "quantities",
-                    expected,
-                });
+                return Err(SpecError::keys("quantities", expected));
             }
             let lacks = (want & ImuQuantity::Acceleration.bit() != 0
                 && legacy_mask & LEGACY_ACCELEROMETERS == 0)
@@ -99,22 +90,14 @@ impl ImuKeys {
             if lacks || legacy_mask > 0xF {
                 let expected = "at most 15, with bit 2 for angular_velocity and bit 0, 1 or 3 for \
                      acceleration";
-                return Err(SpecError::Key {
-                    key: "legacy_mask",
-                    value: f64::from(legacy_mask),
-                    expected,
-                });
+                return Err(SpecError::key("legacy_mask", legacy_mask, expected));
             }
         }
         let orientation = match options.placement {
             None => 0,
             Some(placement @ 0..=7) => 0x80 | placement,
             Some(other) => {
-                return Err(SpecError::Key {
-                    key: "placement",
-                    value: f64::from(other),
-                    expected: "0 to 7",
-                });
+                return Err(SpecError::key("placement", other, "0 to 7"));
             }
         };
         let [low, high] = want.to_le_bytes();

@@ -78,7 +78,7 @@ impl Board for MaisBoard {
             if has_this && self.fresh & joints == joints {
                 self.fresh &= !mask;
                 let id = icub::stream(class::PERIODIC_ANALOG, self.address, kind);
-                let _ = out.try_push(Frame::new(id, counts));
+                board::send(id, counts, out);
             }
         }
         Ok(())

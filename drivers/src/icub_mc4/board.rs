@@ -5,7 +5,7 @@ use super::{
     status_quality,
 };
 use crate::icub::{self, class};
-use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, bytes};
+use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board, bytes};
 use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading};
 
@@ -35,7 +35,7 @@ struct Mc4Board {
 impl Mc4Board {
     fn send(&self, kind: u8, data: [u8; FRAME], out: &mut Frames) {
         let id = icub::stream(class::PERIODIC_MOTOR, self.address, kind);
-        let _ = out.try_push(Frame::new(id, &data));
+        board::send(id, &data, out);
     }
 
     fn send_status(&self, out: &mut Frames) {
@@ -48,6 +48,7 @@ impl Mc4Board {
 impl Simulate for IcubMc4Options {
     /// A board that streams at once.
     fn board(&self, spec: &Spec) -> Result<Box<dyn Board>, SpecError> {
+        self.hold()?;
         let period = icub::period(self.period_ms)?;
         Ok(Box::new(Mc4Board {
             address: icub::address(spec)?,

@@ -29,7 +29,7 @@ impl MotorBoard {
             (bytes::quantise(actuator.duty, DUTY_PER_LSB, -32000, 32000) as i16).to_le_bytes();
         let [f0, f1, f2, f3] = actuator.faults.to_le_bytes();
         let id = icub::stream(class::PERIODIC_MOTOR, self.address, kind::STATUS);
-        let _ = out.try_push(Frame::new(id, &[mode, encoder, d0, d1, f0, f1, f2, f3]));
+        board::send(id, &[mode, encoder, d0, d1, f0, f1, f2, f3], out);
         self.status = quality_of(actuator);
         Ok(())
     }
@@ -113,7 +113,7 @@ impl Board for MotorBoard {
                 #[allow(clippy::cast_possible_truncation)] // limited to 32 bits
                 let [p0, p1, p2, p3] = (position as i32).to_le_bytes();
                 let id = icub::stream(class::PERIODIC_MOTOR, self.address, kind::TWO_FOC);
-                let _ = out.try_push(Frame::new(id, &[c0, c1, v0, v1, p0, p1, p2, p3]));
+                board::send(id, &[c0, c1, v0, v1, p0, p1, p2, p3], out);
                 Ok(())
             }
             Reading::Actuator(actuator) => self.send_status(actuator, out),

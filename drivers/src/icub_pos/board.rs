@@ -47,7 +47,7 @@ impl Board for PosBoard {
                 let [b, c, d, e, f, g] = sensors;
                 let id = icub::to_host(class::POLLING_ANALOG, self.address);
                 let answer = [command::POS_CONFIG_GET, kind, b, c, d, e, f, g];
-                let _ = out.try_push(Frame::new(id, &answer));
+                board::send(id, &answer, out);
             }
             Some(&[command::POS_TRANSMIT, ms]) => {
                 self.streaming = ms > 0;
@@ -78,10 +78,7 @@ impl Board for PosBoard {
         let (code, lsb) = self.quantity.code_and_lsb();
         let [low, high] = bytes::quantise_i16(joint.position, lsb).to_le_bytes();
         let id = icub::stream(class::PERIODIC_ANALOG, self.address, POS);
-        let _ = out.try_push(Frame::new(
-            id,
-            &[code, output << 4 | 1, low, high, 0, 0, 0, 0],
-        ));
+        board::send(id, &[code, output << 4 | 1, low, high, 0, 0, 0, 0], out);
         Ok(())
     }
 }

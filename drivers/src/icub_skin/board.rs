@@ -2,7 +2,7 @@
 
 use super::{FIRST, IcubSkinOptions, SECOND, THERMAL};
 use crate::icub::{self, class, command};
-use crate::{Board, EncodeError, Frame, Frames, Id, Mode, Simulate, Spec, SpecError, bytes};
+use crate::{Board, EncodeError, Frame, Frames, Id, Mode, Simulate, Spec, SpecError, board, bytes};
 use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading};
 
@@ -88,7 +88,7 @@ impl Board for SkinBoard {
             [FIRST, p0, p1, p2, p3, p4, p5, p6],
             [SECOND, p7, p8, p9, p10, p11, high, low],
         ] {
-            let _ = out.try_push(Frame::new(id, &data));
+            board::send(id, &data, out);
         }
         Ok(())
     }

@@ -161,10 +161,7 @@ impl Board for StrainBoard {
                 let [high, low] =
                     (bytes::quantise(full_scale, 1.0, 0, i64::from(u16::MAX)) as u16).to_be_bytes();
                 let id = icub::to_host(class::POLLING_ANALOG, self.address);
-                let _ = out.try_push(Frame::new(
-                    id,
-                    &[command::GET_FULL_SCALES, channel, high, low],
-                ));
+                board::send(id, &[command::GET_FULL_SCALES, channel, high, low], out);
                 self.scale_known = true;
             }
             Some(&[command::SET_MATRIX_RC, row, column, high, low]) => {
@@ -179,7 +176,7 @@ impl Board for StrainBoard {
                 let [high, low] = entry.to_be_bytes();
                 let id = icub::to_host(class::POLLING_ANALOG, self.address);
                 let data = [command::GET_MATRIX_RC, row, column, high, low];
-                let _ = out.try_push(Frame::new(id, &data));
+                board::send(id, &data, out);
             }
             Some(&[command::SET_CURR_TARE, 0, ..]) => self.tare = [0; 6],
             Some(&[command::SET_CURR_TARE, MINUS_PRESENT, ..]) => {
@@ -196,10 +193,7 @@ impl Board for StrainBoard {
                 let tare = self.tare.get(usize::from(channel)).copied().unwrap_or(0);
                 let [high, low] = tare.to_be_bytes();
                 let id = icub::to_host(class::POLLING_ANALOG, self.address);
-                let _ = out.try_push(Frame::new(
-                    id,
-                    &[command::GET_CURR_TARE, channel, high, low],
-                ));
+                board::send(id, &[command::GET_CURR_TARE, channel, high, low], out);
             }
             Some(&[command::SET_CANDATARATE, ms]) if ms > 0 => {
                 self.period = Nanos::from_millis(i64::from(ms));
@@ -235,7 +229,7 @@ impl Board for StrainBoard {
                 board::finite(&[*celsius])?;
                 let [low, high] = bytes::quantise_i16(*celsius, CELSIUS_PER_LSB).to_le_bytes();
                 let id = icub::stream(class::PERIODIC_ANALOG, self.address, kind::THERMOMETER);
-                let _ = out.try_push(Frame::new(id, &[1, low, high, 0, 0]));
+                board::send(id, &[1, low, high, 0, 0], out);
             }
             _ => return Err(EncodeError::Kind),
         }

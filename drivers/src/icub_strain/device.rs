@@ -8,13 +8,13 @@ use crate::bringup::{Ask, Attempts, Bringup, Inquiry, Timing};
 use crate::family::{Family, Session, Supervised};
 use crate::icub::{self, class, command};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
+use crate::received::Received;
 use crate::{
     Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
     Driver, Frame, Mode, NotSent, OutputInfo, Spec, SpecError, StampedReading, bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
-use arrayvec::ArrayVec;
 use proprio_topics::{
     Counter, Gauges, Kind, Nanos, Quality, Reading, Refusal, StampKind, Temperature, Wrench,
 };
@@ -54,29 +54,29 @@ impl StrainScales {
     }
 
     /// Takes an answer of the board: `[18, axis, high, low]`.
-    fn answer(&mut self, data: &[u8], mode: Mode, frame: &Frame, out: &mut Decoded) {
+    fn answer(&mut self, data: &[u8], mode: Mode, frame: &mut Received<'_>) {
         let &[_, channel, high, low] = data else {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         };
         if channel >> 4 != 0 {
             // This answer is about a stored regulation set, not the one in use.
             if channel & 0xF > 5 || channel >> 4 > 3 {
-                out.fault(Counter::Value, 1, frame.id);
+                frame.fault(Counter::Value);
             }
             return;
         }
         let axis = usize::from(channel);
         let (Some(told), Some(open)) = (self.told.get_mut(axis), self.open.get_mut(axis)) else {
-            return out.fault(Counter::Value, 1, frame.id);
+            return frame.fault(Counter::Value);
         };
         let value = u16::from_be_bytes([high, low]);
         let differs = told.is_some_and(|known| known != value);
         if differs {
-            out.fault(Counter::Changed, 1, frame.id);
+            frame.fault(Counter::Changed);
         }
         if mode == Mode::Supervise {
             if *open == 0 || !self.attempts.counts(frame.t) {
-                return out.fault(Counter::Unexpected, 1, frame.id);
+                return frame.fault(Counter::Unexpected);
             }
             *open -= 1;
         }
@@ -173,11 +173,7 @@ struct Whole {
 
 impl Whole {
     fn output(&self, quality: Quality, reading: Reading, frame: &Frame) -> StampedReading {
-        StampedReading {
-            acquired: self.acquired,
-            stamp: self.stamp,
-            ..StampedReading::new(0, frame, quality, reading)
-        }
+        StampedReading::new(0, frame, quality, reading).at(self.acquired, self.stamp)
     }
 }
 
@@ -197,17 +193,11 @@ impl Pair {
     }
 
     /// Adds a half; returns both halves with their quality flags when complete.
-    fn push(
-        &mut self,
-        second: bool,
-        data: &[u8],
-        frame: &Frame,
-        out: &mut Decoded,
-    ) -> Option<Whole> {
+    fn push(&mut self, second: bool, data: &[u8], frame: &mut Received<'_>) -> Option<Whole> {
         let half = match StrainHalf::parse(data) {
             Ok(half) => half,
             Err(counter) => {
-                out.fault(counter, 1, frame.id);
+                frame.fault(counter);
                 self.gap = true;
                 return None;
             }
@@ -215,7 +205,7 @@ impl Pair {
         let mut unpaired = 0;
         let paired = self.pairing.push(second, frame, half, &mut unpaired);
         if unpaired > 0 {
-            out.fault(Counter::Unpaired, unpaired, frame.id);
+            frame.faults(Counter::Unpaired, unpaired);
             self.gap = true;
         }
         let Paired::With(acquired, stamp, [first, second]) = paired else {
@@ -256,11 +246,10 @@ impl Strain {
         &mut self,
         second: bool,
         data: &[u8],
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<StrainScales>,
-        out: &mut Decoded,
     ) {
-        let Some(whole) = self.calibrated.push(second, data, frame, out) else {
+        let Some(whole) = self.calibrated.push(second, data, frame) else {
             return;
         };
         let Some(per_step) = session.questions.per_step else {
@@ -292,18 +281,17 @@ impl Strain {
             Quality::GOOD
         };
         let quality = whole.quality | frozen | step | self.calibrated.take_gap();
-        session.add(whole.output(quality, reading, frame), frame, out);
+        session.add(whole.output(quality, reading, frame), frame);
     }
 
     fn gauges(
         &mut self,
         second: bool,
         data: &[u8],
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<StrainScales>,
-        out: &mut Decoded,
     ) {
-        let Some(whole) = self.raw.push(second, data, frame, out) else {
+        let Some(whole) = self.raw.push(second, data, frame) else {
             return;
         };
         let ([a, b, c], [d, e, f]) = (whole.first.counts, whole.second.counts);
@@ -311,7 +299,7 @@ impl Strain {
             counts: [a, b, c, d, e, f].map(i32::from),
         });
         let quality = whole.quality | self.raw.take_gap();
-        session.add(whole.output(quality, reading, frame), frame, out);
+        session.add(whole.output(quality, reading, frame), frame);
     }
 }
 
@@ -329,15 +317,10 @@ impl Driver for IcubStrainOptions {
         let timing = icub::timing(self.power_on_silence_ms)?;
         let limit = match self.pair_timeout_ms {
             None => Limit::of_period(Nanos::from_millis(i64::from(period))),
-            Some(ms) if ms.is_finite() && ms > 0.0 && ms <= 1000.0 => {
-                Limit::fixed(Nanos::from_seconds(ms * 1e-3))
-            }
+            Some(ms) if ms > 0.0 && ms <= 1000.0 => Limit::fixed(Nanos::from_seconds(ms * 1e-3)),
             Some(value) => {
-                return Err(SpecError::Key {
-                    key: "pair_timeout_ms",
-                    value,
-                    expected: "above 0 and at most 1000",
-                });
+                let expected = "above 0 and at most 1000";
+                return Err(SpecError::key("pair_timeout_ms", value, expected));
             }
         };
         let (force, command_id) = (
@@ -360,7 +343,7 @@ impl Driver for IcubStrainOptions {
         }
         bringup.start_with(command_id, &[command::SET_TXMODE, self.stream.code()]);
         bringup.stop_with(command_id, &[command::SET_TXMODE, 1]);
-        let mut claims: ArrayVec<Claim, 7> = icub::claims(
+        let mut claims = icub::claims(
             class::PERIODIC_ANALOG,
             address,
             &[
@@ -388,41 +371,40 @@ impl Driver for IcubStrainOptions {
 impl Family for Strain {
     type Questions = StrainScales;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<StrainScales>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session<StrainScales>) {
         if let Some(stream) = icub::stream_type(frame.id, class::PERIODIC_ANALOG, self.address) {
             let known = matches!(stream, kind::RAW_FORCE..=kind::TORQUE | kind::THERMOMETER..);
-            let Some(data) = known.then(|| bytes::payload(frame, out)).flatten() else {
+            let Some(data) = known.then(|| frame.payload()).flatten() else {
                 return;
             };
             match stream {
-                kind::FORCE => self.wrench(false, data, frame, session, out),
-                kind::TORQUE => self.wrench(true, data, frame, session, out),
-                kind::RAW_FORCE => self.gauges(false, data, frame, session, out),
-                kind::RAW_TORQUE => self.gauges(true, data, frame, session, out),
-                _ => temperature(data, frame, out),
+                kind::FORCE => self.wrench(false, data, frame, session),
+                kind::TORQUE => self.wrench(true, data, frame, session),
+                kind::RAW_FORCE => self.gauges(false, data, frame, session),
+                kind::RAW_TORQUE => self.gauges(true, data, frame, session),
+                _ => temperature(data, frame),
             }
         } else if frame.id == icub::to_host(class::POLLING_ANALOG, self.address)
-            && let Some(data) = bytes::payload(frame, out)
+            && let Some(data) = frame.payload()
         {
             match data.first() {
                 Some(&command::GET_FULL_SCALES) if !self.exchange.expects(data) => {
                     session
                         .questions
-                        .answer(data, session.bringup.mode(), frame, out);
+                        .answer(data, session.bringup.mode(), frame);
                 }
                 // As with full scales: live and in a log the same answers are malformed.
                 Some(&command::GET_MATRIX_RC) => {
-                    self.exchange
-                        .answer(data, session.bringup.mode(), frame, out);
+                    self.exchange.answer(data, session.bringup.mode(), frame);
                 }
                 Some(&(command::GET_FULL_SCALES | command::GET_CURR_TARE))
                     if session.bringup.mode() == Mode::Supervise =>
                 {
-                    self.exchange.answer(data, Mode::Supervise, frame, out);
+                    self.exchange.answer(data, Mode::Supervise, frame);
                 }
                 // Answers to other questions are for other devices.
                 Some(_) => {}
-                None => out.fault(Counter::Length, 1, frame.id),
+                None => frame.fault(Counter::Length),
             }
         }
     }
@@ -515,15 +497,14 @@ fn calibration(told: Told) -> Calibration {
 }
 
 /// The reading of a thermometer frame.
-fn temperature(data: &[u8], frame: &Frame, out: &mut Decoded) {
+fn temperature(data: &[u8], frame: &mut Received<'_>) {
     match *data {
         [mask, _, _, _, _] if mask & 1 == 1 => {
             let celsius = f64::from(bytes::i16_le(data, 1)) * CELSIUS_PER_LSB;
             let reading = Reading::Temperature(Temperature { celsius });
-            let stamped = StampedReading::new(0, frame, Quality::GOOD, reading);
-            out.push(stamped, frame.id);
+            frame.tell(0, Quality::GOOD, reading);
         }
-        [_, _, _, _, _] => out.fault(Counter::Value, 1, frame.id),
-        _ => out.fault(Counter::Length, 1, frame.id),
+        [_, _, _, _, _] => frame.fault(Counter::Value),
+        _ => frame.fault(Counter::Length),
     }
 }

@@ -3,7 +3,8 @@
 
 use crate::bringup::{Attempts, Timing};
 use crate::icub::{self, class, command};
-use crate::{COMMAND_TIME, Command, CommandFailed, Decoded, Frame, Mode, NotSent};
+use crate::received::Received;
+use crate::{COMMAND_TIME, Command, CommandFailed, Frame, Mode, NotSent};
 use proprio_topics::{Counter, Nanos};
 
 /// The mode of SET_CURR_TARE that takes minus the present force and torque of every axis.
@@ -194,7 +195,7 @@ impl Exchange {
     }
 
     /// Takes an answer of the board.
-    pub(super) fn answer(&mut self, data: &[u8], mode: Mode, frame: &Frame, out: &mut Decoded) {
+    pub(super) fn answer(&mut self, data: &[u8], mode: Mode, frame: &mut Received<'_>) {
         if let [command::GET_MATRIX_RC, row, 0..6, _, _] = *data
             && matches!((row >> 4, row & 0xF), (1..=3, 0..6))
         {
@@ -205,14 +206,14 @@ impl Exchange {
             // Another program has asked.
             Ok(_) if mode == Mode::Listen => return,
             Ok(parsed) => parsed,
-            Err(counter) => return out.fault(counter, 1, frame.id),
+            Err(counter) => return frame.fault(counter),
         };
         let is_tare = data.first() == Some(&command::GET_CURR_TARE);
         let (Some(open), Some(told)) = (self.open.get_mut(at), self.told.get_mut(at)) else {
             return;
         };
         if *open == 0 || is_tare != matches!(self.what, Command::Tare) {
-            return out.fault(Counter::Unexpected, 1, frame.id);
+            return frame.fault(Counter::Unexpected);
         }
         *open -= 1;
         if self.step != ExchangeStep::Asking(at) {

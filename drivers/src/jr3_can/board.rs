@@ -36,7 +36,7 @@ impl Jr3Board {
         }
         let length = 1 + 2 * scales.len();
         let id = id(op::ACKNOWLEDGE, self.node);
-        let _ = out.try_push(Frame::new(id, data.get(..length).unwrap_or(&data)));
+        board::send(id, data.get(..length).unwrap_or(&data), out);
     }
 }
 
@@ -134,7 +134,7 @@ impl Board for Jr3Board {
             (op::MOMENT, [g, h, i, j, k, l]),
         ] {
             let data = [a, b, c, d, e, f, low, high];
-            let _ = out.try_push(Frame::new(id(op, self.node), &data));
+            board::send(id(op, self.node), &data, out);
         }
         Ok(())
     }

@@ -6,6 +6,7 @@ use super::protocol::{READY, SAMPLE, STEPS, id, node, op, op_of};
 use super::scales::{Jr3Scales, Question};
 use crate::bringup::{Bringup, Timing};
 use crate::family::{Family, Session, Supervised};
+use crate::received::Received;
 use crate::wrench::{NewZero, TareCommand, at_end};
 use crate::{
     Calibration, Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device,
@@ -63,9 +64,8 @@ impl Jr3 {
     fn acknowledge(
         &mut self,
         data: &[u8],
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<Jr3Scales>,
-        out: &mut Decoded,
     ) {
         match *data {
             [state] => {
@@ -73,42 +73,35 @@ impl Jr3 {
                 if state == READY {
                     self.tare.confirm();
                 } else {
-                    out.fault(Counter::DeviceFault, 1, frame.id);
+                    frame.fault(Counter::DeviceFault);
                 }
             }
             [state, ref scales @ ..] if scales.len() == 6 => {
                 let scales = [0, 2, 4].map(|at| bytes::u16_le(scales, at));
                 let mode = session.bringup.mode();
-                session.questions.answer(state, scales, mode, frame, out);
+                session.questions.answer(state, scales, mode, frame);
             }
-            _ => out.fault(Counter::Length, 1, frame.id),
+            _ => frame.fault(Counter::Length),
         }
     }
 
-    fn force(
-        &mut self,
-        half: Jr3Half,
-        frame: &Frame,
-        session: &mut Session<Jr3Scales>,
-        out: &mut Decoded,
-    ) {
+    fn force(&mut self, half: Jr3Half, frame: &mut Received<'_>, session: &mut Session<Jr3Scales>) {
         self.joined = true;
         if self.waiting.replace((frame.t, frame.stamp, half)).is_some() {
-            session.lost(Counter::Unpaired, 1, frame, out);
+            session.lost(Counter::Unpaired, 1, frame);
         }
     }
 
     fn moment(
         &mut self,
         half: Jr3Half,
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<Jr3Scales>,
-        out: &mut Decoded,
     ) {
         let force = (self.waiting).take_if(|(_, _, force)| force.counter == half.counter);
         let Some((acquired, stamp, force)) = force else {
             if self.joined {
-                session.lost(Counter::Unpaired, 1, frame, out);
+                session.lost(Counter::Unpaired, 1, frame);
             }
             return;
         };
@@ -118,7 +111,7 @@ impl Jr3 {
                 0 => quality |= Quality::FROZEN,
                 samples => {
                     let lost = self.periods(samples).saturating_sub(1);
-                    session.lost(Counter::Lost, lost, frame, out);
+                    session.lost(Counter::Lost, lost, frame);
                 }
             }
         }
@@ -144,7 +137,7 @@ impl Jr3 {
             device_counter: u32::from(half.counter),
             ..StampedReading::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        session.add(stamped, frame, out);
+        session.add(stamped, frame);
     }
 
     /// The number of periods in which the sensor takes `samples`, to the nearest.
@@ -200,7 +193,7 @@ impl Driver for Jr3CanOptions {
 impl Family for Jr3 {
     type Questions = Jr3Scales;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<Jr3Scales>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session<Jr3Scales>) {
         let Some(op) = op_of(frame.id, self.node) else {
             return;
         };
@@ -215,19 +208,19 @@ impl Family for Jr3 {
             op::FORCE | op::MOMENT | op::ACKNOWLEDGE | op::BOOT_UP => {}
             _ => return,
         }
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = frame.payload() else {
             return;
         };
         match (op, Jr3Half::parse(data)) {
-            (op::ACKNOWLEDGE, _) => self.acknowledge(data, frame, session, out),
-            (op::FORCE, Some(half)) => self.force(half, frame, session, out),
-            (op::MOMENT, Some(half)) => self.moment(half, frame, session, out),
+            (op::ACKNOWLEDGE, _) => self.acknowledge(data, frame, session),
+            (op::FORCE, Some(half)) => self.force(half, frame, session),
+            (op::MOMENT, Some(half)) => self.moment(half, frame, session),
             (op::BOOT_UP, _) if data.is_empty() => {
                 session.bringup.restart();
                 self.reset();
                 self.zero.expect(frame.t);
             }
-            _ => out.fault(Counter::Length, 1, frame.id),
+            _ => frame.fault(Counter::Length),
         }
     }
 

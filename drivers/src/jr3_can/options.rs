@@ -1,6 +1,6 @@
 //! The keys of a board in gateway.toml, for both sides of the driver.
 
-use crate::{SpecError, bytes, wrench};
+use crate::{SpecError, bytes, keys, wrench};
 use proprio_topics::Nanos;
 use serde::Deserialize;
 
@@ -39,26 +39,23 @@ impl Jr3CanOptions {
     }
 
     pub(super) fn period(&self) -> Result<Nanos, SpecError> {
-        match self.period_ms {
-            1..=1000 => Ok(Nanos::from_millis(i64::from(self.period_ms))),
-            other => Err(SpecError::Key {
-                key: "period_ms",
-                value: f64::from(other),
-                expected: "an integer from 1 to 1000",
-            }),
-        }
+        keys::ms(
+            "period_ms",
+            self.period_ms,
+            1..=1000,
+            "an integer from 1 to 1000",
+        )
     }
 
     /// The cut-off frequency in the start command.
     pub(super) fn cutoff(&self) -> Result<u16, SpecError> {
-        if !(self.cutoff_hz >= 0.0 && self.cutoff_hz <= 655.35) {
-            return Err(SpecError::Key {
-                key: "cutoff_hz",
-                value: self.cutoff_hz,
-                expected: "from 0 to 655.35",
-            });
-        }
-        let hundredths = bytes::quantise(self.cutoff_hz, 0.01, 0, u16::MAX.into());
+        let hz = keys::within(
+            "cutoff_hz",
+            self.cutoff_hz,
+            0.0..=655.35,
+            "from 0 to 655.35",
+        )?;
+        let hundredths = bytes::quantise(hz, 0.01, 0, u16::MAX.into());
         Ok(u16::try_from(hundredths).unwrap_or(u16::MAX))
     }
 }

@@ -2,7 +2,8 @@
 
 use super::protocol::{NEWTON_METRE_PER_LSB, READY, STEPS, id, op};
 use crate::bringup::{Ask, Attempts, Inquiry, Timing};
-use crate::{Decoded, Frame, Mode, NotSent};
+use crate::received::Received;
+use crate::{Frame, Mode, NotSent};
 use proprio_topics::{Counter, Nanos, Refusal};
 
 const TIMING: Timing = Timing::USUAL;
@@ -64,17 +65,16 @@ impl Jr3Scales {
         state: u8,
         scales: [u16; 3],
         mode: Mode,
-        frame: &Frame,
-        out: &mut Decoded,
+        frame: &mut Received<'_>,
     ) {
         if self.open == 0 || (mode == Mode::Supervise && frame.t > self.open_until) {
-            return out.fault(Counter::Unexpected, 1, frame.id);
+            return frame.fault(Counter::Unexpected);
         }
         self.open -= 1;
         if state != READY {
             // The sensor is not connected, and the numbers mean nothing.
             self.attempts.slow_down(frame.t);
-            return out.fault(Counter::DeviceFault, 1, frame.id);
+            return frame.fault(Counter::DeviceFault);
         }
         let (told, first) = match self.asked {
             Question::Forces => (&mut self.forces, 0),
@@ -83,7 +83,7 @@ impl Jr3Scales {
         };
         let differs = told.is_some_and(|known| known != scales);
         if differs {
-            out.fault(Counter::Changed, 1, frame.id);
+            frame.fault(Counter::Changed);
         }
         if self.settled || self.refusal == Some(Refusal::Changed) {
             return;

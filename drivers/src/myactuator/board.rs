@@ -21,9 +21,9 @@ struct MyactuatorBoard {
 }
 
 impl MyactuatorBoard {
-    fn frame(&self, answer: Answer) -> Frame {
+    fn send(&self, answer: Answer, out: &mut Frames) {
         let data = answer.pack(self.keys.protocol, self.celsius);
-        Frame::new(self.keys.answers(), &data)
+        board::send(self.keys.answers(), &data, out);
     }
 
     #[allow(clippy::cast_possible_truncation)] // limited, or within a turn
@@ -38,18 +38,9 @@ impl MyactuatorBoard {
             ..
         } = self.keys;
         let JointState {
-            position,
-            velocity,
-            torque,
-            current,
-            ..
+            position, velocity, ..
         } = self.joint;
-        let current = if current.is_nan() {
-            torque / torque_constant
-        } else {
-            current
-        };
-        let current = current / ampere_per_step;
+        let current = board::current(&self.joint, Some(torque_constant)) / ampere_per_step;
         let place = match protocol {
             MyactuatorProtocol::V3 => i64::from(quantise_i16(position, place_step)),
             MyactuatorProtocol::V2 => {
@@ -83,50 +74,11 @@ impl MyactuatorBoard {
     }
 
     #[allow(clippy::cast_possible_truncation)] // an address is a byte
-    fn motion(&self) -> Frame {
+    fn send_motion(&self, out: &mut Frames) {
         let raw = mit::raw(self.keys.scales, &self.joint);
         let [p0, p1, v0, both, t1] = mit::pack(raw);
         let data = [self.keys.address as u8, p0, p1, v0, both, t1, 0, 0];
-        Frame::new(self.keys.motion(), &data)
-    }
-
-    /// Takes a reading; whether the errors are new, and whether it is one that is sent at once.
-    #[allow(clippy::cast_possible_truncation)] // limited or masked
-    fn take(
-        &mut self,
-        output: u8,
-        reading: &Reading,
-        quality: Quality,
-    ) -> Result<(bool, bool), EncodeError> {
-        let errors = self.errors;
-        let mut sent = false;
-        match (output, reading) {
-            (JOINT, Reading::Joint(joint)) => {
-                board::finite(&[joint.position, joint.velocity])?;
-                board::finite_or_absent(&[joint.torque, joint.current])?;
-                self.joint = *joint;
-                let carried = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
-                if self.keys.quality(errors).0 != quality.0 & carried.0 {
-                    let set = |flag, error| if quality.contains(flag) { error } else { 0 };
-                    // V2 has no error of the encoder.
-                    let sensor = match self.keys.protocol {
-                        MyactuatorProtocol::V3 => ENCODER_ERROR,
-                        MyactuatorProtocol::V2 => ANY_ERROR,
-                    };
-                    self.errors =
-                        set(Quality::DEVICE_FAULT, sensor) | set(Quality::DRIVE_FAULT, ANY_ERROR);
-                }
-                sent = true;
-            }
-            (JOINT, Reading::Actuator(actuator)) => self.errors = actuator.faults as u16,
-            (MOTOR, Reading::Temperature(temperature)) if temperature.celsius.is_finite() => {
-                self.celsius = quantise(temperature.celsius, 1.0, -128, 127) as i8;
-            }
-            (MOTOR, Reading::Temperature(_)) => return Err(EncodeError::NotFinite),
-            (JOINT | MOTOR, _) => return Err(EncodeError::Kind),
-            _ => return Err(EncodeError::Output(output)),
-        }
-        Ok((self.errors != errors, sent))
+        board::send(self.keys.motion(), &data, out);
     }
 }
 
@@ -160,7 +112,7 @@ impl Board for MyactuatorBoard {
             Some(moves) if command::MOVES.contains(moves) => self.state(),
             _ => return,
         };
-        let _ = out.try_push(self.frame(answer));
+        self.send(answer, out);
     }
 
     fn period(&self) -> Option<Nanos> {
@@ -169,10 +121,11 @@ impl Board for MyactuatorBoard {
     }
 
     fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {
-        let _ = self.take(output, reading, quality);
+        let _ = self.encode(output, reading, quality, &mut Frames::new());
     }
 
     /// New errors are sent at once, before a joint reading. The temperature is sent with the next.
+    #[allow(clippy::cast_possible_truncation)] // limited or masked
     fn encode(
         &mut self,
         output: u8,
@@ -180,19 +133,43 @@ impl Board for MyactuatorBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        let (new, sent) = self.take(output, reading, quality)?;
-        let errors = new.then(|| self.frame(Answer::Errors(self.errors)));
-        let joint = match self.keys.position {
-            _ if !sent => [None, None],
-            MyactuatorPosition::Angle => [
-                Some(self.frame(self.state())),
-                Some(self.frame(self.angle())),
-            ],
-            MyactuatorPosition::Status => [Some(self.frame(self.state())), None],
-            MyactuatorPosition::Motion => [Some(self.motion()), None],
-        };
-        for frame in errors.into_iter().chain(joint.into_iter().flatten()) {
-            let _ = out.try_push(frame);
+        let (errors, mut is_measured) = (self.errors, false);
+        match (output, reading) {
+            (JOINT, Reading::Joint(joint)) => {
+                board::finite(&[joint.position, joint.velocity])?;
+                board::finite_or_absent(&[joint.torque, joint.current])?;
+                self.joint = *joint;
+                if board::has_other_faults(quality, self.keys.quality(errors)) {
+                    let set = |flag, error| if quality.contains(flag) { error } else { 0 };
+                    // V2 has no error of the encoder.
+                    let sensor = match self.keys.protocol {
+                        MyactuatorProtocol::V3 => ENCODER_ERROR,
+                        MyactuatorProtocol::V2 => ANY_ERROR,
+                    };
+                    self.errors =
+                        set(Quality::DEVICE_FAULT, sensor) | set(Quality::DRIVE_FAULT, ANY_ERROR);
+                }
+                is_measured = true;
+            }
+            (JOINT, Reading::Actuator(actuator)) => self.errors = actuator.faults as u16,
+            (MOTOR, Reading::Temperature(temperature)) => {
+                board::finite(&[temperature.celsius])?;
+                self.celsius = quantise(temperature.celsius, 1.0, -128, 127) as i8;
+            }
+            (JOINT | MOTOR, _) => return Err(EncodeError::Kind),
+            _ => return Err(EncodeError::Output(output)),
+        }
+        if self.errors != errors {
+            self.send(Answer::Errors(self.errors), out);
+        }
+        match self.keys.position {
+            _ if !is_measured => {}
+            MyactuatorPosition::Angle => {
+                self.send(self.state(), out);
+                self.send(self.angle(), out);
+            }
+            MyactuatorPosition::Status => self.send(self.state(), out),
+            MyactuatorPosition::Motion => self.send_motion(out),
         }
         Ok(())
     }

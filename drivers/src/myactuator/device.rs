@@ -2,13 +2,11 @@
 
 use super::frames::{Answer, JOINT, LENGTH, MOTOR, MotorStatus, MyactuatorProtocol, command};
 use super::options::{MyactuatorKeys, MyactuatorOptions, MyactuatorPosition};
-use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Rounds, Session, Supervised, temperature};
+use crate::bringup::{Bringup, NoInquiry};
+use crate::family::{Family, Rounds, Session, Supervised};
 use crate::held::{HeldValue, OnChange};
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading,
-    bytes, mit,
-};
+use crate::received::Received;
+use crate::{Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, mit};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
@@ -36,9 +34,8 @@ impl MyactuatorMotor {
         &self,
         position: f64,
         saturated: bool,
-        frame: &Frame,
-        session: &mut Session<NoInquiry>,
-        out: &mut Decoded,
+        frame: &mut Received<'_>,
+        session: &mut Session,
     ) {
         let mut quality = self.keys.quality(self.errors);
         if saturated {
@@ -52,16 +49,10 @@ impl MyactuatorMotor {
             current,
             ..JointState::ABSENT
         };
-        session.joint(JOINT, frame, quality, state, out);
+        session.joint(JOINT, frame, quality, state);
     }
 
-    fn state(
-        &mut self,
-        state: MotorStatus,
-        frame: &Frame,
-        session: &mut Session<NoInquiry>,
-        out: &mut Decoded,
-    ) {
+    fn state(&mut self, state: MotorStatus, frame: &mut Received<'_>, session: &mut Session) {
         let MyactuatorKeys {
             speed_step,
             ampere_per_step,
@@ -71,7 +62,7 @@ impl MyactuatorMotor {
         self.velocity = HeldValue::new(frame, f64::from(state.speed) * speed_step);
         self.current = HeldValue::new(frame, f64::from(state.current) * ampere_per_step);
         if self.temperature.is_due((), frame) {
-            temperature(MOTOR, f64::from(state.celsius), frame, out);
+            frame.temperature(MOTOR, f64::from(state.celsius));
         }
         if self.keys.position != MyactuatorPosition::Status {
             return;
@@ -84,10 +75,10 @@ impl MyactuatorMotor {
         };
         let saturated = place || is_end(state.speed) || is_end(state.current);
         let position = f64::from(state.place) * place_step;
-        self.joint(position, saturated, frame, session, out);
+        self.joint(position, saturated, frame, session);
     }
 
-    fn errors(&mut self, errors: u16, frame: &Frame, out: &mut Decoded) {
+    fn errors(&mut self, errors: u16, frame: &mut Received<'_>) {
         self.errors = errors;
         if self.told.is_due(errors, frame) {
             let reading = Reading::Actuator(Actuator {
@@ -97,25 +88,18 @@ impl MyactuatorMotor {
                 faults: u32::from(errors),
             });
             let quality = self.keys.quality(errors);
-            let stamped = StampedReading::new(JOINT, frame, quality, reading);
-            out.push(stamped, frame.id);
+            frame.tell(JOINT, quality, reading);
         }
     }
 
-    fn motion(
-        &self,
-        data: &[u8],
-        frame: &Frame,
-        session: &mut Session<NoInquiry>,
-        out: &mut Decoded,
-    ) {
+    fn motion(&self, data: &[u8], frame: &mut Received<'_>, session: &mut Session) {
         let measured = (data.split_first()).filter(|(id, _)| u16::from(**id) == self.keys.address);
         let Some((raw, _)) = measured.and_then(|(_, measured)| mit::unpack(measured)) else {
-            return out.fault(Counter::Value, 1, frame.id);
+            return frame.fault(Counter::Value);
         };
         let (state, saturated) = mit::measured(self.keys.scales, raw);
         let quality = self.keys.quality(self.errors) | saturated;
-        session.joint(JOINT, frame, quality, state, out);
+        session.joint(JOINT, frame, quality, state);
     }
 }
 
@@ -129,16 +113,12 @@ impl Driver for MyactuatorOptions {
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
         let keys = MyactuatorKeys::new(spec, self)?;
-        let (mode, timing) = match keys.request_period {
-            Some(_) => (spec.mode, Timing::POLLED),
-            None => (Mode::Listen, Timing::LISTENED),
-        };
         let mut claims = [Claim::exclusive(keys.answers())].to_vec();
         if keys.position == MyactuatorPosition::Motion {
             claims.insert(0, Claim::exclusive(keys.motion()));
         }
         let watched = claims.first().map_or(keys.answers(), |claim| claim.id);
-        let bringup = Bringup::new(spec, mode, timing, watched);
+        let bringup = Bringup::polled(spec, keys.request_period, watched);
         let this = MyactuatorMotor {
             keys,
             errors: 0,
@@ -157,31 +137,25 @@ impl Family for MyactuatorMotor {
     type Questions = NoInquiry;
 
     #[allow(clippy::cast_precision_loss)] // an angle of 2^53 steps is none
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         let is_motion =
             self.keys.position == MyactuatorPosition::Motion && frame.id == self.keys.motion();
         if !is_motion && frame.id != self.keys.answers() {
             return;
         }
-        let Some(data) = bytes::payload_of(LENGTH, frame, out) else {
+        let Some(data) = frame.payload_of(LENGTH) else {
             return;
         };
         if is_motion {
-            return self.motion(data, frame, session, out);
+            return self.motion(data, frame, session);
         }
         let asks = session.bringup.mode() == Mode::Supervise;
         match Answer::parse(self.keys.protocol, asks, data) {
-            Some(Answer::State(state)) => self.state(state, frame, session, out),
+            Some(Answer::State(state)) => self.state(state, frame, session),
             Some(Answer::Angle(angle)) if self.keys.position == MyactuatorPosition::Angle => {
-                self.joint(
-                    angle as f64 * self.keys.angle_step,
-                    false,
-                    frame,
-                    session,
-                    out,
-                );
+                self.joint(angle as f64 * self.keys.angle_step, false, frame, session);
             }
-            Some(Answer::Errors(errors)) => self.errors(errors, frame, out),
+            Some(Answer::Errors(errors)) => self.errors(errors, frame),
             // Answers to other programs.
             Some(Answer::Angle(_)) | None => {}
         }
@@ -194,12 +168,7 @@ impl Family for MyactuatorMotor {
         (self.velocity, self.current) = (HeldValue::ABSENT, HeldValue::ABSENT);
     }
 
-    fn request(
-        &mut self,
-        now: Nanos,
-        _session: &mut Session<NoInquiry>,
-        _out: &mut Decoded,
-    ) -> Option<Frame> {
+    fn request(&mut self, now: Nanos, _session: &mut Session, _out: &mut Decoded) -> Option<Frame> {
         let round: &[u8] = match self.keys.position {
             MyactuatorPosition::Angle => &[command::STATE, command::ANGLE],
             MyactuatorPosition::Status | MyactuatorPosition::Motion => &[command::STATE],

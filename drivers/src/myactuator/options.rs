@@ -2,8 +2,8 @@
 
 use super::frames::{ANSWERS, COMMANDS, ENCODER_ERROR, MOTION, MyactuatorProtocol};
 use crate::family::quality_of;
-use crate::keys::{above_zero, address, duration};
-use crate::mit::Scale;
+use crate::keys::{above_zero, address, duration, stated, stated_duration, within};
+use crate::mit::{self, Scale};
 use crate::{Id, Spec, SpecError};
 use core::f64::consts::TAU;
 use proprio_topics::{Nanos, Quality};
@@ -101,26 +101,14 @@ impl MyactuatorKeys {
         let address = address(spec, 1..=32)?;
         let (protocol, position) = (options.protocol, options.position);
         if position == MyactuatorPosition::Motion && protocol == MyactuatorProtocol::V2 {
-            return Err(SpecError::Keys {
-                key: "position",
-                expected: "\"angle\" or \"status\" with protocol = \"v2\"",
-            });
+            let expected = "\"angle\" or \"status\" with protocol = \"v2\"";
+            return Err(SpecError::keys("position", expected));
         }
         if position == MyactuatorPosition::Motion && options.request_period_ms.is_some() {
-            return Err(SpecError::Keys {
-                key: "request_period_ms",
-                expected: "left out with position = \"motion\": what asks for it is a command",
-            });
+            let expected = "left out with position = \"motion\": what asks for it is a command";
+            return Err(SpecError::keys("request_period_ms", expected));
         }
-        if !(12..=16).contains(&options.encoder_bits) {
-            return Err(SpecError::Key {
-                key: "encoder_bits",
-                value: f64::from(options.encoder_bits),
-                expected: "12 to 16",
-            });
-        }
-        let stated =
-            |key, given: Option<f64>| given.map(|value| above_zero(key, value)).transpose();
+        let encoder_bits = within("encoder_bits", options.encoder_bits, 12..=16, "12 to 16")?;
         let ampere = stated("ampere_per_step", options.ampere_per_step)?;
         let ratio = above_zero("gear_ratio", options.gear_ratio)?;
         Ok(Self {
@@ -130,7 +118,7 @@ impl MyactuatorKeys {
             angle_step: 0.01 * DEGREE / ratio,
             place_step: match protocol {
                 MyactuatorProtocol::V3 => DEGREE / ratio,
-                MyactuatorProtocol::V2 => TAU / f64::from(1 << options.encoder_bits) / ratio,
+                MyactuatorProtocol::V2 => TAU / f64::from(1 << encoder_bits) / ratio,
             },
             speed_step: DEGREE / ratio,
             ampere_per_step: match (ampere, protocol) {
@@ -138,18 +126,16 @@ impl MyactuatorKeys {
                 (None, MyactuatorProtocol::V3) => 0.01,
                 (None, MyactuatorProtocol::V2) => f64::NAN,
             },
-            encoder_bits: options.encoder_bits,
+            encoder_bits,
             torque_constant: stated("torque_constant", options.torque_constant)?
                 .unwrap_or(f64::NAN),
-            scales: [
-                Scale::range(above_zero("position_max", options.position_max)?, 16),
-                Scale::range(above_zero("velocity_max", options.velocity_max)?, 12),
-                Scale::range(above_zero("torque_max", options.torque_max)?, 12),
-            ],
+            scales: mit::scales([
+                above_zero("position_max", options.position_max)?,
+                above_zero("velocity_max", options.velocity_max)?,
+                above_zero("torque_max", options.torque_max)?,
+            ]),
             hold: duration("hold_ms", options.hold_ms)?,
-            request_period: (options.request_period_ms)
-                .map(|ms| duration("request_period_ms", ms))
-                .transpose()?,
+            request_period: stated_duration("request_period_ms", options.request_period_ms)?,
             period: duration("period_ms", options.period_ms)?,
         })
     }

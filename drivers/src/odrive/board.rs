@@ -5,7 +5,6 @@ use super::frames::{FET, JOINT, MOTOR, command, is_request};
 use super::options::{OdriveKeys, OdriveOptions};
 use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board};
 use alloc::boxed::Box;
-use arrayvec::ArrayVec;
 use core::f64::consts::TAU;
 use proprio_topics::{Nanos, Quality, Reading};
 
@@ -29,9 +28,9 @@ struct OdriveBoard {
 }
 
 impl OdriveBoard {
-    /// The frame of `command` with the present values.
+    /// Sends the message `command` with the present values.
     #[allow(clippy::cast_possible_truncation)] // the protocol has single precision
-    fn frame(&self, command: u8) -> Frame {
+    fn send(&self, command: u8, out: &mut Frames) {
         let floats = |[a, b]: [f64; 2]| {
             let ([a, b, c, d], [e, f, g, h]) = ((a as f32).to_le_bytes(), (b as f32).to_le_bytes());
             [a, b, c, d, e, f, g, h]
@@ -44,7 +43,7 @@ impl OdriveBoard {
             command::VERSION => VERSION,
             _ => self.heartbeat(),
         };
-        Frame::new(self.keys.id(command), &data)
+        board::send(self.keys.id(command), &data, out);
     }
 
     fn heartbeat(&self) -> [u8; 8] {
@@ -54,65 +53,6 @@ impl OdriveBoard {
         };
         let [a, b, c, d] = self.errors.to_le_bytes();
         [a, b, c, d, self.state, motor, encoder, controller]
-    }
-
-    /// Takes a reading; gives the messages that tell of it.
-    #[allow(clippy::cast_possible_truncation)] // the state is a byte on the wire
-    fn take(
-        &mut self,
-        output: u8,
-        reading: &Reading,
-        quality: Quality,
-    ) -> Result<ArrayVec<u8, 4>, EncodeError> {
-        let firmware = self.keys.firmware;
-        let mut messages = ArrayVec::new();
-        match (output, reading) {
-            (JOINT, Reading::Joint(joint)) => {
-                board::finite(&[joint.position])?;
-                let carried = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
-                if firmware.quality(self.errors).0 != quality.0 & carried.0 {
-                    let (encoder, drive) = match firmware {
-                        Firmware::V0_6 => (error::MISSING_ESTIMATE, error::ESTOP_0_6),
-                        Firmware::V0_5 => (error::ENCODER_FAILED, error::ESTOP_0_5),
-                    };
-                    let set = |flag, error| if quality.contains(flag) { error } else { 0 };
-                    self.errors =
-                        set(Quality::DEVICE_FAULT, encoder) | set(Quality::DRIVE_FAULT, drive);
-                    messages.push(command::HEARTBEAT);
-                }
-                self.estimates = [joint.position / TAU, joint.velocity / TAU];
-                self.torque = joint.torque;
-                self.current = match self.keys.torque_constant {
-                    Some(constant) if joint.current.is_nan() => joint.torque / constant,
-                    _ => joint.current,
-                };
-                if self.current.is_finite() {
-                    messages.push(command::IQ);
-                }
-                let derived = self.keys.torque_constant.is_some() || firmware == Firmware::V0_5;
-                if self.torque.is_finite() && !derived {
-                    messages.push(command::TORQUES);
-                }
-                messages.push(command::ESTIMATES);
-            }
-            (JOINT, Reading::Actuator(actuator)) => {
-                self.errors = actuator.faults;
-                self.state = actuator.mode as u8;
-                messages.push(command::HEARTBEAT);
-            }
-            (MOTOR | FET, Reading::Temperature(temperature)) if firmware == Firmware::V0_6 => {
-                let [fet, motor] = &mut self.temperatures;
-                *(if output == MOTOR { motor } else { fet }) = temperature.celsius;
-                self.fresh |= output;
-                if self.fresh == MOTOR | FET {
-                    self.fresh = 0;
-                    messages.push(command::TEMPERATURE);
-                }
-            }
-            (JOINT..=FET, _) => return Err(EncodeError::Kind),
-            _ => return Err(EncodeError::Output(output)),
-        }
-        Ok(messages)
     }
 }
 
@@ -138,10 +78,10 @@ impl Board for OdriveBoard {
             return;
         }
         if let Some(command) = self.keys.command(frame.id) {
-            let _ = out.try_push(self.frame(command));
+            self.send(command, out);
         } else if frame.id == self.keys.id(command::VERSION) && self.keys.firmware == Firmware::V0_6
         {
-            let _ = out.try_push(self.frame(command::VERSION));
+            self.send(command::VERSION, out);
         }
     }
 
@@ -151,11 +91,12 @@ impl Board for OdriveBoard {
     }
 
     fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {
-        let _ = self.take(output, reading, quality);
+        let _ = self.encode(output, reading, quality, &mut Frames::new());
     }
 
     /// If the faults differ from the last heartbeat, one precedes the joint reading. Both
     /// temperatures are sent once both are new.
+    #[allow(clippy::cast_possible_truncation)] // the state is a byte on the wire
     fn encode(
         &mut self,
         output: u8,
@@ -163,8 +104,48 @@ impl Board for OdriveBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        for command in self.take(output, reading, quality)? {
-            let _ = out.try_push(self.frame(command));
+        let firmware = self.keys.firmware;
+        match (output, reading) {
+            (JOINT, Reading::Joint(joint)) => {
+                board::finite(&[joint.position])?;
+                if board::has_other_faults(quality, firmware.quality(self.errors)) {
+                    let (encoder, drive) = match firmware {
+                        Firmware::V0_6 => (error::MISSING_ESTIMATE, error::ESTOP_0_6),
+                        Firmware::V0_5 => (error::ENCODER_FAILED, error::ESTOP_0_5),
+                    };
+                    let set = |flag, error| if quality.contains(flag) { error } else { 0 };
+                    self.errors =
+                        set(Quality::DEVICE_FAULT, encoder) | set(Quality::DRIVE_FAULT, drive);
+                    self.send(command::HEARTBEAT, out);
+                }
+                self.estimates = [joint.position / TAU, joint.velocity / TAU];
+                self.torque = joint.torque;
+                self.current = board::current(joint, self.keys.torque_constant);
+                if self.current.is_finite() {
+                    self.send(command::IQ, out);
+                }
+                let derived = self.keys.torque_constant.is_some() || firmware == Firmware::V0_5;
+                if self.torque.is_finite() && !derived {
+                    self.send(command::TORQUES, out);
+                }
+                self.send(command::ESTIMATES, out);
+            }
+            (JOINT, Reading::Actuator(actuator)) => {
+                self.errors = actuator.faults;
+                self.state = actuator.mode as u8;
+                self.send(command::HEARTBEAT, out);
+            }
+            (MOTOR | FET, Reading::Temperature(temperature)) if firmware == Firmware::V0_6 => {
+                let [fet, motor] = &mut self.temperatures;
+                *(if output == MOTOR { motor } else { fet }) = temperature.celsius;
+                self.fresh |= output;
+                if self.fresh == MOTOR | FET {
+                    self.fresh = 0;
+                    self.send(command::TEMPERATURE, out);
+                }
+            }
+            (JOINT..=FET, _) => return Err(EncodeError::Kind),
+            _ => return Err(EncodeError::Output(output)),
         }
         Ok(())
     }

@@ -4,11 +4,10 @@ use super::firmware::{Firmware, error};
 use super::frames::{FET, JOINT, LENGTH, MOTOR, command, is_request};
 use super::options::{OdriveKeys, OdriveOptions};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Rounds, Session, Supervised, temperature};
+use crate::family::{Family, Rounds, Session, Supervised};
 use crate::held::HeldValue;
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading, bytes,
-};
+use crate::received::Received;
+use crate::{Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, bytes};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use core::f64::consts::TAU;
@@ -31,16 +30,10 @@ pub(super) struct OdriveAxis {
 }
 
 impl OdriveAxis {
-    fn estimates(
-        &self,
-        data: &[u8],
-        frame: &Frame,
-        session: &mut Session<NoInquiry>,
-        out: &mut Decoded,
-    ) {
+    fn estimates(&self, data: &[u8], frame: &mut Received<'_>, session: &mut Session) {
         let (position, velocity) = (float(data, 0) * TAU, float(data, 1) * TAU);
         if !position.is_finite() {
-            return session.lost(Counter::Value, 1, frame, out);
+            return session.lost(Counter::Value, 1, frame);
         }
         let current = self.current.at(frame, self.keys.hold);
         let torque = match self.keys.torque_constant {
@@ -58,10 +51,10 @@ impl OdriveAxis {
             current,
             ..JointState::ABSENT
         };
-        session.joint(JOINT, frame, self.status, state, out);
+        session.joint(JOINT, frame, self.status, state);
     }
 
-    fn heartbeat(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn heartbeat(&mut self, data: &[u8], frame: &mut Received<'_>) {
         let &[_, _, _, _, state, ref flags @ ..] = data else {
             return;
         };
@@ -78,8 +71,7 @@ impl OdriveAxis {
             encoder: faults & self.keys.firmware.encoder_errors(),
             faults,
         });
-        let stamped = StampedReading::new(JOINT, frame, self.status, reading);
-        out.push(stamped, frame.id);
+        frame.tell(JOINT, self.status, reading);
     }
 }
 
@@ -120,25 +112,25 @@ impl Driver for OdriveOptions {
 impl Family for OdriveAxis {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         let Some(command) = self.keys.command(frame.id) else {
             return;
         };
         if is_request(frame) {
             return;
         }
-        let Some(data) = bytes::payload_of(usize::from(LENGTH), frame, out) else {
+        let Some(data) = frame.payload_of(usize::from(LENGTH)) else {
             return;
         };
         match command {
-            command::ESTIMATES => self.estimates(data, frame, session, out),
+            command::ESTIMATES => self.estimates(data, frame, session),
             command::IQ => self.current = HeldValue::new(frame, float(data, 1)),
             command::TORQUES => self.torque = HeldValue::new(frame, float(data, 1)),
             command::TEMPERATURE => {
-                temperature(FET, float(data, 0), frame, out);
-                temperature(MOTOR, float(data, 1), frame, out);
+                frame.temperature(FET, float(data, 0));
+                frame.temperature(MOTOR, float(data, 1));
             }
-            _ => self.heartbeat(data, frame, out),
+            _ => self.heartbeat(data, frame),
         }
     }
 
@@ -147,12 +139,7 @@ impl Family for OdriveAxis {
         (self.current, self.torque) = (HeldValue::ABSENT, HeldValue::ABSENT);
     }
 
-    fn request(
-        &mut self,
-        now: Nanos,
-        _session: &mut Session<NoInquiry>,
-        _out: &mut Decoded,
-    ) -> Option<Frame> {
+    fn request(&mut self, now: Nanos, _session: &mut Session, _out: &mut Decoded) -> Option<Frame> {
         let command = self.requests.ask(self.keys.firmware.requests(), now)?;
         Some(Frame::remote(self.keys.id(command), LENGTH))
     }

@@ -2,7 +2,7 @@
 
 use super::firmware::Firmware;
 use super::frames::NODE_MOST;
-use crate::keys::{above_zero, address, duration};
+use crate::keys::{address, duration, stated, stated_duration};
 use crate::{Id, Spec, SpecError};
 use proprio_topics::Nanos;
 use serde::Deserialize;
@@ -50,18 +50,12 @@ pub(super) struct OdriveKeys {
 impl OdriveKeys {
     pub(super) fn new(spec: &Spec, options: &OdriveOptions) -> Result<Self, SpecError> {
         let node = address(spec, 0..=NODE_MOST)?;
-        let torque_constant = (options.torque_constant)
-            .map(|constant| above_zero("torque_constant", constant))
-            .transpose()?;
-        let request = options.request_period_ms;
         Ok(Self {
             node,
             firmware: options.firmware,
-            torque_constant,
+            torque_constant: stated("torque_constant", options.torque_constant)?,
             hold: duration("hold_ms", options.hold_ms)?,
-            request_period: request
-                .map(|ms| duration("request_period_ms", ms))
-                .transpose()?,
+            request_period: stated_duration("request_period_ms", options.request_period_ms)?,
             period: duration("period_ms", options.period_ms)?,
         })
     }

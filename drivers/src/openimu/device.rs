@@ -10,9 +10,8 @@ use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Session, Supervised};
 use crate::group::FrameGroup;
 use crate::pairing::Limit;
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, OutputInfo, Spec, SpecError, StampedReading, bytes,
-};
+use crate::received::Received;
+use crate::{Claim, Device, Driver, OutputInfo, Spec, SpecError, StampedReading, bytes};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Saturation};
@@ -143,7 +142,7 @@ impl Driver for OpenImuOptions {
 impl Family for OpenImuSensor {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         let Some((pgn, source)) = group_and_source(frame.id) else {
             return;
         };
@@ -152,25 +151,22 @@ impl Family for OpenImuSensor {
         let Some((position, &quantity)) = found.filter(|_| source == self.plan.address) else {
             return;
         };
-        let data = bytes::payload_of(8, frame, out);
+        let data = frame.payload_of(8);
         let Some(data) = data.and_then(|data| data.first_chunk::<8>()) else {
             return;
         };
         let Some(part) = OpenImuSample::of(&self.plan, quantity, data) else {
-            return out.fault(Counter::Value, 1, frame.id);
+            return frame.fault(Counter::Value);
         };
         let mut dropped = 0;
         let add = |sample: &mut OpenImuSample| sample.add(quantity, part);
         let whole = (self.group).push(position, frame, OpenImuSample::EMPTY, add, &mut dropped);
-        session.lost(Counter::Unpaired, dropped, frame, out);
+        session.lost(Counter::Unpaired, dropped, frame);
         let Some(whole) = whole else { return };
         let OpenImuSample { imu, quality } = whole.content;
-        let stamped = StampedReading {
-            acquired: whole.acquired,
-            stamp: whole.stamp,
-            ..StampedReading::new(0, frame, quality, Reading::Imu(imu))
-        };
-        session.add(stamped, frame, out);
+        let stamped = StampedReading::new(0, frame, quality, Reading::Imu(imu))
+            .at(whole.acquired, whole.stamp);
+        session.add(stamped, frame);
     }
 
     fn reset(&mut self) {

@@ -23,7 +23,7 @@ pub(super) const ANY_PRIORITY: u32 = 0b111 << 26;
 /// The host's source address: that of a service tool. Sensors do not look at it.
 pub(super) const HOST: u8 = 0xF9;
 /// The addresses of sensors, and that of delivery.
-pub(super) const ADDRESSES: core::ops::RangeInclusive<u32> = 0x80..=0xF7;
+pub(super) const ADDRESSES: core::ops::RangeInclusive<u8> = 0x80..=0xF7;
 pub(super) const DELIVERED: u32 = 0x80;
 /// The period with divider 1 \[ms\].
 pub(super) const BASE_PERIOD_MS: u8 = 10;

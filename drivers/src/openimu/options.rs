@@ -3,7 +3,7 @@
 use super::frames::{
     ADDRESSES, AxisOrder, BASE_PERIOD_MS, DIVIDERS, OpenImuQuantity, Upright, identifier,
 };
-use crate::{Id, Spec, SpecError};
+use crate::{Id, Spec, SpecError, keys};
 use alloc::vec::Vec;
 use serde::Deserialize;
 
@@ -50,13 +50,7 @@ pub(super) struct OpenImuKeys {
 
 impl OpenImuKeys {
     pub(super) fn new(spec: &Spec, options: &OpenImuOptions) -> Result<Self, SpecError> {
-        let wrong_address = SpecError::Address {
-            address: spec.address,
-            least: *ADDRESSES.start(),
-            most: *ADDRESSES.end(),
-        };
-        let address = u8::try_from(spec.address).ok();
-        let address = address.filter(|_| ADDRESSES.contains(&spec.address));
+        let address = keys::address(spec, ADDRESSES)?;
         let mut dividers = DIVIDERS.into_iter();
         let period = options.period_ms;
         let divider = dividers.find(|by| u32::from(*by) * u32::from(BASE_PERIOD_MS) == period);
@@ -65,19 +59,17 @@ impl OpenImuKeys {
             .filter(|quantity| options.quantities.contains(quantity))
             .collect();
         if quantities.is_empty() {
-            return Err(SpecError::Keys {
-                key: "quantities",
-                expected: "a list with at least one quantity",
-            });
+            let expected = "a list with at least one quantity";
+            return Err(SpecError::keys("quantities", expected));
         }
         Ok(Self {
-            address: address.ok_or(wrong_address)?,
+            address,
             quantities,
-            divider: divider.ok_or(SpecError::Key {
-                key: "period_ms",
-                value: f64::from(period),
-                expected: "10, 20, 40, 50, 100, 200, 250 or 500",
-            })?,
+            divider: divider.ok_or(SpecError::key(
+                "period_ms",
+                period,
+                "10, 20, 40, 50, 100, 200, 250 or 500",
+            ))?,
             axes: options.axes,
             upright: options.acceleration_z,
         })

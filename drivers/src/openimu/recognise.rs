@@ -16,10 +16,9 @@ impl Recognise for OpenImuOptions {
     }
 }
 
-/// The sensor at `address`, if `seen` shows it. One group alone may be that of a tilt sensor of
+/// The sensor at `source`, if `seen` shows it. One group alone may be that of a tilt sensor of
 /// another maker.
-fn sensor(seen: &Traffic, address: u32) -> Option<Finding> {
-    let source = u8::try_from(address).ok()?;
+fn sensor(seen: &Traffic, source: u8) -> Option<Finding> {
     let mut evidence = Evidence::new(seen, ADDRESSES.count());
     let mut quantities: Vec<&str> = Vec::new();
     let mut measured = None;
@@ -38,7 +37,7 @@ fn sensor(seen: &Traffic, address: u32) -> Option<Finding> {
         return None;
     }
     let what = "Aceinna OpenIMU or MTLT (J1939)";
-    let finding = evidence.finding(OpenImuOptions::NAME, address, what)?;
+    let finding = evidence.finding(OpenImuOptions::NAME, source.into(), what)?;
     let words: String = format!("{quantities:?}");
     let mut keys = Vec::from([Key::new("quantities", words)]);
     let is_near = |divider: &&u8| {

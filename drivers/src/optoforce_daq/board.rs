@@ -67,7 +67,7 @@ impl Board for OptoBoard {
         self.zero = [0; 3];
         let [a, b, c, d] = ANSWER;
         let [high, low] = sum(&ANSWER).to_be_bytes();
-        let _ = out.try_push(Frame::new(self.ids.data, &[a, b, c, d, 0, high, low]));
+        board::send(self.ids.data, &[a, b, c, d, 0, high, low], out);
     }
 
     fn period(&self) -> Option<Nanos> {
@@ -114,7 +114,7 @@ impl Board for OptoBoard {
             .wrapping_add(sum(&[a, b, c, d, e, f]))
             .to_be_bytes();
         for data in [first, [a, b, c, d, e, f, high, low]] {
-            let _ = out.try_push(Frame::new(self.ids.data, &data));
+            board::send(self.ids.data, &data, out);
         }
         Ok(())
     }

@@ -7,10 +7,11 @@ use super::protocol::{
 };
 use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Session, Supervised};
+use crate::received::Received;
 use crate::wrench::{self, NewZero};
 use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, Mode, NotSent, OutputInfo, Spec, SpecError,
-    StampedReading, bytes,
+    Claim, Device, Driver, Frame, Id, Mode, NotSent, OutputInfo, Spec, SpecError, StampedReading,
+    bytes,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -54,17 +55,17 @@ pub(super) struct Opto {
 
 impl Opto {
     /// Takes a frame that is not half a packet.
-    fn answer(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn answer(&mut self, data: &[u8], frame: &mut Received<'_>) {
         let Some((&[a, b, c, d, error], _)) = data.split_first_chunk() else {
-            return out.fault(Counter::Length, 1, frame.id);
+            return frame.fault(Counter::Length);
         };
         if data.len() != 7 {
-            out.fault(Counter::Length, 1, frame.id);
+            frame.fault(Counter::Length);
         } else if [a, b, c, d] != ANSWER
             || sum(&[a, b, c, d, error]) != bytes::u16_be(data, 5)
             || error != 0
         {
-            out.fault(Counter::Value, 1, frame.id);
+            frame.fault(Counter::Value);
         } else {
             self.zero.confirm(frame.t);
         }
@@ -75,9 +76,8 @@ impl Opto {
         &mut self,
         halves: [[u8; 8]; 2],
         first: (Nanos, StampKind),
-        frame: &Frame,
-        session: &mut Session<NoInquiry>,
-        out: &mut Decoded,
+        frame: &mut Received<'_>,
+        session: &mut Session,
     ) {
         let [[_, _, _, _, c0, c1, s0, s1], [a, b, c, d, e, f, _, _]] = halves;
         let counter = u16::from_be_bytes([c0, c1]);
@@ -91,7 +91,7 @@ impl Opto {
                     session.bringup.lost();
                     // A large step is a unit that was started again.
                     if step <= u16::MAX / 2 {
-                        out.fault(Counter::Lost, u32::from(step) - 1, frame.id);
+                        frame.faults(Counter::Lost, u32::from(step) - 1);
                     }
                 }
             }
@@ -119,7 +119,7 @@ impl Opto {
             device_counter: u32::from(counter),
             ..StampedReading::new(0, frame, quality, Reading::Wrench(Wrench { force, torque }))
         };
-        session.add(stamped, frame, out);
+        session.add(stamped, frame);
     }
 }
 
@@ -168,21 +168,21 @@ impl Driver for OptoforceDaqOptions {
 impl Family for Opto {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         if frame.id != self.ids.data {
             return;
         }
-        let Some(data) = bytes::payload(frame, out) else {
+        let Some(data) = frame.payload() else {
             return;
         };
         let Ok(half) = <[u8; 8]>::try_from(data) else {
-            return self.answer(data, frame, out);
+            return self.answer(data, frame);
         };
         let waiting = self.waiting.take();
         if let Some((t, stamp, first)) = waiting {
             let before = sum(&first).wrapping_add(sum(half.get(..6).unwrap_or(&half)));
             if before == bytes::u16_be(&half, 6) {
-                return self.packet([first, half], (t, stamp), frame, session, out);
+                return self.packet([first, half], (t, stamp), frame, session);
             }
         }
         let begins = half.starts_with(&PACKET);
@@ -191,11 +191,11 @@ impl Family for Opto {
         }
         match (waiting, begins) {
             // The second frame is missing.
-            (Some(_), true) => out.fault(Counter::Unpaired, 1, frame.id),
+            (Some(_), true) => frame.fault(Counter::Unpaired),
             // The checksum is wrong.
-            (Some(_), false) => out.fault(Counter::Value, 1, frame.id),
+            (Some(_), false) => frame.fault(Counter::Value),
             // The first frame is missing.
-            (None, false) if self.joined => out.fault(Counter::Unpaired, 1, frame.id),
+            (None, false) if self.joined => frame.fault(Counter::Unpaired),
             (None, _) => {
                 self.joined |= begins;
                 return;

@@ -42,14 +42,10 @@ impl OptoforceDaqOptions {
         let key = "counts_per_newton";
         let expected = "three numbers above 0, from the sensor's sensitivity report";
         let Some(counts) = self.counts_per_newton else {
-            return Err(SpecError::Keys { key, expected });
+            return Err(SpecError::keys(key, expected));
         };
         match counts.iter().find(|n| !(n.is_finite() && **n > 0.0)) {
-            Some(&value) => Err(SpecError::Key {
-                key,
-                value,
-                expected,
-            }),
+            Some(&value) => Err(SpecError::key(key, value, expected)),
             None => Ok(counts),
         }
     }
@@ -65,18 +61,15 @@ impl OptoforceDaqOptions {
             return Err(SpecError::Incomplete { given, missing });
         };
         let speed = RATES.iter().find(|(hz, _)| *hz == rate);
-        let &(_, speed) = speed.ok_or(SpecError::Key {
-            key: "rate_hz",
-            value: f64::from(rate),
-            expected: "10, 30, 100, 333 or 1000",
-        })?;
+        let &(_, speed) =
+            speed.ok_or(SpecError::key("rate_hz", rate, "10, 30, 100, 333 or 1000"))?;
         let value = self.filter_hz.unwrap_or(DEFAULT_FILTER);
         let filter = (0..).zip(FILTERS).find(|(_, hz)| *hz == value);
-        let (filter, _) = filter.ok_or(SpecError::Key {
-            key: "filter_hz",
+        let (filter, _) = filter.ok_or(SpecError::key(
+            "filter_hz",
             value,
-            expected: "0, 1.5, 5, 15, 50, 150 or 500",
-        })?;
+            "0, 1.5, 5, 15, 50, 150 or 500",
+        ))?;
         let zero = match self.zero {
             Some(true) => ZERO_HERE,
             _ => ZERO_OWN,
@@ -96,10 +89,8 @@ impl OptoforceDaqOptions {
             config: keys::id("id_config", self.id_config, 0..=0x7FF, expected)?,
         };
         if ids.data == ids.config {
-            return Err(SpecError::Keys {
-                key: "id_config",
-                expected: "another identifier than address",
-            });
+            let expected = "another identifier than address";
+            return Err(SpecError::keys("id_config", expected));
         }
         Ok(ids)
     }

@@ -98,6 +98,17 @@ impl Stream {
         self.heads.iter().chain(&self.recent)
     }
 
+    /// The first bytes of its frames, each once: the numbers of its senders, for example.
+    pub(crate) fn first_bytes(&self) -> Vec<u8> {
+        let mut found = Vec::new();
+        for first in self.kept().filter_map(|frame| frame.data().first()) {
+            if !found.contains(first) {
+                found.push(*first);
+            }
+        }
+        found
+    }
+
     /// The newest frames, at most 48, in their order.
     pub fn recent(&self) -> impl DoubleEndedIterator<Item = &Frame> {
         self.recent.iter()

@@ -46,14 +46,14 @@ impl RftBoard {
             *to = from;
         }
         let (first, second) = bytes.split_at(8);
-        let _ = out.try_push(Frame::new(self.ids.first, first));
-        let _ = out.try_push(Frame::new(self.ids.second, second));
+        board::send(self.ids.first, first, out);
+        board::send(self.ids.second, second, out);
     }
 
     fn answer(&self, bytes: [u8; 3], out: &mut Frames) {
         let [a, b, c] = bytes;
-        let _ = out.try_push(Frame::new(self.ids.first, &[a, b, c, 0, 0, 0, 0, 0]));
-        let _ = out.try_push(Frame::new(self.ids.second, &[0; 8]));
+        board::send(self.ids.first, &[a, b, c, 0, 0, 0, 0, 0], out);
+        board::send(self.ids.second, &[0; 8], out);
     }
 }
 
@@ -137,7 +137,7 @@ impl Board for RftBoard {
             (self.ids.first, [command::START, a, b, c, d, e, f, g]),
             (self.ids.second, [h, i, j, k, l, overload, 0, 0]),
         ] {
-            let _ = out.try_push(Frame::new(id, &data));
+            board::send(id, &data, out);
         }
         Ok(())
     }

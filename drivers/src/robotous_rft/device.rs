@@ -6,10 +6,11 @@ use super::protocol::{DEFAULT_RATE, OVERLOAD_FX, RftIds, SET, command, period, s
 use crate::bringup::{Ask, Attempts, Bringup, Inquiry, Timing};
 use crate::family::{Family, Session, Supervised};
 use crate::pairing::{HalfOrder, Limit, Paired, Pairing};
+use crate::received::Received;
 use crate::wrench::{self, NewZero, TareCommand};
 use crate::{
     Claim, Command, CommandFailed, CommandOutcome, CommandRefused, Decoded, Device, Driver, Frame,
-    Id, Mode, NotSent, OutputInfo, Spec, SpecError, StampedReading, bytes,
+    Id, Mode, NotSent, OutputInfo, Spec, SpecError, StampedReading,
 };
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -40,16 +41,16 @@ pub(super) struct Rate {
 
 impl Rate {
     /// Takes the sensor's answer, in `frame`.
-    fn answer(&mut self, code: u8, frame: &Frame, out: &mut Decoded) {
+    fn answer(&mut self, code: u8, frame: &mut Received<'_>) {
         if !self.attempts.counts(frame.t) {
-            return out.fault(Counter::Unexpected, 1, frame.id);
+            return frame.fault(Counter::Unexpected);
         }
         self.attempts.again();
         self.step = match code {
             0 if self.code == DEFAULT_RATE => RateStep::Done,
             _ if code == self.code => RateStep::Done,
             _ if self.attempts.exhausted() => {
-                out.fault(Counter::Changed, 1, frame.id);
+                frame.fault(Counter::Changed);
                 RateStep::Done
             }
             _ => RateStep::Set,
@@ -133,20 +134,16 @@ impl Rft {
         &mut self,
         halves: [[u8; 8]; 2],
         first: (Nanos, StampKind),
-        frame: &Frame,
+        frame: &mut Received<'_>,
         session: &mut Session<Rate>,
-        out: &mut Decoded,
     ) {
         let [a, b] = halves;
         let (wrench, mut quality) = self.wrench(a, b);
         quality |= self.zero.mark(frame.t);
         let (acquired, stamp) = first;
-        let stamped = StampedReading {
-            acquired,
-            stamp,
-            ..StampedReading::new(0, frame, quality, Reading::Wrench(wrench))
-        };
-        session.add(stamped, frame, out);
+        let stamped =
+            StampedReading::new(0, frame, quality, Reading::Wrench(wrench)).at(acquired, stamp);
+        session.add(stamped, frame);
     }
 }
 
@@ -185,27 +182,27 @@ impl Driver for RobotousRftOptions {
 impl Family for Rft {
     type Questions = Rate;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<Rate>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session<Rate>) {
         let second = frame.id == self.ids.second;
         if !second && frame.id != self.ids.first {
             return;
         }
-        let data = bytes::payload_of(8, frame, out);
+        let data = frame.payload_of(8);
         let Some(&half) = data.and_then(|data| data.first_chunk()) else {
             return;
         };
         let mut unpaired = 0;
         let paired = self.pairing.push(second, frame, half, &mut unpaired);
-        session.lost(Counter::Unpaired, unpaired, frame, out);
+        session.lost(Counter::Unpaired, unpaired, frame);
         let Paired::With(acquired, stamp, halves) = paired else {
             return;
         };
         match halves[0] {
             [command::START, ..] => {
-                self.add(halves, (acquired, stamp), frame, session, out);
+                self.add(halves, (acquired, stamp), frame, session);
             }
             [command::GET_RATE, code, ..] if session.bringup.mode() == Mode::Supervise => {
-                session.questions.answer(code, frame, out);
+                session.questions.answer(code, frame);
             }
             // Answers to other questions are for other programs.
             _ => {}

@@ -102,20 +102,18 @@ impl RobotousRftOptions {
             second: keys::id("id_second", self.id_second, 1..=255, expected)?,
         };
         if ids.first == ids.second || ids.command == ids.first || ids.command == ids.second {
-            return Err(SpecError::Keys {
-                key: "id_second",
-                expected: "another identifier than id_first, and both others than address",
-            });
+            let expected = "another identifier than id_first, and both others than address";
+            return Err(SpecError::keys("id_second", expected));
         }
         Ok(ids)
     }
 
     pub(super) fn rate_code(&self) -> Result<u8, SpecError> {
         let found = RATES.iter().find(|(hz, _)| *hz == self.rate_hz);
-        found.map(|(_, code)| *code).ok_or(SpecError::Key {
-            key: "rate_hz",
-            value: f64::from(self.rate_hz),
-            expected: "10, 20, 50, 100, 200, 300, 333, 500 or 1000",
-        })
+        found.map(|(_, code)| *code).ok_or(SpecError::key(
+            "rate_hz",
+            self.rate_hz,
+            "10, 20, 50, 100, 200, 300, 333, 500 or 1000",
+        ))
     }
 }

@@ -63,66 +63,11 @@ impl RobstrideBoard {
         }
     }
 
-    /// Takes a reading; gives the frames that tell of it.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // limited or masked
-    fn take(
-        &mut self,
-        output: u8,
-        reading: &Reading,
-        quality: Quality,
-    ) -> Result<[Option<Frame>; 2], EncodeError> {
-        let mut frames = [None; 2];
-        let [first, second] = &mut frames;
-        match (output, reading) {
-            (JOINT, Reading::Joint(joint)) => {
-                board::finite(&[joint.position, joint.velocity])?;
-                board::finite_or_absent(&[joint.torque])?;
-                self.joint = *joint;
-                let carried = Quality::DEVICE_FAULT | Quality::DRIVE_FAULT;
-                let all = u32::from(self.of_state) << OF_STATE | self.faults;
-                if quality_of(all, self.keys.encoder).0 != quality.0 & carried.0 {
-                    let set = |flag, bit: u32| {
-                        if quality.contains(flag) {
-                            bit >> OF_STATE
-                        } else {
-                            0
-                        }
-                    };
-                    let encoder = set(Quality::DEVICE_FAULT, fault::MAGNETIC_ENCODER);
-                    self.of_state =
-                        (encoder | set(Quality::DRIVE_FAULT, fault::OVER_TEMPERATURE)) as u8;
-                    let was = self.faults;
-                    self.faults = 0;
-                    if self.keys.protocol == RobstrideProtocol::Mit {
-                        if quality.contains(Quality::DEVICE_FAULT) {
-                            self.faults |= fault::NOT_CALIBRATED;
-                        }
-                        // Bit 0: too hot.
-                        self.faults |= u32::from(quality.contains(Quality::DRIVE_FAULT));
-                    }
-                    if self.faults != was {
-                        *first = Some(self.told_faults());
-                    }
-                }
-                *second = Some(self.state());
-            }
-            (JOINT, Reading::Actuator(actuator)) => {
-                self.mode = actuator.mode as u8 & 3;
-                self.of_state = (actuator.faults >> OF_STATE) as u8 & 0x3F;
-                let was = self.faults;
-                self.faults = actuator.faults & ((1 << OF_STATE) - 1);
-                if self.faults != was {
-                    *first = Some(self.told_faults());
-                }
-            }
-            (MOTOR, Reading::Temperature(temperature)) if temperature.celsius.is_finite() => {
-                self.tenths = bytes::quantise(temperature.celsius, 0.1, 0, 0xFFFF) as u16;
-            }
-            (MOTOR, Reading::Temperature(_)) => return Err(EncodeError::NotFinite),
-            (JOINT | MOTOR, _) => return Err(EncodeError::Kind),
-            _ => return Err(EncodeError::Output(output)),
+    /// Sets the faults of a frame of their own, and sends it if they are new.
+    fn set_faults(&mut self, faults: u32, out: &mut Frames) {
+        if core::mem::replace(&mut self.faults, faults) != faults {
+            let _ = out.try_push(self.told_faults());
         }
-        Ok(frames)
     }
 }
 
@@ -188,11 +133,12 @@ impl Board for RobstrideBoard {
     }
 
     fn present(&mut self, output: u8, reading: &Reading, quality: Quality) {
-        let _ = self.take(output, reading, quality);
+        let _ = self.encode(output, reading, quality, &mut Frames::new());
     }
 
     /// Faults beyond those of a state precede it in a frame of their own. The temperature is sent
     /// with the next joint reading.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // limited or masked
     fn encode(
         &mut self,
         output: u8,
@@ -200,8 +146,40 @@ impl Board for RobstrideBoard {
         quality: Quality,
         out: &mut Frames,
     ) -> Result<(), EncodeError> {
-        for frame in self.take(output, reading, quality)?.into_iter().flatten() {
-            let _ = out.try_push(frame);
+        match (output, reading) {
+            (JOINT, Reading::Joint(joint)) => {
+                board::finite(&[joint.position, joint.velocity])?;
+                board::finite_or_absent(&[joint.torque])?;
+                self.joint = *joint;
+                let all = u32::from(self.of_state) << OF_STATE | self.faults;
+                if board::has_other_faults(quality, quality_of(all, self.keys.encoder)) {
+                    let set = |flag, bits: u32| if quality.contains(flag) { bits } else { 0 };
+                    let of_state = set(Quality::DEVICE_FAULT, fault::MAGNETIC_ENCODER)
+                        | set(Quality::DRIVE_FAULT, fault::OVER_TEMPERATURE);
+                    self.of_state = (of_state >> OF_STATE) as u8;
+                    let faults = match self.keys.protocol {
+                        RobstrideProtocol::Private => 0,
+                        // Bit 0: too hot.
+                        RobstrideProtocol::Mit => {
+                            set(Quality::DEVICE_FAULT, fault::NOT_CALIBRATED)
+                                | set(Quality::DRIVE_FAULT, 1)
+                        }
+                    };
+                    self.set_faults(faults, out);
+                }
+                let _ = out.try_push(self.state());
+            }
+            (JOINT, Reading::Actuator(actuator)) => {
+                self.mode = actuator.mode as u8 & 3;
+                self.of_state = (actuator.faults >> OF_STATE) as u8 & 0x3F;
+                self.set_faults(actuator.faults & ((1 << OF_STATE) - 1), out);
+            }
+            (MOTOR, Reading::Temperature(temperature)) => {
+                board::finite(&[temperature.celsius])?;
+                self.tenths = bytes::quantise(temperature.celsius, 0.1, 0, 0xFFFF) as u16;
+            }
+            (JOINT | MOTOR, _) => return Err(EncodeError::Kind),
+            _ => return Err(EncodeError::Output(output)),
         }
         Ok(())
     }

@@ -5,13 +5,11 @@ use super::frames::{
     parameter,
 };
 use super::options::{RobstrideKeys, RobstrideOptions, RobstrideProtocol};
-use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::family::{Family, Rounds, Session, Supervised, quality_of, temperature};
+use crate::bringup::{Bringup, NoInquiry};
+use crate::family::{Family, Rounds, Session, Supervised, quality_of};
 use crate::held::{HeldValue, OnChange};
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, Id, Mode, OutputInfo, Spec, SpecError, StampedReading,
-    bytes, mit,
-};
+use crate::received::Received;
+use crate::{Claim, Decoded, Device, Driver, Frame, Id, OutputInfo, Spec, SpecError, mit};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Actuator, Counter, JointState, Kind, Nanos, Quality, Reading};
@@ -32,7 +30,7 @@ pub(super) struct RobstrideMotor {
 
 impl RobstrideMotor {
     /// Tells mode and faults if they are new, and now and then. Returns whether it did.
-    fn tell(&mut self, frame: &Frame, out: &mut Decoded) -> bool {
+    fn tell(&mut self, frame: &mut Received<'_>) -> bool {
         let faults = self.faults | self.of_state;
         let due = self.told.is_due((self.mode, faults), frame);
         if due {
@@ -42,8 +40,7 @@ impl RobstrideMotor {
                 encoder: faults & self.keys.encoder,
                 faults,
             });
-            let stamped = StampedReading::new(JOINT, frame, self.quality(), reading);
-            out.push(stamped, frame.id);
+            frame.tell(JOINT, self.quality(), reading);
         }
         due
     }
@@ -52,13 +49,7 @@ impl RobstrideMotor {
         quality_of(self.faults | self.of_state, self.keys.encoder)
     }
 
-    fn state(
-        &mut self,
-        state: &RobstrideState,
-        frame: &Frame,
-        session: &mut Session<NoInquiry>,
-        out: &mut Decoded,
-    ) {
+    fn state(&mut self, state: &RobstrideState, frame: &mut Received<'_>, session: &mut Session) {
         if let Some((mode, faults)) = state.told {
             self.mode = mode;
             self.of_state = u32::from(faults) << OF_STATE;
@@ -66,22 +57,21 @@ impl RobstrideMotor {
                 self.faults = 0;
             }
         }
-        if self.tell(frame, out) {
-            temperature(MOTOR, f64::from(state.tenths) / 10.0, frame, out);
+        if self.tell(frame) {
+            frame.temperature(MOTOR, f64::from(state.tenths) / 10.0);
         }
         if self.keys.request_period.is_some() {
             return;
         }
         let (state, saturated) = mit::measured(self.keys.scales, state.raw);
-        session.joint(JOINT, frame, self.quality() | saturated, state, out);
+        session.joint(JOINT, frame, self.quality() | saturated, state);
     }
 
     fn parameter(
         &mut self,
         (parameter, value): (u16, f64),
-        frame: &Frame,
-        session: &mut Session<NoInquiry>,
-        out: &mut Decoded,
+        frame: &mut Received<'_>,
+        session: &mut Session,
     ) {
         // Answers to another program.
         let Some(period) = self.keys.request_period else {
@@ -99,15 +89,15 @@ impl RobstrideMotor {
                     current,
                     ..JointState::ABSENT
                 };
-                session.joint(JOINT, frame, self.quality(), state, out);
+                session.joint(JOINT, frame, self.quality(), state);
             }
-            parameter::POSITION => out.fault(Counter::Value, 1, frame.id),
+            parameter::POSITION => frame.fault(Counter::Value),
             _ => {}
         }
     }
 
     /// What `frame` tells.
-    fn message(&self, frame: &Frame, out: &mut Decoded) -> Option<RobstrideMessage> {
+    fn message(&self, frame: &mut Received<'_>) -> Option<RobstrideMessage> {
         let (address, host) = (self.keys.address, self.keys.host);
         let kind = match self.keys.protocol {
             RobstrideProtocol::Private => {
@@ -117,7 +107,7 @@ impl RobstrideMotor {
             RobstrideProtocol::Mit if frame.id == Id::standard(host.into()) => None,
             RobstrideProtocol::Mit => return None,
         };
-        let data = bytes::payload_of(LENGTH, frame, out)?;
+        let data = frame.payload_of(LENGTH)?;
         let [_, _, upper, _] = frame.id.raw().to_le_bytes();
         match kind {
             Some(kind) => Some(RobstrideMessage::of_private(kind, upper, data)),
@@ -136,10 +126,6 @@ impl Driver for RobstrideOptions {
 
     fn device(&self, spec: &Spec) -> Result<Box<dyn Device>, SpecError> {
         let keys = RobstrideKeys::new(spec, self)?;
-        let (mode, timing) = match keys.request_period {
-            Some(_) => (spec.mode, Timing::POLLED),
-            None => (Mode::Listen, Timing::LISTENED),
-        };
         let (address, host) = (keys.address, keys.host);
         let mut claims = match keys.protocol {
             RobstrideProtocol::Private => {
@@ -152,7 +138,7 @@ impl Driver for RobstrideOptions {
             claims.swap(0, 1);
         }
         let watched = claims.first().map_or(Id::standard(0), |claim| claim.id);
-        let bringup = Bringup::new(spec, mode, timing, watched);
+        let bringup = Bringup::polled(spec, keys.request_period, watched);
         let this = RobstrideMotor {
             keys,
             mode: 0,
@@ -170,20 +156,20 @@ impl Driver for RobstrideOptions {
 impl Family for RobstrideMotor {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
-        match self.message(frame, out) {
-            Some(RobstrideMessage::State(state)) => self.state(&state, frame, session, out),
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
+        match self.message(frame) {
+            Some(RobstrideMessage::State(state)) => self.state(&state, frame, session),
             Some(RobstrideMessage::Faults(faults)) => {
                 self.faults = faults & ((1 << OF_STATE) - 1);
-                self.tell(frame, out);
+                self.tell(frame);
             }
             Some(RobstrideMessage::Parameter(parameter, Some(value))) => {
-                self.parameter((parameter, f64::from(value)), frame, session, out);
+                self.parameter((parameter, f64::from(value)), frame, session);
             }
             Some(RobstrideMessage::Parameter(parameter, None))
                 if self.keys.request_period.is_some() && parameter::ASKED.contains(&parameter) =>
             {
-                out.fault(Counter::Value, 1, frame.id);
+                frame.fault(Counter::Value);
             }
             Some(RobstrideMessage::Parameter(_, None)) | None => {}
         }
@@ -195,12 +181,7 @@ impl Family for RobstrideMotor {
         (self.velocity, self.current) = (HeldValue::ABSENT, HeldValue::ABSENT);
     }
 
-    fn request(
-        &mut self,
-        now: Nanos,
-        _session: &mut Session<NoInquiry>,
-        _out: &mut Decoded,
-    ) -> Option<Frame> {
+    fn request(&mut self, now: Nanos, _session: &mut Session, _out: &mut Decoded) -> Option<Frame> {
         let [low, high] = (self.questions.ask(&parameter::ASKED, now)?).to_le_bytes();
         let id = id(kind::PARAMETER, 0, self.keys.host, self.keys.address);
         Some(Frame::new(id, &[low, high, 0, 0, 0, 0, 0, 0]))

@@ -1,7 +1,7 @@
 //! The keys of a motor in gateway.toml, for both sides of the driver.
 
 use super::frames::fault;
-use crate::keys::{above_zero, address, duration, known};
+use crate::keys::{above_zero, address, duration, known, stated, stated_duration};
 use crate::mit::Scale;
 use crate::{Spec, SpecError};
 use core::f64::consts::TAU;
@@ -112,20 +112,16 @@ pub(super) struct RobstrideKeys {
 
 impl RobstrideKeys {
     pub(super) fn new(spec: &Spec, options: &RobstrideOptions) -> Result<Self, SpecError> {
-        let [address, _] = address(spec, 1..=0xFD)?.to_le_bytes();
+        let address = address(spec, 1..=0xFD)?;
         let (protocol, host) = (options.protocol, options.host_id);
         if host == address {
-            return Err(SpecError::Key {
-                key: "host_id",
-                value: f64::from(host),
-                expected: "0 to 255, and not the motor's address",
-            });
+            let expected = "0 to 255, and not the motor's address";
+            return Err(SpecError::key("host_id", host, expected));
         }
         if options.request_period_ms.is_some() && protocol == RobstrideProtocol::Mit {
-            return Err(SpecError::Keys {
-                key: "request_period_ms",
-                expected: "left out with protocol = \"mit\": it has no question that is no command",
-            });
+            let expected =
+                "left out with protocol = \"mit\": it has no question that is no command";
+            return Err(SpecError::keys("request_period_ms", expected));
         }
         let ranges = options.model.map(RobstrideModel::ranges);
         let of_model = ranges.map(|(private, mit, _)| match protocol {
@@ -156,12 +152,8 @@ impl RobstrideKeys {
                 Scale::range(torque, bits),
             ],
             encoder,
-            request_period: (options.request_period_ms)
-                .map(|ms| duration("request_period_ms", ms))
-                .transpose()?,
-            torque_constant: (options.torque_constant)
-                .map(|constant| above_zero("torque_constant", constant))
-                .transpose()?,
+            request_period: stated_duration("request_period_ms", options.request_period_ms)?,
+            torque_constant: stated("torque_constant", options.torque_constant)?,
             period: duration("period_ms", options.period_ms)?,
         })
     }

@@ -46,8 +46,7 @@ impl Recognise for RobstrideOptions {
                 kind::DEVICE if (upper, host) == (0, 0xFE) => (address, 0xFD),
                 _ => continue,
             };
-            let is_known = |known: &&(u8, u8)| known.0 == pair.0;
-            let is_new = found.iter().find(is_known).is_none();
+            let is_new = found.iter().all(|known| known.0 != pair.0);
             if (1..=NUMBERS).contains(&address) && is_new {
                 found.push(pair);
             }
@@ -141,12 +140,7 @@ fn private(seen: &Traffic, address: u8, host: u8) -> Option<Finding> {
 
 /// Motors with the MIT protocol that answer on the identifier of `stream`.
 fn mit_motors(seen: &Traffic, stream: &Stream) -> Vec<Finding> {
-    let mut numbers: Vec<u8> = Vec::new();
-    for first in stream.kept().filter_map(|frame| frame.data().first()) {
-        if !numbers.contains(first) {
-            numbers.push(*first);
-        }
-    }
+    let numbers = stream.first_bytes();
     let are_few = (1..=16).contains(&numbers.len())
         && numbers.iter().all(|number| (1..=NUMBERS).contains(number));
     let find = |address: &u8| {

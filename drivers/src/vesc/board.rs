@@ -5,7 +5,7 @@ use super::frames::{
 };
 use super::options::{VescKeys, VescOptions, VescPosition};
 use crate::bytes::{quantise, quantise_i16};
-use crate::{Board, EncodeError, Frame, Frames, Simulate, Spec, SpecError, board};
+use crate::{Board, EncodeError, Frames, Simulate, Spec, SpecError, board};
 use alloc::boxed::Box;
 use proprio_topics::{Nanos, Quality, Reading};
 
@@ -45,7 +45,7 @@ impl VescBoard {
     }
 
     fn send(&self, command: u8, data: [u8; 8], out: &mut Frames) {
-        let _ = out.try_push(Frame::new(self.keys.id(command), &data));
+        board::send(self.keys.id(command), &data, out);
     }
 }
 
@@ -61,8 +61,6 @@ impl Simulate for VescOptions {
 }
 
 impl Board for VescBoard {
-    fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
-
     fn period(&self) -> Option<Nanos> {
         Some(self.keys.period)
     }
@@ -78,10 +76,7 @@ impl Board for VescBoard {
     ) -> Result<(), EncodeError> {
         match (output, reading) {
             (JOINT, Reading::Joint(joint)) => {
-                let amperes = match self.keys.torque_constant {
-                    Some(constant) if joint.current.is_nan() => joint.torque / constant,
-                    _ => joint.current,
-                };
+                let amperes = board::current(joint, self.keys.torque_constant);
                 let amperes = if amperes.is_nan() { 0.0 } else { amperes };
                 let values = [joint.position, joint.velocity, amperes];
                 board::finite(&values)?;

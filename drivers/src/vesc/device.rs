@@ -5,12 +5,11 @@ use super::frames::{
 };
 use super::options::{VescKeys, VescOptions, VescPosition};
 use crate::bringup::{Bringup, NoInquiry, Timing};
-use crate::bytes::{self, i16_be, u32_be};
-use crate::family::{Family, Session, Supervised, temperature};
+use crate::bytes::{i16_be, u32_be};
+use crate::family::{Family, Session, Supervised};
 use crate::held::HeldValue;
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading,
-};
+use crate::received::Received;
+use crate::{Claim, Device, Driver, Mode, OutputInfo, Spec, SpecError};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Actuator, JointState, Kind, Quality, Reading};
@@ -25,7 +24,7 @@ pub(super) struct VescController {
 }
 
 impl VescController {
-    fn status(&mut self, data: &[u8], frame: &Frame, out: &mut Decoded) {
+    fn status(&mut self, data: &[u8], frame: &mut Received<'_>) {
         let [current, duty] = [4, 6].map(|at| i16_be(data, at));
         let velocity = f64::from(u32_be(data, 0).cast_signed()) * self.keys.velocity_step;
         self.velocity = HeldValue::new(frame, velocity);
@@ -41,17 +40,10 @@ impl VescController {
             encoder: 0,
             faults: 0,
         });
-        let stamped = StampedReading::new(JOINT, frame, Quality::GOOD, actuator);
-        out.push(stamped, frame.id);
+        frame.tell(JOINT, Quality::GOOD, actuator);
     }
 
-    fn position(
-        &self,
-        raw: i32,
-        frame: &Frame,
-        session: &mut Session<NoInquiry>,
-        out: &mut Decoded,
-    ) {
+    fn position(&self, raw: i32, frame: &mut Received<'_>, session: &mut Session) {
         let hold = self.keys.hold;
         let current = self.current.at(frame, hold);
         let constant = self.keys.torque_constant.unwrap_or(f64::NAN);
@@ -62,7 +54,7 @@ impl VescController {
             current,
             ..JointState::ABSENT
         };
-        session.joint(JOINT, frame, Quality::GOOD, state, out);
+        session.joint(JOINT, frame, Quality::GOOD, state);
     }
 }
 
@@ -93,30 +85,30 @@ impl Driver for VescOptions {
 impl Family for VescController {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         let commands = [command::STATUS, command::STATUS_4, command::STATUS_5];
         let is_its = |command: &u8| self.keys.id(*command) == frame.id;
         let Some(command) = commands.into_iter().find(is_its) else {
             return;
         };
-        let Some(data) = bytes::payload_of(LENGTH, frame, out) else {
+        let Some(data) = frame.payload_of(LENGTH) else {
             return;
         };
         match (command, self.keys.position) {
-            (command::STATUS, _) => self.status(data, frame, out),
+            (command::STATUS, _) => self.status(data, frame),
             (command::STATUS_4, position) => {
                 for (output, at) in [(FET, 0), (MOTOR, 2)] {
                     let celsius = f64::from(i16_be(data, at)) * KELVIN_PER_STEP;
                     if celsius >= COLDEST {
-                        temperature(output, celsius, frame, out);
+                        frame.temperature(output, celsius);
                     }
                 }
                 if position == VescPosition::Pid {
-                    self.position(i32::from(i16_be(data, 6)), frame, session, out);
+                    self.position(i32::from(i16_be(data, 6)), frame, session);
                 }
             }
             (_, VescPosition::Tachometer) => {
-                self.position(u32_be(data, 0).cast_signed(), frame, session, out);
+                self.position(u32_be(data, 0).cast_signed(), frame, session);
             }
             _ => {}
         }

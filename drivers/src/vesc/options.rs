@@ -1,7 +1,7 @@
 //! The keys of a controller in gateway.toml, for both sides of the driver.
 
 use super::frames::{ADDRESS_MOST, RAD_PER_COUNT, RAD_PER_S_PER_RPM, RAD_PER_STEP, command};
-use crate::keys::{above_zero, address, duration};
+use crate::keys::{above_zero, address, duration, stated};
 use crate::{Id, Spec, SpecError};
 use proprio_topics::Nanos;
 use serde::Deserialize;
@@ -67,16 +67,11 @@ impl VescKeys {
     pub(super) fn new(spec: &Spec, options: &VescOptions) -> Result<Self, SpecError> {
         let address = address(spec, 0..=ADDRESS_MOST)?;
         let Some(pairs) = options.pole_pairs else {
-            return Err(SpecError::Keys {
-                key: "pole_pairs",
-                expected: "given: the speed is in electrical revolutions",
-            });
+            let expected = "given: the speed is in electrical revolutions";
+            return Err(SpecError::keys("pole_pairs", expected));
         };
         let pairs = above_zero("pole_pairs", f64::from(pairs))?;
         let electrical = pairs * above_zero("gear_ratio", options.gear_ratio)?;
-        let torque_constant = (options.torque_constant)
-            .map(|constant| above_zero("torque_constant", constant))
-            .transpose()?;
         Ok(Self {
             address,
             position: options.position,
@@ -85,7 +80,7 @@ impl VescKeys {
                 VescPosition::Tachometer => RAD_PER_COUNT / electrical,
             },
             velocity_step: RAD_PER_S_PER_RPM / electrical,
-            torque_constant,
+            torque_constant: stated("torque_constant", options.torque_constant)?,
             hold: duration("hold_ms", options.hold_ms)?,
             period: duration("period_ms", options.period_ms)?,
         })

@@ -46,8 +46,6 @@ impl Simulate for XsensMtiOptions {
 }
 
 impl Board for MtiBoard {
-    fn on_frame(&mut self, _frame: &Frame, _out: &mut Frames) {}
-
     fn period(&self) -> Option<Nanos> {
         Some(self.plan.period)
     }

@@ -6,9 +6,8 @@ use crate::bringup::{Bringup, NoInquiry, Timing};
 use crate::family::{Family, Session, Supervised};
 use crate::group::{FrameGroup, PartialReading};
 use crate::pairing::Limit;
-use crate::{
-    Claim, Decoded, Device, Driver, Frame, Mode, OutputInfo, Spec, SpecError, StampedReading, bytes,
-};
+use crate::received::Received;
+use crate::{Claim, Device, Driver, Mode, OutputInfo, Spec, SpecError, StampedReading, bytes};
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use proprio_topics::{Counter, Imu, Kind, Nanos, Quality, Reading, Saturation};
@@ -112,9 +111,8 @@ impl Mti {
     fn add(
         &mut self,
         whole: &PartialReading<MtiSample>,
-        frame: &Frame,
-        session: &mut Session<NoInquiry>,
-        out: &mut Decoded,
+        frame: &mut Received<'_>,
+        session: &mut Session,
     ) {
         let sample = &whole.content;
         let mut quality = sample.quality(&self.plan);
@@ -122,8 +120,8 @@ impl Mti {
             quality |= Quality::DEVICE_COUNTER;
             let last = self.counter.replace(sample.counter);
             match last.map(|last| sample.counter.wrapping_sub(last)) {
-                Some(0) => return out.fault(Counter::Unexpected, 1, frame.id),
-                Some(ahead) => session.lost(Counter::Lost, u32::from(ahead) - 1, frame, out),
+                Some(0) => return frame.fault(Counter::Unexpected),
+                Some(ahead) => session.lost(Counter::Lost, u32::from(ahead) - 1, frame),
                 None => {}
             }
         }
@@ -139,7 +137,7 @@ impl Mti {
             device_counter: u32::from(sample.counter),
             ..StampedReading::new(0, frame, quality, Reading::Imu(sample.imu))
         };
-        session.add(stamped, frame, out);
+        session.add(stamped, frame);
     }
 }
 
@@ -172,7 +170,7 @@ impl Driver for XsensMtiOptions {
 impl Family for Mti {
     type Questions = NoInquiry;
 
-    fn on_frame(&mut self, frame: &Frame, session: &mut Session<NoInquiry>, out: &mut Decoded) {
+    fn on_frame(&mut self, frame: &mut Received<'_>, session: &mut Session) {
         let mut numbered = (0..).zip(&self.plan.messages);
         let found = numbered.find(|(_, (id, _))| *id == frame.id);
         let (position, message) = match found {
@@ -180,21 +178,21 @@ impl Family for Mti {
             None if frame.id == self.plan.error => (0, MtiMessage::Error),
             None => return,
         };
-        let Some(data) = bytes::payload_of(message.length(), frame, out) else {
+        let Some(data) = frame.payload_of(message.length()) else {
             return;
         };
         if message == MtiMessage::Error {
             if data.first() != Some(&BUFFER_OVERFLOW) {
-                return out.fault(Counter::Value, 1, frame.id);
+                return frame.fault(Counter::Value);
             }
-            return session.lost(Counter::DeviceFault, 1, frame, out);
+            return session.lost(Counter::DeviceFault, 1, frame);
         }
         let mut dropped = 0;
         let add = |sample: &mut MtiSample| sample.add(&self.plan, message, data);
         let whole = (self.group).push(position, frame, MtiSample::EMPTY, add, &mut dropped);
-        session.lost(Counter::Unpaired, dropped, frame, out);
+        session.lost(Counter::Unpaired, dropped, frame);
         if let Some(whole) = whole {
-            self.add(&whole, frame, session, out);
+            self.add(&whole, frame, session);
         }
     }
 

@@ -1,7 +1,7 @@
 //! The keys of an MTi in gateway.toml, and what they mean to both sides of the driver.
 
 use super::frames::{FIELD_LSB, HighRate, MtiMessage};
-use crate::{Id, Spec, SpecError};
+use crate::{Id, Spec, SpecError, keys};
 use alloc::collections::BTreeMap;
 use alloc::vec::Vec;
 use proprio_topics::Nanos;
@@ -66,11 +66,6 @@ pub(super) struct MtiKeys {
 
 impl MtiKeys {
     pub(super) fn new(spec: &Spec, options: &XsensMtiOptions) -> Result<Self, SpecError> {
-        let key = |key, value, expected| SpecError::Key {
-            key,
-            value,
-            expected,
-        };
         let mut wanted = options.quantities.clone();
         wanted.sort_unstable();
         wanted.dedup();
@@ -82,20 +77,22 @@ impl MtiKeys {
                            acceleration, magnetic_field, and without error",
             });
         }
-        if !(options.period_ms >= 0.5 && options.period_ms <= 1000.0) {
-            return Err(key("period_ms", options.period_ms, "from 0.5 to 1000"));
-        }
+        let period_ms = options.period_ms;
+        let period_ms = keys::within("period_ms", period_ms, 0.5..=1000.0, "from 0.5 to 1000")?;
         let unit = options.sample_time_unit_us;
         if !matches!(unit, 1 | 100) {
-            return Err(key("sample_time_unit_us", f64::from(unit), "1 or 100"));
+            return Err(SpecError::key("sample_time_unit_us", unit, "1 or 100"));
         }
         let one = options.quaternion_one;
         if !matches!(one, 32767 | 32768) {
-            return Err(key("quaternion_one", f64::from(one), "32767 or 32768"));
+            return Err(SpecError::key("quaternion_one", one, "32767 or 32768"));
         }
         let unit_field = match options.magnetic_unit {
             Some(unit) if unit > 0.0 && unit <= 1.0 => unit,
-            Some(unit) => return Err(key("magnetic_unit", unit, "above 0, at most 1")),
+            Some(unit) => {
+                let expected = "above 0, at most 1";
+                return Err(SpecError::key("magnetic_unit", unit, expected));
+            }
             None if wants(&MtiMessage::MagneticField) => {
                 return Err(SpecError::Incomplete {
                     given: "magnetic_field",
@@ -109,19 +106,11 @@ impl MtiKeys {
         for message in wanted.into_iter().chain([MtiMessage::Error]) {
             let delivered = message.identifier(options.high_rate);
             let identifier = *options.identifiers.get(&message).unwrap_or(&delivered);
-            if identifier > most {
-                return Err(key("identifiers", f64::from(identifier), "an identifier"));
-            }
-            if spec.address > most - identifier {
-                return Err(SpecError::Address {
-                    address: spec.address,
-                    least: 0,
-                    most: most - identifier,
-                });
-            }
-            let id = match (options.extended, u16::try_from(identifier + spec.address)) {
+            keys::within("identifiers", identifier, 0..=most, "an identifier")?;
+            let sum = identifier + keys::address(spec, 0..=most - identifier)?;
+            let id = match (options.extended, u16::try_from(sum)) {
                 (false, Ok(raw)) => Id::standard(raw),
-                _ => Id::extended(identifier + spec.address),
+                _ => Id::extended(sum),
             };
             messages.push((id, message));
         }
@@ -131,15 +120,12 @@ impl MtiKeys {
             .windows(2)
             .any(|two| matches!(two, [(a, _), (b, _)] if a == b));
         if twice || messages.iter().any(|(id, _)| *id == error) {
-            return Err(SpecError::Keys {
-                key: "identifiers",
-                expected: "different for each message",
-            });
+            return Err(SpecError::keys("identifiers", "different for each message"));
         }
         Ok(Self {
             messages,
             error,
-            period: Nanos::from_seconds(options.period_ms * 1e-3),
+            period: Nanos::from_seconds(period_ms * 1e-3),
             tick: Nanos::from_micros(i64::from(unit)),
             quaternion_lsb: 1.0 / f64::from(one),
             field_lsb: unit_field * FIELD_LSB,

@@ -16,41 +16,26 @@ pub struct ErrorFrame {
 
 /// What tells that a cause is reported: one of these class bits and, in byte 1 of the data, one of
 /// these bits (any data if there are none).
-const SIGNS: [(BusError, u32, libc::c_int); BusError::ALL.len()] = [
-    (BusError::TxTimeout, libc::CAN_ERR_TX_TIMEOUT, 0),
-    (BusError::ArbitrationLost, libc::CAN_ERR_LOSTARB, 0),
-    (
-        BusError::RxOverflow,
-        libc::CAN_ERR_CRTL,
-        libc::CAN_ERR_CRTL_RX_OVERFLOW,
-    ),
-    (
-        BusError::TxOverflow,
-        libc::CAN_ERR_CRTL,
-        libc::CAN_ERR_CRTL_TX_OVERFLOW,
-    ),
-    (
-        BusError::Warning,
-        libc::CAN_ERR_CRTL,
-        libc::CAN_ERR_CRTL_RX_WARNING | libc::CAN_ERR_CRTL_TX_WARNING,
-    ),
-    (
-        BusError::Passive,
-        libc::CAN_ERR_CRTL,
-        libc::CAN_ERR_CRTL_RX_PASSIVE | libc::CAN_ERR_CRTL_TX_PASSIVE,
-    ),
-    (
-        BusError::Active,
-        libc::CAN_ERR_CRTL,
-        libc::CAN_ERR_CRTL_ACTIVE,
-    ),
-    (BusError::Protocol, libc::CAN_ERR_PROT, 0),
-    (BusError::Transceiver, libc::CAN_ERR_TRX, 0),
-    (BusError::NoAck, libc::CAN_ERR_ACK, 0),
-    (BusError::BusOff, libc::CAN_ERR_BUSOFF, 0),
-    (BusError::Bus, libc::CAN_ERR_BUSERROR, 0),
-    (BusError::Restarted, libc::CAN_ERR_RESTARTED, 0),
-];
+const SIGNS: [(BusError, u32, libc::c_int); BusError::ALL.len()] = {
+    use libc::*;
+    const RX_TX_WARNING: c_int = CAN_ERR_CRTL_RX_WARNING | CAN_ERR_CRTL_TX_WARNING;
+    const RX_TX_PASSIVE: c_int = CAN_ERR_CRTL_RX_PASSIVE | CAN_ERR_CRTL_TX_PASSIVE;
+    [
+        (BusError::TxTimeout, CAN_ERR_TX_TIMEOUT, 0),
+        (BusError::ArbitrationLost, CAN_ERR_LOSTARB, 0),
+        (BusError::RxOverflow, CAN_ERR_CRTL, CAN_ERR_CRTL_RX_OVERFLOW),
+        (BusError::TxOverflow, CAN_ERR_CRTL, CAN_ERR_CRTL_TX_OVERFLOW),
+        (BusError::Warning, CAN_ERR_CRTL, RX_TX_WARNING),
+        (BusError::Passive, CAN_ERR_CRTL, RX_TX_PASSIVE),
+        (BusError::Active, CAN_ERR_CRTL, CAN_ERR_CRTL_ACTIVE),
+        (BusError::Protocol, CAN_ERR_PROT, 0),
+        (BusError::Transceiver, CAN_ERR_TRX, 0),
+        (BusError::NoAck, CAN_ERR_ACK, 0),
+        (BusError::BusOff, CAN_ERR_BUSOFF, 0),
+        (BusError::Bus, CAN_ERR_BUSERROR, 0),
+        (BusError::Restarted, CAN_ERR_RESTARTED, 0),
+    ]
+};
 
 impl ErrorFrame {
     /// The contents of `frame`; `None` if it is not an error frame.

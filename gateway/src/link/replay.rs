@@ -14,7 +14,7 @@
 use super::{Link, LinkCounters, OpenError, Received, TransmitError, passes};
 use crate::clock::{Clock, Monotonic, sleep_until};
 pub use crate::config::Pace;
-use crate::log::{self, Bytes, LogFormat, LogReader, LogReport, Stamps};
+use crate::log::{self, Bytes, LogReader, LogReport, Stamps};
 use proprio_drivers::{Claim, Format, Frame};
 use proprio_topics::{LinkState, Nanos, StampKind};
 use std::io::{self, BufRead, BufReader};
@@ -153,9 +153,7 @@ impl<R: BufRead> Replay<R> {
         // The first frame of the whole log is the origin, so that the buses of one log stay in
         // step.
         let matches = |interface: &str| matching.as_ref().is_none_or(|m| m.takes(interface));
-        let first = log
-            .next_record()?
-            .map(|r| (r.stamp, matches(r.interface), r.frame));
+        let first = (log.next_record()?).map(|r| (r.stamp, matches(r.interface), r.frame));
         let mut replay = Self {
             log,
             pace,
@@ -259,18 +257,11 @@ impl<R: BufRead> Replay<R> {
 
 impl<R: BufRead + Send> Link for Replay<R> {
     fn note(&self) -> Option<String> {
-        let report = self.log.report();
         let mut notes = Vec::new();
         if let Some(failure) = self.failure {
             notes.push(format!("the log could not be read to its end: {failure}"));
         }
-        if let Some(first) = self.log.bad().next() {
-            let parts = self.log.format().map_or("lines", LogFormat::parts);
-            notes.push(format!(
-                "{} {parts} of the log were skipped; the first is {first}",
-                report.bad
-            ));
-        }
+        notes.extend(self.log.skipped());
         let key = "stamps = \"since_start\" or \"since_previous\" of the source";
         notes.extend(self.log.doubt(key));
         notes.extend(self.log.step_back());
@@ -280,7 +271,7 @@ impl<R: BufRead + Send> Link for Replay<R> {
         if self.counters.received == 0 {
             notes.push(format!(
                 "none of the log's {} frames is for this bus",
-                report.records
+                self.log.report().records
             ));
         }
         (!notes.is_empty()).then(|| notes.join("; "))

@@ -363,10 +363,7 @@ fn decode(bytes: &[u8]) -> Option<Frame> {
         CLASSIC if raw & libc::CAN_RTR_FLAG != 0 => Some(Frame::remote(id, len as u8)),
         CLASSIC => Frame::with_format(id, Format::Classic, payload?),
         FD => {
-            let format = Format::Fd {
-                bit_rate_switch: flags & BIT_RATE_SWITCH != 0,
-                error_state: flags & ERROR_STATE != 0,
-            };
+            let format = Format::fd(flags & BIT_RATE_SWITCH != 0, flags & ERROR_STATE != 0);
             Frame::with_format(id, format, payload?)
         }
         _ => None,

@@ -92,46 +92,37 @@ fn group(key: &[u8]) -> SocketAddrV4 {
 
 /// A socket of bus `name` in `group`.
 fn join(name: &str, group: SocketAddrV4) -> Result<Socket, OpenError> {
-    let action = |what: &str| {
+    let done = |what: &str, done: io::Result<()>| {
         let action = format!("{what} for virtual bus {name}");
-        move |cause| OpenError::System { action, cause }
+        done.map_err(|cause| OpenError::System { action, cause })
     };
-    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))
-        .map_err(action("create a socket"))?;
+    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP));
+    let socket = socket.map_err(|cause| OpenError::System {
+        action: format!("create a socket for virtual bus {name}"),
+        cause,
+    })?;
     // Every multicast datagram goes to all sockets that share the address this way.
     // SO_REUSEPORT would additionally require that all of them belong to one user.
-    socket
-        .set_reuse_address(true)
-        .map_err(action("share the address"))?;
+    done("share the address", socket.set_reuse_address(true))?;
     // Bound to the group, so that datagrams to this port of another group or of the host do not
     // arrive here. The buffer fills from here on, so options that concern its frames are set
     // before.
-    setsockopt(&socket, sockopt::ReceiveTimestampns, &true)
-        .map_err(|e| action("enable time stamps")(e.into()))?;
-    setsockopt(&socket, sockopt::RxqOvfl, &1)
-        .map_err(|e| action("enable drop counts")(e.into()))?;
+    let stamps = setsockopt(&socket, sockopt::ReceiveTimestampns, &true);
+    done("enable time stamps", stamps.map_err(Into::into))?;
+    let drops = setsockopt(&socket, sockopt::RxqOvfl, &1);
+    done("enable drop counts", drops.map_err(Into::into))?;
     enlarge_receive_buffer(&socket, RECEIVE_BUFFER);
-    socket
-        .bind(&group.into())
-        .map_err(action(&format!("bind to {group}")))?;
+    done(&format!("bind to {group}"), socket.bind(&group.into()))?;
     // Always through lo, also without a route (as in a new network namespace), and never through
     // another interface.
+    let ip = Ipv4Addr::LOCALHOST;
     let lo = "through 127.0.0.1 (is the loopback interface up? `ip link set lo up`)";
-    socket
-        .set_multicast_if_v4(&Ipv4Addr::LOCALHOST)
-        .map_err(action(&format!("send {lo}")))?;
-    socket
-        .set_multicast_ttl_v4(0)
-        .map_err(action("limit frames to this host"))?;
-    socket
-        .set_multicast_loop_v4(true)
-        .map_err(action("reach this host"))?;
-    socket
-        .join_multicast_v4(group.ip(), &Ipv4Addr::LOCALHOST)
-        .map_err(action(&format!("join {group} {lo}")))?;
-    socket
-        .set_nonblocking(true)
-        .map_err(action("set up the socket"))?;
+    done(&format!("send {lo}"), socket.set_multicast_if_v4(&ip))?;
+    done("limit frames to this host", socket.set_multicast_ttl_v4(0))?;
+    done("reach this host", socket.set_multicast_loop_v4(true))?;
+    let joined = socket.join_multicast_v4(group.ip(), &ip);
+    done(&format!("join {group} {lo}"), joined)?;
+    done("set up the socket", socket.set_nonblocking(true))?;
     Ok(socket)
 }
 
@@ -230,10 +221,7 @@ fn decode(
     };
     let format = match flags & FORMAT {
         0 => Format::Classic,
-        FD => Format::Fd {
-            bit_rate_switch: flags & BIT_RATE_SWITCH != 0,
-            error_state: flags & ERROR_STATE != 0,
-        },
+        FD => Format::fd(flags & BIT_RATE_SWITCH != 0, flags & ERROR_STATE != 0),
         REMOTE if data.is_empty() && *len <= 8 => return Some(Frame::remote(id, *len)),
         _ => return None,
     };

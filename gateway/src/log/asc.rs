@@ -35,16 +35,14 @@
 //! Sources: can-utils `asc2log.c`, `log2asc.c`; python-can `io/asc.py` and the files of its tests.
 
 use super::record::{
-    FrameDirection, Interface, LineError, LogFormat, OwnedRecord, ParsedLine, StampForm, bus_error,
-    identifier,
+    FrameDirection, Interface, LineError, LogFormat, OwnedRecord, ParsedLine, bus_error,
+    identifier, stamp_since,
 };
-use super::text::{civil, decimal, number, words};
+use super::text::{SECOND, civil, decimal, number, words};
 use arrayvec::ArrayVec;
 use proprio_drivers::{Format, Frame, Id};
 use proprio_topics::Nanos;
 
-/// A second \[ns\].
-const SECOND: u64 = 1_000_000_000;
 /// The flag of a line with `CANFD`: the frame is a remote request.
 const REMOTE: u32 = 0x10;
 /// The flag of a line with `CANFD`: the frame is CAN FD.
@@ -159,12 +157,8 @@ impl Asc {
             }
             return Ok(ParsedLine::Note);
         };
-        let stamp = match self.start {
-            Some(start) => (start.saturating_add(self.last), StampForm::Absolute),
-            None => (self.last, StampForm::Origin),
-        };
         Ok(ParsedLine::Record(OwnedRecord {
-            stamp: Some(stamp),
+            stamp: Some(stamp_since(self.start, self.last)),
             interface: Interface::channel(channel),
             direction,
             frame,
@@ -329,10 +323,7 @@ fn fd_frame<'a>(
         Some(flags) if flags & REMOTE != 0 => Frame::remote(id, code.min(8) as u8),
         Some(_) => Frame::new(id, data),
         None => {
-            let format = Format::Fd {
-                bit_rate_switch,
-                error_state,
-            };
+            let format = Format::fd(bit_rate_switch, error_state);
             Frame::with_format(id, format, data).ok_or(LineError::TooLong { most: 64 })?
         }
     };

@@ -27,7 +27,8 @@
 //! Sources: python-can `io/blf.py`; Technica Engineering `vector_blf`; Wireshark `blf.h`.
 
 use super::record::{
-    FrameDirection, Interface, LineError, OwnedRecord, ParsedLine, StampForm, bus_error, identifier,
+    FrameDirection, Interface, LineError, OwnedRecord, ParsedLine, bus_error, identifier,
+    stamp_since,
 };
 use super::text::civil;
 use flate2::{Decompress, FlushDecompress, Status};
@@ -450,12 +451,8 @@ fn parse(
     // Some files have times before the start, as negative numbers.
     let t = u64_at(object, 24).ok_or(short)?.cast_signed();
     let t = Nanos(t.saturating_mul(unit));
-    let stamp = match start {
-        Some(start) => (start.saturating_add(t), StampForm::Absolute),
-        None => (t, StampForm::Origin),
-    };
     Ok(OwnedRecord {
-        stamp: Some(stamp),
+        stamp: Some(stamp_since(start, t)),
         interface: Interface::channel(channel),
         direction,
         frame,
@@ -479,13 +476,7 @@ fn parse_body(
         let id = word(4)?;
         identifier(id & !EXTENDED, id & EXTENDED != 0)
     };
-    let way = |sent: bool| {
-        Some(if sent {
-            FrameDirection::Sent
-        } else {
-            FrameDirection::Received
-        })
-    };
+    let way = |sent: bool| Some(FrameDirection::of(sent));
     let wide_channel = || u16_at(body, 0).ok_or(short);
     Ok(match kind {
         1 | 86 => {
@@ -541,11 +532,8 @@ fn any_frame(
     data: &[u8],
 ) -> Result<Frame, LineError> {
     if fd {
-        let format = Format::Fd {
-            bit_rate_switch,
-            error_state,
-        };
-        Frame::with_format(id, format, data).ok_or(LineError::TooLong { most: 64 })
+        Frame::with_format(id, Format::fd(bit_rate_switch, error_state), data)
+            .ok_or(LineError::TooLong { most: 64 })
     } else if remote {
         Ok(Frame::remote(id, code.min(8)))
     } else {

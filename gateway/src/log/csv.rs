@@ -15,15 +15,13 @@
 use super::record::{
     Interface, LineError, OwnedRecord, ParsedLine, StampForm, bus_error, identifier,
 };
-use super::text::{decimal, number};
+use super::text::{SECOND, decimal, number};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use proprio_drivers::{Format, Frame};
 
 /// The names of the columns.
 const HEADER: &[u8] = b"timestamp,arbitration_id,extended,remote,error,dlc,data";
-/// A second \[ns\].
-const SECOND: u64 = 1_000_000_000;
 
 /// Whether only this format has such a line.
 pub(super) fn has(line: &[u8]) -> bool {
@@ -82,11 +80,8 @@ pub(super) fn parse(line: &[u8]) -> Result<ParsedLine, LineError> {
     } else if declared <= 8 {
         Frame::new(id, data)
     } else {
-        let format = Format::Fd {
-            bit_rate_switch: false,
-            error_state: false,
-        };
-        Frame::with_format(id, format, data).ok_or(LineError::TooLong { most: 64 })?
+        Frame::with_format(id, Format::fd(false, false), data)
+            .ok_or(LineError::TooLong { most: 64 })?
     };
     Ok(ParsedLine::Record(OwnedRecord {
         stamp: Some((t, StampForm::Origin)),

@@ -263,6 +263,16 @@ impl<R: BufRead> LogReader<R> {
         self.report.first_bad.iter().map(text)
     }
 
+    /// What a person should be told if parts of the log were skipped.
+    pub(crate) fn skipped(&self) -> Option<String> {
+        let first = self.bad().next()?;
+        let parts = self.format.map_or("lines", LogFormat::parts);
+        let bad = self.report.bad;
+        Some(format!(
+            "{bad} {parts} of the log were skipped; the first is {first}"
+        ))
+    }
+
     /// Why a log without a frame has none.
     pub fn why_empty(&self) -> String {
         match (self.bad().next(), self.report.first_bad.first()) {
@@ -513,33 +523,14 @@ impl<R: BufRead> LogReader<R> {
 
     /// Reads and parses the next line; `None` at the end.
     fn next_line(&mut self) -> io::Result<Option<Result<ParsedLine, LineError>>> {
-        self.line.clear();
-        let most = MAX_LINE as u64 + 1;
-        if self
-            .inner
-            .by_ref()
-            .take(most)
-            .read_until(b'\n', &mut self.line)?
-            == 0
-        {
+        if self.read_part()? == 0 {
             return Ok(None);
         }
         self.report.lines += 1;
         let ended = self.line.last() == Some(&b'\n');
         if !ended && self.line.len() > MAX_LINE {
             // The rest of the line, in parts.
-            while self.line.last() != Some(&b'\n') {
-                self.line.clear();
-                if self
-                    .inner
-                    .by_ref()
-                    .take(most)
-                    .read_until(b'\n', &mut self.line)?
-                    == 0
-                {
-                    break;
-                }
-            }
+            while self.read_part()? > 0 && self.line.last() != Some(&b'\n') {}
             return Ok(Some(Err(LineError::LineTooLong)));
         }
         without_escapes(&mut self.line);
@@ -557,6 +548,13 @@ impl<R: BufRead> LogReader<R> {
             Err(error) if !ended && !error.is_final() => Err(LineError::Unfinished),
             parsed => parsed,
         }))
+    }
+
+    /// Reads a line, or a part of one that is too long; returns its length.
+    fn read_part(&mut self) -> io::Result<usize> {
+        self.line.clear();
+        let mut part = self.inner.by_ref().take(MAX_LINE as u64 + 1);
+        part.read_until(b'\n', &mut self.line)
     }
 
     /// Parses a line of text whose format is not known, and learns the format if it tells.

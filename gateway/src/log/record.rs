@@ -64,6 +64,15 @@ pub enum FrameDirection {
     Sent,
 }
 
+impl FrameDirection {
+    pub(super) const fn of(sent: bool) -> Self {
+        match sent {
+            true => Self::Sent,
+            false => Self::Received,
+        }
+    }
+}
+
 /// One frame of a log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Record<'a> {
@@ -310,6 +319,14 @@ pub(super) fn identifier(id: u32, extended: bool) -> Result<Id, LineError> {
         (true, _) => Err(range(29)),
         (false, Ok(id)) if id <= 0x7FF => Ok(Id::Standard(id)),
         (false, _) => Err(range(11)),
+    }
+}
+
+/// The stamp of a frame that came `t` after the recording began at `start`, if that is known.
+pub(super) fn stamp_since(start: Option<Nanos>, t: Nanos) -> (Nanos, StampForm) {
+    match start {
+        Some(start) => (start.saturating_add(t), StampForm::Absolute),
+        None => (t, StampForm::Origin),
     }
 }
 

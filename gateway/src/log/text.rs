@@ -2,6 +2,9 @@
 
 use proprio_topics::Nanos;
 
+/// A second \[ns\].
+pub(super) const SECOND: u64 = 1_000_000_000;
+
 /// The value of each hexadecimal digit; 0xFF for other characters.
 const HEX: [u8; 256] = {
     let mut table = [0xFF; 256];

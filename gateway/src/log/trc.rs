@@ -29,8 +29,8 @@
 //! its tests.
 
 use super::record::{
-    FrameDirection, Interface, LineError, LogFormat, OwnedRecord, ParsedLine, StampForm, bus_error,
-    fd_length, identifier,
+    FrameDirection, Interface, LineError, LogFormat, OwnedRecord, ParsedLine, bus_error, fd_length,
+    identifier, stamp_since,
 };
 use super::text::{civil, decimal, hex_byte, number, words};
 use arrayvec::ArrayVec;
@@ -183,12 +183,8 @@ impl Trc {
             parse_frame(kind, id, length, words)?
         };
         let t = t.ok_or(LineError::Columns)?;
-        let stamp = match self.start {
-            Some(start) => (start.saturating_add(t), StampForm::Absolute),
-            None => (t, StampForm::Origin),
-        };
         Ok(ParsedLine::Record(OwnedRecord {
-            stamp: Some(stamp),
+            stamp: Some(stamp_since(self.start, t)),
             interface: Interface::channel(bus),
             direction,
             frame,
@@ -219,10 +215,6 @@ fn parse_frame<'a>(
     length: usize,
     mut words: impl Iterator<Item = &'a [u8]> + Clone,
 ) -> Result<(Frame, bool), LineError> {
-    let fd = |bit_rate_switch, error_state| Format::Fd {
-        bit_rate_switch,
-        error_state,
-    };
     let short = length.min(8);
     #[allow(clippy::cast_possible_truncation)] // at most 8
     let remote = Frame::remote(id, short as u8);
@@ -234,10 +226,10 @@ fn parse_frame<'a>(
         },
         // Its length ends the line, unless a blank follows.
         b"RR" => return Ok((remote, false)),
-        b"FD" => fd(false, false),
-        b"FB" => fd(true, false),
-        b"FE" => fd(false, true),
-        b"BI" => fd(true, true),
+        b"FD" => Format::fd(false, false),
+        b"FB" => Format::fd(true, false),
+        b"FE" => Format::fd(false, true),
+        b"BI" => Format::fd(true, true),
         _ => {
             return Err(LineError::Kind {
                 format: LogFormat::Trc,

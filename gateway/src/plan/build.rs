@@ -1,15 +1,15 @@
 //! From the tables of gateway.toml to the plan, checked.
 
-use super::wiring::{NewDevice, Wiring};
+use super::wiring::{NewDevice, Wiring, angle};
 use super::words::did_you_mean;
 use super::{BusPlan, ChannelPlan, DevicePlan, OutputPlan, Plan, bit_rate};
 use crate::config::{BusConfig, DeviceConfig, FrameSource, GatewayConfig, JointConfig, Scheduling};
 use crate::joints::{JointMap, JointsPlan};
 use crate::load::{self, BitRates, BusLoad, Participant};
+use crate::scan::contested;
 use crate::{dbc, eds};
 use proprio_drivers::{DRIVERS, Device, Mode, Options, OptionsError, OutputInfo, Outputs, Spec};
 use proprio_topics::{Kind, MAX_BUSES, MAX_CHANNELS, Name, Nanos, ROBOT_NAME, is_robot_name};
-use std::f64::consts::TAU;
 use std::path::Path;
 
 /// The highest rates that transceivers are made for: with these a load is never overestimated.
@@ -401,18 +401,12 @@ fn check_claims(place: &str, devices: &[DevicePlan]) -> Result<(), String> {
     for plan in devices {
         let device = plan.options.device(&plan.spec).map_err(|e| e.to_string())?;
         for (other, taken) in &claimed {
-            for (a, b) in device
-                .claims()
-                .iter()
-                .flat_map(|a| taken.claims().iter().map(move |b| (a, b)))
-            {
-                if a.overlaps(b) && (a.exclusive || b.exclusive) {
-                    return Err(format!(
-                        "{place}: devices {:?} and {other:?} both claim identifier {}: one of \
-                         their addresses is wrong",
-                        plan.name, a.id
-                    ));
-                }
+            if let Some(claim) = contested(device.claims(), taken.claims()) {
+                return Err(format!(
+                    "{place}: devices {:?} and {other:?} both claim identifier {}: one of their \
+                     addresses is wrong",
+                    plan.name, claim.id
+                ));
             }
         }
         claimed.push((&plan.name, device));
@@ -437,15 +431,7 @@ fn joint_map(at: &str, joint: &JointConfig) -> Result<JointMap, String> {
             joint.offset_rad
         ));
     }
-    // More than a full turn is no other angle: such a number is in degrees.
-    if joint.offset_rad.abs() > TAU {
-        return Err(format!(
-            "{at}: offset_rad = {} looks like degrees; in rad it is {:.6} (at most a full \
-             turn, {TAU:.6}, is possible)",
-            joint.offset_rad,
-            joint.offset_rad.to_radians()
-        ));
-    }
+    angle(at, "offset_rad", joint.offset_rad)?;
     Ok(JointMap {
         gain: f64::from(joint.sign) / joint.ratio,
         offset: joint.offset_rad,
@@ -460,11 +446,7 @@ fn check_turns(options: &Options, spec: &Spec, outputs: &[OutputPlan]) -> Result
         return Ok(());
     };
     // A board that has been started.
-    let mode = Mode::Listen;
-    let board = options.board(&Spec {
-        mode,
-        ..spec.clone()
-    });
+    let board = options.board(&spec.in_mode(Mode::Listen));
     match board.map_err(|e| e.to_string())?.period() {
         Some(period) if period >= wrap.certain => Err(format!(
             "at max_speed_radps its shaft turns by half the range of wraps_rad in {} s, and it \

@@ -342,6 +342,18 @@ fn takes(at: &str, list: Option<&[JointQuantity]>) -> Result<Takes, String> {
     }
 }
 
+/// Refuses what is no angle. More than a full turn is none: such a number is in degrees.
+pub(super) fn angle(at: &str, key: &str, value: f64) -> Result<(), String> {
+    if value.abs() <= TAU {
+        return Ok(());
+    }
+    Err(format!(
+        "{at}: {key} = {value} looks like degrees; in rad it is {:.6} (at most a full turn, \
+         {TAU:.6}, is possible)",
+        value.to_radians()
+    ))
+}
+
 /// The range of a joint's table, checked; `at` is its place.
 fn wrap(at: &str, raw: &JointConfig, map: &JointMap) -> Result<Option<Wrap>, String> {
     let (range, centre, speed) = match (raw.wraps_rad, raw.centre_rad, raw.max_speed_radps) {
@@ -381,13 +393,7 @@ fn wrap(at: &str, raw: &JointConfig, map: &JointMap) -> Result<Option<Wrap>, Str
             low + turns.round() * TAU
         ));
     }
-    if centre.is_nan() || centre.abs() > TAU {
-        return Err(format!(
-            "{at}: centre_rad = {centre} looks like degrees; in rad it is {:.6} (at most a full \
-             turn, {TAU:.6}, is possible)",
-            centre.to_radians()
-        ));
-    }
+    angle(at, "centre_rad", centre)?;
     if !(speed > 0.0 && speed.is_finite()) {
         return Err(format!("{at}: max_speed_radps = {speed} must be above 0"));
     }

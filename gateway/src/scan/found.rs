@@ -51,6 +51,12 @@ fn claims(finding: &Finding) -> Result<Vec<Claim>, String> {
     Ok(device.claims().to_vec())
 }
 
+/// The first of `own` claims that another device's claims contest.
+pub(crate) fn contested<'c>(own: &'c [Claim], others: &[Claim]) -> Option<&'c Claim> {
+    let contests = |a: &Claim, b: &Claim| a.overlaps(b) && (a.exclusive || b.exclusive);
+    own.iter().find(|a| others.iter().any(|b| contests(a, b)))
+}
+
 /// The devices on the bus of `heard`, the surest first. `prefix` begins their names.
 #[must_use]
 pub fn devices(heard: &Traffic, prefix: &str) -> Vec<FoundDevice> {
@@ -65,12 +71,7 @@ pub fn devices(heard: &Traffic, prefix: &str) -> Vec<FoundDevice> {
             _ => Vec::new(),
         };
         // As the plan refuses it: one identifier, two readers.
-        let rivals = |device: &FoundDevice| {
-            let mut pairs = claims
-                .iter()
-                .flat_map(|a| device.claims.iter().map(move |b| (a, b)));
-            pairs.any(|(a, b)| a.overlaps(b) && (a.exclusive || b.exclusive))
-        };
+        let rivals = |device: &FoundDevice| contested(&claims, &device.claims).is_some();
         if let Some(better) = devices.iter_mut().find(|device| rivals(device)) {
             better.rivals.push(finding);
             continue;

@@ -2,68 +2,51 @@
 //! these inputs causes.
 
 use crate::code::coded;
-use crate::{Code, Header, JointTorque, Name};
+use crate::{Code, Header, JointTorque, Name, valid};
 use core::fmt;
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use zerocopy::FromBytes;
 
-/// What causes a part of a torque's variance.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
-pub enum Source {
-    /// Noise of an F/T sensor, as stated or found.
-    Noise = 0,
-    /// The offset of an F/T sensor.
-    Offset = 1,
-    /// The gain, or another part of the calibration, of an F/T sensor.
-    Gain = 2,
-    /// What an F/T sensor's offset has drifted since it was known, by time or temperature; noise
-    /// beyond the stated one; and the change of a reading that is extrapolated.
-    Drift = 3,
-    /// The inertial parameters of a link.
-    Link = 4,
-    /// The position of a joint: noise and zero of its encoder.
-    Position = 5,
-    /// The acceleration of a joint, if it is differentiated.
-    Acceleration = 6,
-    /// The proper acceleration of the base: a base that is not level, or bias and mounting of its
-    /// IMU.
-    Base = 7,
-    /// The angular acceleration of the base, differentiated from its IMU.
-    Rotation = 8,
-    /// The place of a contact.
-    Place = 9,
-    /// What else than the stated setup explains the readings nearly as well: an encoder's zero, a
-    /// tilted base. Identification has not refuted it.
-    Alternative = 10,
-    /// The offset of an F/T sensor may have jumped, or a contact may have begun.
-    Step = 11,
-    /// Further inputs together.
-    Others = 12,
-    /// A contact that is present: the torque rests on its kind, and has its wrench as an unknown.
-    Present = 13,
-    /// A possible contact that the torque assumes to be absent.
-    Absent = 14,
+coded! {
+    /// What causes a part of a torque's variance.
+    pub enum Source {
+        /// Noise of an F/T sensor, as stated or found.
+        Noise = 0 => "noise",
+        /// The offset of an F/T sensor.
+        Offset = 1 => "offset",
+        /// The gain, or another part of the calibration, of an F/T sensor.
+        Gain = 2 => "gain",
+        /// What an F/T sensor's offset has drifted since it was known, by time or temperature;
+        /// noise beyond the stated one; and the change of a reading that is extrapolated.
+        Drift = 3 => "drift",
+        /// The inertial parameters of a link.
+        Link = 4 => "link",
+        /// The position of a joint: noise and zero of its encoder.
+        Position = 5 => "position",
+        /// The acceleration of a joint, if it is differentiated.
+        Acceleration = 6 => "acceleration",
+        /// The proper acceleration of the base: a base that is not level, or bias and mounting of
+        /// its IMU.
+        Base = 7 => "base",
+        /// The angular acceleration of the base, differentiated from its IMU.
+        Rotation = 8 => "rotation",
+        /// The place of a contact.
+        Place = 9 => "place",
+        /// What else than the stated setup explains the readings nearly as well: an encoder's zero,
+        /// a tilted base. Identification has not refuted it.
+        Alternative = 10 => "alternative",
+        /// The offset of an F/T sensor may have jumped, or a contact may have begun.
+        Step = 11 => "step",
+        /// Further inputs together.
+        Others = 12 => "others",
+        /// A contact that is present: the torque rests on its kind, and has its wrench as an
+        /// unknown.
+        Present = 13 => "present",
+        /// A possible contact that the torque assumes to be absent.
+        Absent = 14 => "absent",
+    }
 }
-
-coded!(Source {
-    Noise = "noise",
-    Offset = "offset",
-    Gain = "gain",
-    Drift = "drift",
-    Link = "link",
-    Position = "position",
-    Acceleration = "acceleration",
-    Base = "base",
-    Rotation = "rotation",
-    Place = "place",
-    Alternative = "alternative",
-    Step = "step",
-    Others = "others",
-    Present = "present",
-    Absent = "absent",
-});
 
 /// One input of a torque.
 #[repr(C)]
@@ -204,7 +187,7 @@ impl TorqueBudget {
     /// The valid parts.
     #[must_use]
     pub fn parts(&self) -> &[BudgetPart] {
-        self.parts.get(..self.count as usize).unwrap_or(&self.parts)
+        valid(&self.parts, self.count)
     }
 
     /// Adds a part, to an existing one of the same source and name if there is one; if there is no

@@ -76,13 +76,26 @@ impl<E: Coded> fmt::Debug for Code<E> {
     }
 }
 
-/// Implements [`Coded`] for an enumeration without fields: the number of a variant is its
-/// discriminant. Also `ALL`, `Code`s of constants, and the names in tables and logs.
+/// Defines an enumeration without fields that is [`Coded`]: the number of a variant is its
+/// discriminant, and the name after it the one in tables and logs. Also `ALL`, and `Code`s of
+/// constants.
 macro_rules! coded {
-    ($name:ident { $($variant:ident = $word:literal),+ $(,)? }) => {
+    (
+        $(#[$of_all:meta])*
+        pub enum $name:ident {
+            $($(#[$of_one:meta])* $variant:ident = $number:literal => $word:literal,)+
+        }
+    ) => {
+        $(#[$of_all])*
+        #[repr(C)]
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, ZeroCopySend)]
+        pub enum $name {
+            $($(#[$of_one])* $variant = $number,)+
+        }
+
         impl $name {
             /// All variants, in the order of their numbers.
-            pub const ALL: [Self; [$($word),+].len()] = [$(Self::$variant),+];
+            pub const ALL: [Self; [$($number),+].len()] = [$(Self::$variant),+];
 
             /// Its name in tables and logs.
             #[must_use]

@@ -2,7 +2,7 @@
 //! joint and contact.
 
 use crate::code::coded;
-use crate::{Code, Header, Kind, Nanos};
+use crate::{Code, Header, Kind, Nanos, valid};
 use core::fmt;
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
@@ -59,45 +59,34 @@ impl fmt::Display for Name {
     }
 }
 
-/// The sender of a description.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
-pub enum Publisher {
-    /// The gateway: channels of `<robot>/samples`.
-    Gateway = 0,
-    /// The estimator: joints of `<robot>/estimate/torque`, contacts of `<robot>/estimate/contact`,
-    /// and the channels that `cause` refers to.
-    Estimator = 1,
+coded! {
+    /// The sender of a description.
+    pub enum Publisher {
+        /// The gateway: channels of `<robot>/samples`.
+        Gateway = 0 => "gateway",
+        /// The estimator: joints of `<robot>/estimate/torque`, contacts of
+        /// `<robot>/estimate/contact`, and the channels that `cause` refers to.
+        Estimator = 1 => "estimator",
+    }
 }
-
-coded!(Publisher {
-    Gateway = "gateway",
-    Estimator = "estimator",
-});
 
 /// The origin of the channel whose samples are the instants of the estimates.
 pub const TRIGGER: &str = "trigger";
 
-/// What an entry's number is an index of.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
-pub enum Role {
-    /// `Sample::channel` (from the gateway), `JointTorque::cause` (from the estimator).
-    Channel = 0,
-    /// The index into `TorqueEstimate::joints`.
-    Joint = 1,
-    /// The index into `ContactEstimate::contacts`.
-    Contact = 2,
-    /// The index into `ContactEstimate::residuals`; the name is that of the sub-tree's top link.
-    SubTree = 3,
+coded! {
+    /// What an entry's number is an index of.
+    pub enum Role {
+        /// `Sample::channel` (from the gateway), `JointTorque::cause` (from the estimator).
+        Channel = 0 => "channel",
+        /// The index into `TorqueEstimate::joints`.
+        Joint = 1 => "joint",
+        /// The index into `ContactEstimate::contacts`.
+        Contact = 2 => "contact",
+        /// The index into `ContactEstimate::residuals`; the name is that of the sub-tree's top
+        /// link.
+        SubTree = 3 => "sub_tree",
+    }
 }
-
-coded!(Role {
-    Channel = "channel",
-    Joint = "joint",
-    Contact = "contact",
-    SubTree = "sub_tree",
-});
 
 /// One named number.
 #[repr(C)]
@@ -176,9 +165,7 @@ impl Description {
     /// The valid entries.
     #[must_use]
     pub fn entries(&self) -> &[Entry] {
-        self.entries
-            .get(..self.count as usize)
-            .unwrap_or(&self.entries)
+        valid(&self.entries, self.count)
     }
 
     /// The entry for number `index` of `role`.

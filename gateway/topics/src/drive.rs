@@ -2,47 +2,36 @@
 //! force/torque sensors.
 
 use crate::code::coded;
-use crate::{Code, Header, MAX_JOINTS, NO_CAUSE, Name, Reason};
+use crate::{Code, Header, MAX_JOINTS, NO_CAUSE, Name, Reason, valid};
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use zerocopy::FromBytes;
 
-/// Whether the drive and the force/torque sensors agree about a torque.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ZeroCopySend)]
-pub enum Agreement {
-    /// They cannot be compared: [`DriveTorque::reason`].
-    #[default]
-    Unknown = 0,
-    /// Their difference is within both deviations.
-    Agrees = 1,
-    /// It is not.
-    Disagrees = 2,
+coded! {
+    /// Whether the drive and the force/torque sensors agree about a torque.
+    #[derive(Default)]
+    pub enum Agreement {
+        /// They cannot be compared: [`DriveTorque::reason`].
+        #[default]
+        Unknown = 0 => "unknown",
+        /// Their difference is within both deviations.
+        Agrees = 1 => "agrees",
+        /// It is not.
+        Disagrees = 2 => "disagrees",
+    }
 }
 
-coded!(Agreement {
-    Unknown = "unknown",
-    Agrees = "agrees",
-    Disagrees = "disagrees",
-});
-
-/// What may be the cause of a disagreement.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
-pub enum Candidate {
-    /// A contact on the named link, which no F/T sensor sees or which is taken to be elsewhere.
-    Contact = 0,
-    /// The named F/T sensor: turned, damaged, or with another gain.
-    Sensor = 1,
-    /// The drive of the named joint: it reports in other units, or its friction has changed.
-    Drive = 2,
+coded! {
+    /// What may be the cause of a disagreement.
+    pub enum Candidate {
+        /// A contact on the named link, which no F/T sensor sees or which is taken to be elsewhere.
+        Contact = 0 => "contact",
+        /// The named F/T sensor: turned, damaged, or with another gain.
+        Sensor = 1 => "sensor",
+        /// The drive of the named joint: it reports in other units, or its friction has changed.
+        Drive = 2 => "drive",
+    }
 }
-
-coded!(Candidate {
-    Contact = "contact",
-    Sensor = "sensor",
-    Drive = "drive",
-});
 
 /// A candidate by name.
 #[repr(C)]
@@ -154,9 +143,7 @@ impl DriveEstimate {
     /// The valid joints.
     #[must_use]
     pub fn drives(&self) -> &[DriveTorque] {
-        self.drives
-            .get(..self.count as usize)
-            .unwrap_or(&self.drives)
+        valid(&self.drives, self.count)
     }
 
     /// The drive of a joint, by its index in `TorqueEstimate::joints`.
@@ -168,9 +155,7 @@ impl DriveEstimate {
     /// The valid candidates.
     #[must_use]
     pub fn candidates(&self) -> &[NamedCandidate] {
-        self.candidates
-            .get(..self.candidate_count as usize)
-            .unwrap_or(&self.candidates)
+        valid(&self.candidates, self.candidate_count)
     }
 }
 

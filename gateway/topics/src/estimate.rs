@@ -2,69 +2,52 @@
 //! receives.
 
 use crate::code::coded;
-use crate::{Code, Header, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Nanos, Quality};
+use crate::{Code, Header, MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Nanos, Quality, valid};
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use zerocopy::FromBytes;
 
-/// Why an estimate is withheld. A withheld estimate has no value: its numbers are NaN.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, ZeroCopySend)]
-pub enum Reason {
-    /// It is valid.
-    #[default]
-    None = 0,
-    /// A channel it depends on has never been seen.
-    NeverSeen = 1,
-    /// A channel it depends on has been silent for longer than its maximum.
-    Stale = 2,
-    /// A sensor it depends on is saturated.
-    Saturated = 3,
-    /// A device it depends on reports a fault.
-    DeviceFault = 4,
-    /// The unknown contact wrenches of its sub-tree outnumber the equations: the value depends on
-    /// an assumption.
-    Undetermined = 5,
-    /// Its predicted standard deviation exceeds the configured bound.
-    Uncertain = 6,
-    /// The result of the computation is not finite.
-    NotFinite = 7,
-    /// This contact is not present.
-    Absent = 8,
-    /// A channel it depends on has too few samples yet for a velocity and an acceleration.
-    Starting = 9,
-    /// It depends on the base motion, and no link is declared to stand still.
-    NoStance = 10,
-    /// Neither the model nor a possible contact explains the readings of the F/T sensors of its
-    /// sub-tree.
-    Unexplained = 11,
-    /// A sensor it depends on repeats its readings instead of measuring ([`Quality::FROZEN`]), and
-    /// is not saturated.
-    Frozen = 12,
-    /// A reading it depends on contradicts the ones before it ([`Quality::IMPLAUSIBLE`]).
-    Implausible = 13,
-    /// The readings contradict what is configured: something else explains them better, such as an
-    /// encoder reversed, a sensor turned, or a contact that has been there since the start.
-    Contradicted = 14,
+coded! {
+    /// Why an estimate is withheld. A withheld estimate has no value: its numbers are NaN.
+    #[derive(Default)]
+    pub enum Reason {
+        /// It is valid.
+        #[default]
+        None = 0 => "",
+        /// A channel it depends on has never been seen.
+        NeverSeen = 1 => "never_seen",
+        /// A channel it depends on has been silent for longer than its maximum.
+        Stale = 2 => "stale",
+        /// A sensor it depends on is saturated.
+        Saturated = 3 => "saturated",
+        /// A device it depends on reports a fault.
+        DeviceFault = 4 => "device_fault",
+        /// The unknown contact wrenches of its sub-tree outnumber the equations: the value depends
+        /// on an assumption.
+        Undetermined = 5 => "undetermined",
+        /// Its predicted standard deviation exceeds the configured bound.
+        Uncertain = 6 => "uncertain",
+        /// The result of the computation is not finite.
+        NotFinite = 7 => "not_finite",
+        /// This contact is not present.
+        Absent = 8 => "absent",
+        /// A channel it depends on has too few samples yet for a velocity and an acceleration.
+        Starting = 9 => "starting",
+        /// It depends on the base motion, and no link is declared to stand still.
+        NoStance = 10 => "no_stance",
+        /// Neither the model nor a possible contact explains the readings of the F/T sensors of its
+        /// sub-tree.
+        Unexplained = 11 => "unexplained",
+        /// A sensor it depends on repeats its readings instead of measuring ([`Quality::FROZEN`]),
+        /// and is not saturated.
+        Frozen = 12 => "frozen",
+        /// A reading it depends on contradicts the ones before it ([`Quality::IMPLAUSIBLE`]).
+        Implausible = 13 => "implausible",
+        /// The readings contradict what is configured: something else explains them better, such as
+        /// an encoder reversed, a sensor turned, or a contact that has been there since the start.
+        Contradicted = 14 => "contradicted",
+    }
 }
-
-coded!(Reason {
-    None = "",
-    NeverSeen = "never_seen",
-    Stale = "stale",
-    Saturated = "saturated",
-    DeviceFault = "device_fault",
-    Undetermined = "undetermined",
-    Uncertain = "uncertain",
-    NotFinite = "not_finite",
-    Absent = "absent",
-    Starting = "starting",
-    NoStance = "no_stance",
-    Unexplained = "unexplained",
-    Frozen = "frozen",
-    Implausible = "implausible",
-    Contradicted = "contradicted",
-});
 
 impl Reason {
     /// The reason that `quality` gives, or [`Reason::None`]; `faults` are the flags that count as a
@@ -151,9 +134,7 @@ impl TorqueEstimate {
     /// The valid joints.
     #[must_use]
     pub fn joints(&self) -> &[JointTorque] {
-        self.joints
-            .get(..self.count as usize)
-            .unwrap_or(&self.joints)
+        valid(&self.joints, self.count)
     }
 }
 
@@ -258,17 +239,13 @@ impl ContactEstimate {
     /// The valid contacts.
     #[must_use]
     pub fn contacts(&self) -> &[ContactWrench] {
-        self.contacts
-            .get(..self.count as usize)
-            .unwrap_or(&self.contacts)
+        valid(&self.contacts, self.count)
     }
 
     /// The valid residuals.
     #[must_use]
     pub fn residuals(&self) -> &[Residual] {
-        self.residuals
-            .get(..self.residual_count as usize)
-            .unwrap_or(&self.residuals)
+        valid(&self.residuals, self.residual_count)
     }
 }
 

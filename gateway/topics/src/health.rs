@@ -4,178 +4,126 @@
 use core::fmt;
 
 use crate::code::coded;
-use crate::{Code, Header, MAX_BUSES, MAX_CHANNELS, Name, Nanos};
+use crate::{Code, Header, MAX_BUSES, MAX_CHANNELS, Name, Nanos, valid};
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use zerocopy::FromBytes;
 
-/// The counters of one device.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, ZeroCopySend)]
-pub enum Counter {
-    /// Frames with one of the device's identifiers.
-    Frames = 0,
-    /// Readings published.
-    Readings = 1,
-    /// Frames with a length that the protocol does not define.
-    Length = 2,
-    /// Frames with a value that the protocol does not define.
-    Value = 3,
-    /// Half readings (one of two frames) whose other half did not arrive.
-    Unpaired = 4,
-    /// Lost readings, from gaps in the device's own sequence number.
-    Lost = 5,
-    /// Frames too many: replies without a request, a frame that has come before.
-    Unexpected = 6,
-    /// Configuration replies that contradict an earlier one: the device's settings have changed.
-    Changed = 7,
-    /// Readings with a saturated channel.
-    Saturated = 8,
-    /// Readings with a device fault.
-    DeviceFault = 9,
-    /// Number of silences longer than the device's maximum.
-    Silences = 10,
-    /// Number of start sequences begun.
-    Starts = 11,
-    /// Readings dropped because their stamp was not later than the last one's.
-    Backward = 12,
-    /// Readings with a fault of the drive that does not concern the reading.
-    DriveFault = 13,
-    /// Frames to the device that could not be sent.
-    Unsent = 14,
-    /// Readings with a value that has stopped to change although it was never that still: the
-    /// gateway's own judgement, see [`DeviceHealth::frozen_axes`].
-    Frozen = 15,
-    /// Readings with a value beyond the sensor's full scale.
-    OutOfRange = 16,
+coded! {
+    /// The counters of one device.
+    pub enum Counter {
+        /// Frames with one of the device's identifiers.
+        Frames = 0 => "frames",
+        /// Readings published.
+        Readings = 1 => "readings",
+        /// Frames with a length that the protocol does not define.
+        Length = 2 => "bad_length",
+        /// Frames with a value that the protocol does not define.
+        Value = 3 => "bad_value",
+        /// Half readings (one of two frames) whose other half did not arrive.
+        Unpaired = 4 => "unpaired",
+        /// Lost readings, from gaps in the device's own sequence number.
+        Lost = 5 => "lost",
+        /// Frames too many: replies without a request, a frame that has come before.
+        Unexpected = 6 => "unexpected",
+        /// Configuration replies that contradict an earlier one: the device's settings have
+        /// changed.
+        Changed = 7 => "changed",
+        /// Readings with a saturated channel.
+        Saturated = 8 => "saturated",
+        /// Readings with a device fault.
+        DeviceFault = 9 => "device_fault",
+        /// Number of silences longer than the device's maximum.
+        Silences = 10 => "silences",
+        /// Number of start sequences begun.
+        Starts = 11 => "starts",
+        /// Readings dropped because their stamp was not later than the last one's.
+        Backward = 12 => "backward_stamp",
+        /// Readings with a fault of the drive that does not concern the reading.
+        DriveFault = 13 => "drive_fault",
+        /// Frames to the device that could not be sent.
+        Unsent = 14 => "unsent",
+        /// Readings with a value that has stopped to change although it was never that still: the
+        /// gateway's own judgement, see [`DeviceHealth::frozen_axes`].
+        Frozen = 15 => "frozen",
+        /// Readings with a value beyond the sensor's full scale.
+        OutOfRange = 16 => "out_of_range",
+    }
 }
 
-coded!(Counter {
-    Frames = "frames",
-    Readings = "readings",
-    Length = "bad_length",
-    Value = "bad_value",
-    Unpaired = "unpaired",
-    Lost = "lost",
-    Unexpected = "unexpected",
-    Changed = "changed",
-    Saturated = "saturated",
-    DeviceFault = "device_fault",
-    Silences = "silences",
-    Starts = "starts",
-    Backward = "backward_stamp",
-    DriveFault = "drive_fault",
-    Unsent = "unsent",
-    Frozen = "frozen",
-    OutOfRange = "out_of_range",
-});
-
-/// The state of a link to a bus.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, ZeroCopySend)]
-pub enum LinkState {
-    /// Frames can be received and sent.
-    #[default]
-    Up = 0,
-    /// The interface exists but is down.
-    Down = 1,
-    /// The interface does not exist.
-    Gone = 2,
-    /// The controller is bus-off after too many errors.
-    BusOff = 3,
-    /// The replayed log has ended.
-    Ended = 4,
-    /// The interface is up, but has no carrier: its controller or its peer is not running.
-    NoCarrier = 5,
+coded! {
+    /// The state of a link to a bus.
+    #[derive(Default)]
+    pub enum LinkState {
+        /// Frames can be received and sent.
+        #[default]
+        Up = 0 => "up",
+        /// The interface exists but is down.
+        Down = 1 => "down",
+        /// The interface does not exist.
+        Gone = 2 => "gone",
+        /// The controller is bus-off after too many errors.
+        BusOff = 3 => "bus_off",
+        /// The replayed log has ended.
+        Ended = 4 => "ended",
+        /// The interface is up, but has no carrier: its controller or its peer is not running.
+        NoCarrier = 5 => "no_carrier",
+    }
 }
 
-coded!(LinkState {
-    Up = "up",
-    Down = "down",
-    Gone = "gone",
-    BusOff = "bus_off",
-    Ended = "ended",
-    NoCarrier = "no_carrier",
-});
-
-/// The error state of a CAN controller (ISO 11898-1), as the kernel reports it.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, ZeroCopySend)]
-pub enum Controller {
-    /// Not known: a virtual interface, or not asked yet.
-    #[default]
-    Unknown = 0,
-    /// Error active: the normal state.
-    Active = 1,
-    /// An error counter has reached the warning limit (96).
-    Warning = 2,
-    /// Error passive: an error counter has reached 128.
-    Passive = 3,
-    /// Bus-off: the transmit error counter has passed 255.
-    BusOff = 4,
-    /// Stopped by its host.
-    Stopped = 5,
-    /// Asleep.
-    Sleeping = 6,
+coded! {
+    /// The error state of a CAN controller (ISO 11898-1), as the kernel reports it.
+    #[derive(Default)]
+    pub enum Controller {
+        /// Not known: a virtual interface, or not asked yet.
+        #[default]
+        Unknown = 0 => "unknown",
+        /// Error active: the normal state.
+        Active = 1 => "active",
+        /// An error counter has reached the warning limit (96).
+        Warning = 2 => "warning",
+        /// Error passive: an error counter has reached 128.
+        Passive = 3 => "passive",
+        /// Bus-off: the transmit error counter has passed 255.
+        BusOff = 4 => "bus_off",
+        /// Stopped by its host.
+        Stopped = 5 => "stopped",
+        /// Asleep.
+        Sleeping = 6 => "sleeping",
+    }
 }
 
-coded!(Controller {
-    Unknown = "unknown",
-    Active = "active",
-    Warning = "warning",
-    Passive = "passive",
-    BusOff = "bus_off",
-    Stopped = "stopped",
-    Sleeping = "sleeping",
-});
-
-/// What an error frame of a CAN interface reports; one frame may report several.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, ZeroCopySend)]
-pub enum BusError {
-    /// A frame could not be sent in time.
-    TxTimeout = 0,
-    /// Arbitration was lost.
-    ArbitrationLost = 1,
-    /// The controller's receive buffer overflowed: frames were lost.
-    RxOverflow = 2,
-    /// The controller's transmit buffer overflowed.
-    TxOverflow = 3,
-    /// An error counter reached the warning limit.
-    Warning = 4,
-    /// The controller became error passive.
-    Passive = 5,
-    /// The controller became error active again.
-    Active = 6,
-    /// A violation of the protocol: bit, form, stuff or other error.
-    Protocol = 7,
-    /// The transceiver reports a fault, such as a broken wire or a short circuit.
-    Transceiver = 8,
-    /// Nobody acknowledged a frame.
-    NoAck = 9,
-    /// The controller became bus-off.
-    BusOff = 10,
-    /// A bus error.
-    Bus = 11,
-    /// The controller was restarted.
-    Restarted = 12,
+coded! {
+    /// What an error frame of a CAN interface reports; one frame may report several.
+    pub enum BusError {
+        /// A frame could not be sent in time.
+        TxTimeout = 0 => "tx_timeout",
+        /// Arbitration was lost.
+        ArbitrationLost = 1 => "arbitration_lost",
+        /// The controller's receive buffer overflowed: frames were lost.
+        RxOverflow = 2 => "rx_overflow",
+        /// The controller's transmit buffer overflowed.
+        TxOverflow = 3 => "tx_overflow",
+        /// An error counter reached the warning limit.
+        Warning = 4 => "warning",
+        /// The controller became error passive.
+        Passive = 5 => "passive",
+        /// The controller became error active again.
+        Active = 6 => "active",
+        /// A violation of the protocol: bit, form, stuff or other error.
+        Protocol = 7 => "protocol",
+        /// The transceiver reports a fault, such as a broken wire or a short circuit.
+        Transceiver = 8 => "transceiver",
+        /// Nobody acknowledged a frame.
+        NoAck = 9 => "no_ack",
+        /// The controller became bus-off.
+        BusOff = 10 => "bus_off",
+        /// A bus error.
+        Bus = 11 => "bus_error",
+        /// The controller was restarted.
+        Restarted = 12 => "restarted",
+    }
 }
-
-coded!(BusError {
-    TxTimeout = "tx_timeout",
-    ArbitrationLost = "arbitration_lost",
-    RxOverflow = "rx_overflow",
-    TxOverflow = "tx_overflow",
-    Warning = "warning",
-    Passive = "passive",
-    Active = "active",
-    Protocol = "protocol",
-    Transceiver = "transceiver",
-    NoAck = "no_ack",
-    BusOff = "bus_off",
-    Bus = "bus_error",
-    Restarted = "restarted",
-});
 
 /// What the kernel knows of an interface and its CAN controller; zero where it does not tell.
 #[repr(C)]
@@ -266,77 +214,35 @@ pub struct BusHealth {
 impl BusHealth {
     /// Without a name and with all counts zero.
     pub const EMPTY: Self = Self {
-        name: Name::EMPTY,
-        frames: 0,
-        unclaimed: 0,
-        dropped: 0,
-        error_frames: 0,
-        errors: [0; BusError::ALL.len()],
-        sent: 0,
-        send_failures: 0,
-        queue_full: 0,
-        link_losses: 0,
-        published: 0,
-        publish_failures: 0,
-        connections: 0,
         last_frame: Nanos::MIN,
         last_turn: Nanos::MIN,
         load: f64::NAN,
-        frame_rate: 0.0,
-        interface: InterfaceHealth {
-            rx_frames: 0,
-            tx_frames: 0,
-            rx_bytes: 0,
-            tx_bytes: 0,
-            rx_errors: 0,
-            tx_errors: 0,
-            rx_dropped: 0,
-            tx_dropped: 0,
-            controller: Controller::Unknown.in_memory(),
-            tx_error_counter: 0,
-            rx_error_counter: 0,
-            bit_rate: 0,
-            data_bit_rate: 0,
-            restart_ms: 0,
-            fd: 0,
-            listen_only: 0,
-        },
-        link: LinkState::Up.in_memory(),
-        reserved: 0,
+        ..zerocopy::transmute!([0_u8; size_of::<Self>()])
     };
 }
 
-/// The state of a device's bring-up.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, ZeroCopySend)]
-pub enum DeviceState {
-    /// The gateway keeps silent, as boards require after power-on.
-    #[default]
-    Waiting = 0,
-    /// The gateway asks for the board's configuration.
-    Asking = 1,
-    /// The board was started; no reading received yet.
-    Starting = 2,
-    /// Readings arrive.
-    Streaming = 3,
-    /// No reading for longer than the maximum silence, or none at all after many starts; the board
-    /// is started again.
-    Silent = 4,
-    /// Not usable: see the refusal.
-    Refused = 5,
-    /// The board was stopped.
-    Stopped = 6,
+coded! {
+    /// The state of a device's bring-up.
+    #[derive(Default)]
+    pub enum DeviceState {
+        /// The gateway keeps silent, as boards require after power-on.
+        #[default]
+        Waiting = 0 => "waiting",
+        /// The gateway asks for the board's configuration.
+        Asking = 1 => "asking",
+        /// The board was started; no reading received yet.
+        Starting = 2 => "starting",
+        /// Readings arrive.
+        Streaming = 3 => "streaming",
+        /// No reading for longer than the maximum silence, or none at all after many starts; the
+        /// board is started again.
+        Silent = 4 => "silent",
+        /// Not usable: see the refusal.
+        Refused = 5 => "refused",
+        /// The board was stopped.
+        Stopped = 6 => "stopped",
+    }
 }
-
-coded!(DeviceState {
-    Waiting = "waiting",
-    Asking = "asking",
-    Starting = "starting",
-    Streaming = "streaming",
-    Silent = "silent",
-    Refused = "refused",
-    Stopped = "stopped",
-});
 
 /// Why a device is not usable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -419,38 +325,25 @@ impl Refusal {
     #[must_use]
     #[allow(clippy::cast_possible_truncation)]
     pub const fn from_code(code: u32) -> Option<Self> {
-        match code {
-            1 => Some(Self::NoFullScale),
-            2 => Some(Self::Changed),
-            3 => Some(Self::NoCalibration),
-            4 => Some(Self::NoAnswer),
-            5 => Some(Self::NotMapped),
-            0x100..=0x1FF => Some(Self::ZeroFullScale {
-                channel: (code & 0xFF) as u8,
-            }),
-            0x200..=0x2FF => Some(Self::BadCalibration {
-                channel: (code & 0xFF) as u8,
-            }),
-            0x1_0000..=0x1_FFFF => Some(Self::OtherDevice {
-                profile: (code & 0xFFFF) as u16,
-            }),
-            0x2_0000..=0x2_FFFF => Some(Self::Rejected {
-                object: (code & 0xFFFF) as u16,
-            }),
-            0x3_0000..=0x3_FFFF => Some(Self::Implausible {
-                object: (code & 0xFFFF) as u16,
-            }),
-            0x4_0000..=0x4_FFFF => Some(Self::Untold {
-                object: (code & 0xFFFF) as u16,
-            }),
-            0x5_0000..=0x5_FFFF => Some(Self::SwitchedOff {
-                object: (code & 0xFFFF) as u16,
-            }),
-            0x4000_0000..=0x5FFF_FFFF => Some(Self::OtherIdentifier {
+        let (channel, profile, object) = (code as u8, code as u16, code as u16);
+        Some(match code {
+            1 => Self::NoFullScale,
+            2 => Self::Changed,
+            3 => Self::NoCalibration,
+            4 => Self::NoAnswer,
+            5 => Self::NotMapped,
+            0x100..=0x1FF => Self::ZeroFullScale { channel },
+            0x200..=0x2FF => Self::BadCalibration { channel },
+            0x1_0000..=0x1_FFFF => Self::OtherDevice { profile },
+            0x2_0000..=0x2_FFFF => Self::Rejected { object },
+            0x3_0000..=0x3_FFFF => Self::Implausible { object },
+            0x4_0000..=0x4_FFFF => Self::Untold { object },
+            0x5_0000..=0x5_FFFF => Self::SwitchedOff { object },
+            0x4000_0000..=0x5FFF_FFFF => Self::OtherIdentifier {
                 id: code & 0x1FFF_FFFF,
-            }),
-            _ => None,
-        }
+            },
+            _ => return None,
+        })
     }
 }
 
@@ -604,15 +497,13 @@ pub struct GatewayHealth {
 
 impl DeviceHealth {
     /// Without a name and with all counts zero.
-    pub const EMPTY: Self = Self {
-        name: Name::EMPTY,
-        counters: [0; Counter::ALL.len()],
-        state: DeviceState::Waiting.in_memory(),
-        refusal: 0,
-        bus: 0,
-        frozen_axes: 0,
-        beyond_axes: 0,
-    };
+    pub const EMPTY: Self = zerocopy::transmute!([0_u8; size_of::<Self>()]);
+
+    /// The value of a counter.
+    #[must_use]
+    pub fn count(&self, counter: Counter) -> u64 {
+        (self.counters.get(counter as usize).copied()).unwrap_or_default()
+    }
 }
 
 impl GatewayHealth {
@@ -634,17 +525,13 @@ impl GatewayHealth {
     /// The valid buses.
     #[must_use]
     pub fn buses(&self) -> &[BusHealth] {
-        self.buses
-            .get(..self.bus_count as usize)
-            .unwrap_or(&self.buses)
+        valid(&self.buses, self.bus_count)
     }
 
     /// The valid devices.
     #[must_use]
     pub fn devices(&self) -> &[DeviceHealth] {
-        self.devices
-            .get(..self.device_count as usize)
-            .unwrap_or(&self.devices)
+        valid(&self.devices, self.device_count)
     }
 }
 

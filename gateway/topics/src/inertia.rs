@@ -3,7 +3,7 @@
 //!
 //! Published about once a second. A reader that opens late receives the last one.
 
-use crate::{Header, MAX_LINKS, MAX_SENSORS, Name};
+use crate::{Header, MAX_LINKS, MAX_SENSORS, Name, valid};
 use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use zerocopy::FromBytes;
@@ -115,17 +115,13 @@ impl InertiaEstimate {
     /// The valid links.
     #[must_use]
     pub fn links(&self) -> &[LinkInertia] {
-        self.links
-            .get(..self.link_count as usize)
-            .unwrap_or(&self.links)
+        valid(&self.links, self.link_count)
     }
 
     /// The valid offsets.
     #[must_use]
     pub fn offsets(&self) -> &[SensorOffset] {
-        self.offsets
-            .get(..self.offset_count as usize)
-            .unwrap_or(&self.offsets)
+        valid(&self.offsets, self.offset_count)
     }
 }
 

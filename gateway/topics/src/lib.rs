@@ -61,6 +61,11 @@ pub const MAX_SUBTREES: usize = MAX_SENSORS + 1;
 /// Maximum number of buses of one gateway; also the maximum number of publishers of samples.
 pub const MAX_BUSES: usize = 16;
 
+/// The first `count` of `entries`.
+fn valid<E>(entries: &[E], count: u32) -> &[E] {
+    entries.get(..count as usize).unwrap_or(entries)
+}
+
 /// The program in the book compiles.
 #[cfg(all(doctest, feature = "ipc"))]
 mod documents {

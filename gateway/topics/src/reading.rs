@@ -129,37 +129,27 @@ pub enum Reading {
     Skin(Skin),
 }
 
-/// The kind of a reading. The kind of a channel is that of its main reading; a channel may also
-/// carry readings of other kinds, such as the temperature of a force/torque sensor.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, ZeroCopySend)]
-pub enum Kind {
-    /// [`Reading::Joint`].
-    Joint = 0,
-    /// [`Reading::Wrench`].
-    Wrench = 1,
-    /// [`Reading::Imu`].
-    Imu = 2,
-    /// [`Reading::Gauges`].
-    Gauges = 3,
-    /// [`Reading::Temperature`].
-    Temperature = 4,
-    /// [`Reading::Actuator`].
-    Actuator = 5,
-    /// [`Reading::Skin`].
-    Skin = 6,
-}
-
 // The words are also the first parts of CSV columns.
-coded!(Kind {
-    Joint = "joint",
-    Wrench = "wrench",
-    Imu = "imu",
-    Gauges = "gauges",
-    Temperature = "temperature",
-    Actuator = "actuator",
-    Skin = "skin",
-});
+coded! {
+    /// The kind of a reading. The kind of a channel is that of its main reading; a channel may also
+    /// carry readings of other kinds, such as the temperature of a force/torque sensor.
+    pub enum Kind {
+        /// [`Reading::Joint`].
+        Joint = 0 => "joint",
+        /// [`Reading::Wrench`].
+        Wrench = 1 => "wrench",
+        /// [`Reading::Imu`].
+        Imu = 2 => "imu",
+        /// [`Reading::Gauges`].
+        Gauges = 3 => "gauges",
+        /// [`Reading::Temperature`].
+        Temperature = 4 => "temperature",
+        /// [`Reading::Actuator`].
+        Actuator = 5 => "actuator",
+        /// [`Reading::Skin`].
+        Skin = 6 => "skin",
+    }
+}
 
 /// The largest number of values of a reading.
 pub const VALUES: usize = 16;

@@ -9,30 +9,23 @@ use iceoryx2_bb_derive_macros::ZeroCopySend;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use zerocopy::FromBytes;
 
-/// Source of an acquisition stamp, from worst to best.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, ZeroCopySend)]
-pub enum StampKind {
-    /// No stamp (a log without time stamps): only the order is known.
-    #[default]
-    None = 0,
-    /// Read from the clock by the receiving program, after reception.
-    User = 1,
-    /// As recorded in a log.
-    Log = 2,
-    /// The kernel's receive stamp.
-    Software = 3,
-    /// The CAN adapter's receive stamp, converted to CLOCK_MONOTONIC.
-    Hardware = 4,
+coded! {
+    /// Source of an acquisition stamp, from worst to best.
+    #[derive(Default, PartialOrd, Ord)]
+    pub enum StampKind {
+        /// No stamp (a log without time stamps): only the order is known.
+        #[default]
+        None = 0 => "none",
+        /// Read from the clock by the receiving program, after reception.
+        User = 1 => "user",
+        /// As recorded in a log.
+        Log = 2 => "log",
+        /// The kernel's receive stamp.
+        Software = 3 => "software",
+        /// The CAN adapter's receive stamp, converted to CLOCK_MONOTONIC.
+        Hardware = 4 => "hardware",
+    }
 }
-
-coded!(StampKind {
-    None = "none",
-    User = "user",
-    Log = "log",
-    Software = "software",
-    Hardware = "hardware",
-});
 
 /// Saturation of one axis of a six-axis sensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

@@ -158,15 +158,14 @@ fn base_plot(unit: &str, some: &[(usize, &BaseParameterOutcome)]) -> Plot {
             )
         })
         .collect();
-    let mut x = PlotAxis::new("number of the base parameter");
-    x.range = Some((first as f64 - 0.7, last as f64 + 0.7));
+    let range = (first as f64 - 0.7, last as f64 + 0.7);
     Plot {
         title: match unit {
             "kg" => "Masses".into(),
             "kg m" => "First moments".into(),
             _ => "Moments of inertia".into(),
         },
-        x,
+        x: PlotAxis::within("number of the base parameter", range),
         y: PlotAxis::new(&format!("[{}]", unit_text(unit))),
         series: vec![
             Trace::dots("CAD", Ink::Cad, cad),
@@ -178,9 +177,7 @@ fn base_plot(unit: &str, some: &[(usize, &BaseParameterOutcome)]) -> Plot {
 
 /// Small parameters vanish beside large ones; in standard deviations all are comparable.
 fn change_plot(all: &[BaseParameterOutcome]) -> Plot {
-    let mut x = PlotAxis::new("number of the base parameter");
     let (from, to) = (0.3, all.len() as f64 + 0.7);
-    x.range = Some((from, to));
     let change = |b: &BaseParameterOutcome| (b.identified - b.cad) / b.deviation;
     let dots = (1..)
         .zip(all)
@@ -188,7 +185,7 @@ fn change_plot(all: &[BaseParameterOutcome]) -> Plot {
     Plot {
         title: "Change from CAD".into(),
         note: "in standard deviations".into(),
-        x,
+        x: PlotAxis::within("number of the base parameter", (from, to)),
         y: PlotAxis::new("change / σ"),
         series: vec![
             Trace::band(
@@ -211,8 +208,7 @@ pub(super) fn excitation(outcome: &Outcome) -> Option<String> {
             .enumerate()
             .map(|(i, v)| (i as f64 + 1.0, *v, f64::NAN, f64::NAN))
             .collect();
-        let mut x = PlotAxis::new("number of the combination, best excited first");
-        x.range = Some((0.3, values.len() as f64 + 0.7));
+        let (from, to) = (0.3, values.len() as f64 + 0.7);
         body.push(report::paragraph(&format!(
             "Each dot is one combination of parameters. The logs determine those above 1; those \
              below 1 keep their CAD values. {} are above 1. The robot's structure makes {} \
@@ -224,14 +220,10 @@ pub(super) fn excitation(outcome: &Outcome) -> Option<String> {
         body.push(report::figures(&[Plot {
             title: "Excitation spectrum".into(),
             note: "singular values, relative to the prior standard deviation".into(),
-            x,
+            x: PlotAxis::within("number of the combination, best excited first", (from, to)),
             y: PlotAxis::log("singular value"),
             series: vec![
-                Trace::line(
-                    "",
-                    Ink::Fitted,
-                    vec![(0.3, 1.0), (values.len() as f64 + 0.7, 1.0)],
-                ),
+                Trace::line("", Ink::Fitted, vec![(from, 1.0), (to, 1.0)]),
                 Trace::dots("", Ink::Identified, dots),
             ],
             ..Plot::default()
@@ -369,8 +361,7 @@ pub(super) fn sessions(outcome: &Outcome) -> Option<String> {
     let mut body = vec![times.html(), rotors.html()];
     body.extend(outcome.calibrations.iter().map(|c| calibration(c).html()));
     for log in &outcome.logs {
-        let tables = [offsets(log), friction(log)].map(|table| table.html());
-        let tables: Vec<String> = tables.into_iter().filter(|t| !t.is_empty()).collect();
+        let tables = report::tables([offsets(log), friction(log)]);
         if !tables.is_empty() {
             let title = format!("Offsets and friction: {}", log.file);
             body.push(report::folded(&title, false, &tables));

@@ -78,14 +78,8 @@ pub(super) fn logs(outcome: &Outcome) -> Option<String> {
             );
         }
     }
-    Some(report::section(
-        "The logs",
-        &[relative, used]
-            .iter()
-            .filter(|table| !table.is_empty())
-            .map(ReportTable::html)
-            .collect::<Vec<_>>(),
-    ))
+    let tables = report::tables([relative, used]);
+    Some(report::section("The logs", &tables))
 }
 
 /// The errors of the identified parameters and of the CAD with fitted offsets, with bars on one
@@ -222,11 +216,7 @@ fn joint_table(log: &LogOutcome) -> Vec<String> {
             table.row(cells);
         }
     }
-    [joints, routes, moving]
-        .iter()
-        .filter(|t| !t.is_empty())
-        .map(ReportTable::html)
-        .collect()
+    report::tables([joints, routes, moving])
 }
 
 /// The values of a curve and their error.

@@ -143,15 +143,9 @@ fn parse_columns(rest: &[u8]) -> (Option<Columns>, &[u8]) {
             b' ',
             after @ ..,
         ] => {
-            let direction = if *d == b'T' {
-                FrameDirection::Sent
-            } else {
-                FrameDirection::Received
-            };
-            (
-                Some((direction, (*brs == b'B', *esi == b'E'))),
-                after.trim_ascii_start(),
-            )
+            let direction = FrameDirection::of(*d == b'T');
+            let columns = (direction, (*brs == b'B', *esi == b'E'));
+            (Some(columns), after.trim_ascii_start())
         }
         _ => (None, rest),
     }
@@ -192,10 +186,7 @@ fn parse_log_frame(
         [b'#', flags, rest @ ..] => {
             let flags = hex(*flags).ok_or(LineError::Flags)?;
             (
-                Format::Fd {
-                    bit_rate_switch: flags & 1 != 0,
-                    error_state: flags & 2 != 0,
-                },
+                Format::fd(flags & 1 != 0, flags & 2 != 0),
                 Frame::MAX_LEN,
                 rest,
             )
@@ -320,10 +311,7 @@ fn parse_screen_frame(
     }
     let format = match (fd, error) {
         (true, true) => return Err(LineError::Contradiction),
-        (true, false) => Format::Fd {
-            bit_rate_switch,
-            error_state,
-        },
+        (true, false) => Format::fd(bit_rate_switch, error_state),
         (false, true) => Format::Error,
         (false, false) => Format::Classic,
     };

@@ -378,14 +378,14 @@ impl RobotReader {
     /// # Errors
     /// [`Unavailable`], the reason why there is none.
     pub fn joint(&self, channel: ChannelHandle) -> Result<Measured<JointState>, Unavailable> {
-        match self.measured(channel, Quality::UNTRUSTED_ENCODER)? {
-            (Reading::Joint(value), quality, age) => Ok(Measured {
-                value,
-                quality,
-                age,
-            }),
-            _ => Err(Unavailable::Unknown),
-        }
+        self.measured(
+            channel,
+            Quality::UNTRUSTED_ENCODER,
+            |reading| match reading {
+                Reading::Joint(value) => Some(value),
+                _ => None,
+            },
+        )
     }
 
     /// A force/torque sensor's reading.
@@ -393,14 +393,10 @@ impl RobotReader {
     /// # Errors
     /// [`Unavailable`], the reason why there is none.
     pub fn wrench(&self, channel: ChannelHandle) -> Result<Measured<Wrench>, Unavailable> {
-        match self.measured(channel, Quality::DEVICE_FAULT)? {
-            (Reading::Wrench(value), quality, age) => Ok(Measured {
-                value,
-                quality,
-                age,
-            }),
-            _ => Err(Unavailable::Unknown),
-        }
+        self.measured(channel, Quality::DEVICE_FAULT, |reading| match reading {
+            Reading::Wrench(value) => Some(value),
+            _ => None,
+        })
     }
 
     /// An inertial measurement unit's reading.
@@ -408,21 +404,18 @@ impl RobotReader {
     /// # Errors
     /// [`Unavailable`], the reason why there is none.
     pub fn imu(&self, channel: ChannelHandle) -> Result<Measured<Imu>, Unavailable> {
-        match self.measured(channel, Quality::DEVICE_FAULT)? {
-            (Reading::Imu(value), quality, age) => Ok(Measured {
-                value,
-                quality,
-                age,
-            }),
-            _ => Err(Unavailable::Unknown),
-        }
+        self.measured(channel, Quality::DEVICE_FAULT, |reading| match reading {
+            Reading::Imu(value) => Some(value),
+            _ => None,
+        })
     }
 
-    fn measured(
+    fn measured<T>(
         &self,
         channel: ChannelHandle,
         faults: Quality,
-    ) -> Result<(Reading, Quality, Nanos), Unavailable> {
+        of: impl FnOnce(Reading) -> Option<T>,
+    ) -> Result<Measured<T>, Unavailable> {
         let gateway = self.described(Publisher::Gateway);
         let number = self.index(channel.0, gateway.map(|d| d.header.epoch))?;
         let sample = self.samples.get(number).and_then(Option::as_ref);
@@ -440,8 +433,11 @@ impl RobotReader {
                 return Err(Unavailable::Withheld { reason, channel });
             }
         }
-        let reading = sample.reading().ok_or(Unavailable::Unknown)?;
-        Ok((reading, quality, age))
+        Ok(Measured {
+            value: sample.reading().and_then(of).ok_or(Unavailable::Unknown)?,
+            quality,
+            age,
+        })
     }
 
     /// The names of the joints whose torques are estimated, in order of their numbers; empty before

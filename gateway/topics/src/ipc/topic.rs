@@ -59,8 +59,9 @@ pub trait Topic: ZeroCopySend + FromBytes + Copy + Debug + 'static {
     fn is_valid(&self) -> bool;
 }
 
+/// `topic!(payload, suffix, quality, what makes it valid)`.
 macro_rules! topic {
-    ($payload:ty, $suffix:literal, $is_valid:expr, $quality:expr) => {
+    ($payload:ty, $suffix:literal, $quality:expr, $is_valid:expr) => {
         impl Topic for $payload {
             const SUFFIX: &'static str = $suffix;
             const QUALITY: QualityOfService = $quality;
@@ -83,70 +84,54 @@ fn within<E>(count: u32, entries: &[E]) -> bool {
     count as usize <= entries.len()
 }
 
-const NODES: usize = 64;
+/// A quality: the most writers and readers, and how many payloads wait and are given to who opens
+/// late.
+const fn quality(
+    [publishers, subscribers]: [usize; 2],
+    [buffer, history]: [usize; 2],
+) -> QualityOfService {
+    QualityOfService {
+        publishers,
+        subscribers,
+        nodes: 64,
+        buffer,
+        history,
+    }
+}
 
 // One publisher per bus, 2 MB each. 256 samples are 32 ms of the 8000 frames a second that a bus of
 // 1 Mbit/s carries at most, and a quarter of a second of ten channels at 100 Hz.
 topic!(
     Sample,
     "samples",
-    |sample| sample.reading().is_some(),
-    QualityOfService {
-        publishers: crate::MAX_BUSES,
-        subscribers: 32,
-        nodes: NODES,
-        buffer: 256,
-        history: 0
-    }
+    quality([crate::MAX_BUSES, 32], [256, 0]),
+    |sample| sample.reading().is_some()
 );
 // One writer each in gateway and estimator, and one more of each while a predecessor still ends.
-topic!(
-    Description,
-    "description",
-    |d| {
-        d.publisher.get().is_some()
-            && within(d.count, &d.entries)
-            && (d.entries().iter()).all(|e| e.role.get().is_some() && e.kind.get().is_some())
-    },
-    QualityOfService {
-        publishers: 4,
-        subscribers: 32,
-        nodes: NODES,
-        buffer: 1,
-        history: 1
-    }
-);
+topic!(Description, "description", quality([4, 32], [1, 1]), |d| {
+    d.publisher.get().is_some()
+        && within(d.count, &d.entries)
+        && (d.entries().iter()).all(|e| e.role.get().is_some() && e.kind.get().is_some())
+});
 // A control loop needs only the newest; 64 let a recorder pause for 64 ms at 1 kHz.
 topic!(
     TorqueEstimate,
     "estimate/torque",
+    quality([1, 24], [64, 0]),
     |e| {
         within(e.count, &e.joints) && e.joints().iter().all(|joint| joint.reason.get().is_some())
-    },
-    QualityOfService {
-        publishers: 1,
-        subscribers: 24,
-        nodes: NODES,
-        buffer: 64,
-        history: 0
     }
 );
 topic!(
     ContactEstimate,
     "estimate/contact",
+    quality([1, 24], [64, 0]),
     |e| {
         within(e.count, &e.contacts)
             && within(e.residual_count, &e.residuals)
             && e.contacts()
                 .iter()
                 .all(|contact| contact.reason.get().is_some())
-    },
-    QualityOfService {
-        publishers: 1,
-        subscribers: 24,
-        nodes: NODES,
-        buffer: 64,
-        history: 0
     }
 );
 // Sent once a second: a reader that reads every few seconds misses none, and one that opens late
@@ -154,36 +139,25 @@ topic!(
 topic!(
     InertiaEstimate,
     "estimate/inertia",
-    |e| within(e.link_count, &e.links) && within(e.offset_count, &e.offsets),
-    QualityOfService {
-        publishers: 1,
-        subscribers: 16,
-        nodes: NODES,
-        buffer: 4,
-        history: 1
-    }
+    quality([1, 16], [4, 1]),
+    |e| within(e.link_count, &e.links) && within(e.offset_count, &e.offsets)
 );
 // Of one joint after another, for a person who asks: who misses some sees the next round.
 topic!(
     TorqueBudget,
     "estimate/budget",
+    quality([1, 4], [8, 0]),
     |b| {
         within(b.count, &b.parts)
             && b.torque.reason.get().is_some()
             && b.parts().iter().all(|part| part.source.get().is_some())
-    },
-    QualityOfService {
-        publishers: 1,
-        subscribers: 4,
-        nodes: NODES,
-        buffer: 8,
-        history: 0
     }
 );
 // For people and monitors: a reader that misses some sees the next one.
 topic!(
     DriveEstimate,
     "estimate/drive",
+    quality([1, 8], [16, 0]),
     |e| {
         within(e.count, &e.drives)
             && within(e.candidate_count, &e.candidates)
@@ -191,32 +165,20 @@ topic!(
                 .iter()
                 .all(|own| own.agreement.get().is_some() && own.reason.get().is_some())
             && e.candidates().iter().all(|own| own.kind.get().is_some())
-    },
-    QualityOfService {
-        publishers: 1,
-        subscribers: 8,
-        nodes: NODES,
-        buffer: 16,
-        history: 0
     }
 );
 topic!(
     ContactDeclaration,
     "contact/declared",
-    |_| true,
-    QualityOfService {
-        publishers: 8,
-        subscribers: 8,
-        nodes: NODES,
-        buffer: 64,
-        history: 1
-    }
+    quality([8, 8], [64, 1]),
+    |_| true
 );
 // One gateway and one estimator per robot: the health service admits one publisher, so the second
 // is refused.
 topic!(
     GatewayHealth,
     "health/gateway",
+    quality([1, 16], [1, 1]),
     |h| {
         within(h.bus_count, &h.buses)
             && within(h.device_count, &h.devices)
@@ -225,24 +187,11 @@ topic!(
             && h.devices()
                 .iter()
                 .all(|device| device.state.get().is_some())
-    },
-    QualityOfService {
-        publishers: 1,
-        subscribers: 16,
-        nodes: NODES,
-        buffer: 1,
-        history: 1
     }
 );
 topic!(
     EstimatorHealth,
     "health/estimator",
-    |_| true,
-    QualityOfService {
-        publishers: 1,
-        subscribers: 16,
-        nodes: NODES,
-        buffer: 8,
-        history: 1
-    }
+    quality([1, 16], [8, 1]),
+    |_| true
 );
