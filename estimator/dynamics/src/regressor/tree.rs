@@ -134,9 +134,9 @@ impl Regressor {
 
     /// Writes all non-zero entries.
     ///
-    /// In base coordinates a link's six rows are its part of `Y_n` already; each joint between the link
-    /// and the base takes its row from them, as the component along its axis: six products per column
-    /// of mass and first moment, three for the others, whose force is zero.
+    /// In base coordinates a link's six rows are its part of `Y_n` already; each joint between the
+    /// link and the base takes its row from them, as the component along its axis: six products per
+    /// column of mass and first moment, three for the others, whose force is zero.
     #[inline(always)]
     fn fill(&mut self, kinematics: &Kinematics) {
         let Self {
