@@ -334,7 +334,7 @@ impl<S: MessageSink> Messages<S> {
             message.numbers(&joints, |(_, joint)| joint.torque);
             message.numbers(&joints, |(_, joint)| joint.standard_deviation);
             message.sequence(&joints, |message, (_, joint)| {
-                message.bool(joint.valid == 1)
+                message.bool(joint.valid == 1);
             });
             message.texts(&joints, |(_, joint)| reason(joint));
             message.texts(&joints, |(_, joint)| {

@@ -93,7 +93,8 @@ pub(crate) fn has_other_faults(quality: Quality, told: Quality) -> bool {
     (quality.0 ^ told.0) & carried.0 != 0
 }
 
-/// The code that tells of the faults in `quality`: `none`, that of the sensor, or that of the drive.
+/// The code that tells of the faults in `quality`: `none`, that of the sensor, or that of the
+/// drive.
 pub(crate) const fn fault_code<T: Copy>(quality: Quality, [none, sensor, drive]: [T; 3]) -> T {
     if quality.contains(Quality::DEVICE_FAULT) {
         sensor
