@@ -2,7 +2,7 @@
 //! restarts of its daemons and damage of its domain.
 
 use crate::described::{DescriptionReader, next};
-use proprio_topics::csv::{Series, Value, What};
+use proprio_topics::csv::{Series, SeriesKind, Value};
 use proprio_topics::ipc::{Domain, DomainConfig, DomainError, PortError, Reader, TakeError, Topic};
 use proprio_topics::{
     ContactDeclaration, ContactEstimate, Description, DriveEstimate, EstimatorHealth,
@@ -341,7 +341,7 @@ impl Listener {
     }
 
     /// The number of a series, which is added if it is new.
-    fn number(&mut self, what: What, name: &str) -> usize {
+    fn number(&mut self, what: SeriesKind, name: &str) -> usize {
         let known = (self.series.iter()).position(|one| one.what == what && one.name == name);
         known.unwrap_or_else(|| {
             let name = name.to_owned();
@@ -358,7 +358,7 @@ impl Listener {
                 && let Some(kind) = entry.kind.get()
                 && let Some(number) = numbers.get_mut(entry.index as usize)
             {
-                *number = Some(self.number(What::Channel(kind), entry.name.as_str()));
+                *number = Some(self.number(SeriesKind::Channel(kind), entry.name.as_str()));
             }
         }
         (self.numbers, self.epoch) = (numbers, description.header.epoch);
@@ -367,7 +367,7 @@ impl Listener {
     fn name_contacts(&mut self, description: &Description) {
         for entry in description.entries() {
             if entry.role == Role::Contact {
-                self.number(What::Contact, entry.name.as_str());
+                self.number(SeriesKind::Contact, entry.name.as_str());
             }
         }
     }
@@ -386,7 +386,7 @@ impl Listener {
         while let Some(reader) = &mut self.declarations
             && let Some(declared) = next(reader).map_err(failed)?
         {
-            let number = self.number(What::Contact, declared.contact.as_str());
+            let number = self.number(SeriesKind::Contact, declared.contact.as_str());
             let event = Event {
                 t: declared.header.acquired,
                 epoch: declared.header.epoch,

@@ -4,7 +4,7 @@ use crate::cdr::CdrMessage;
 use crate::definitions::{self, Definition};
 use crate::diagnostics;
 use crate::listener::Heard;
-use proprio_topics::csv::{Series, Value, What};
+use proprio_topics::csv::{Series, SeriesKind, Value};
 use proprio_topics::{
     Agreement, Candidate, ContactEstimate, ContactState, Description, DriveEstimate, Entry,
     EstimatorHealth, GatewayHealth, Imu, JointState, JointTorque, Kind, Nanos, Quality, Reading,
@@ -166,7 +166,7 @@ impl<S: MessageSink> Messages<S> {
         for (number, one) in series.iter().enumerate().skip(self.known.len()) {
             let name = &one.name;
             let (topic, definition, standard) = match one.what {
-                What::Channel(kind) => (
+                SeriesKind::Channel(kind) => (
                     format!("/samples/{kind}/{name}"),
                     definitions::sample(kind),
                     match kind {
@@ -177,7 +177,7 @@ impl<S: MessageSink> Messages<S> {
                         _ => None,
                     },
                 ),
-                What::Contact => (format!("/declared/{name}"), definitions::declared(), None),
+                SeriesKind::Contact => (format!("/declared/{name}"), definitions::declared(), None),
             };
             let own = self.sink.add(&topic, &definition, Some(number))?;
             let standard = match standard {
@@ -269,7 +269,7 @@ impl<S: MessageSink> Messages<S> {
             return Ok(());
         };
         match (known.series.what, value) {
-            (What::Channel(main), Value::Reading(reading, quality)) => {
+            (SeriesKind::Channel(main), Value::Reading(reading, quality)) => {
                 let kind = reading.kind();
                 let name = known.series.name.as_str();
                 let own = match known.others.get(kind.word()) {
@@ -308,7 +308,7 @@ impl<S: MessageSink> Messages<S> {
                     _ => Ok(()),
                 }
             }
-            (What::Contact, Value::Contact(state)) => match &known.own {
+            (SeriesKind::Contact, Value::Contact(state)) => match &known.own {
                 Some(own) => sink.send(own, wall, &declared(t, state)),
                 None => Ok(()),
             },
@@ -387,7 +387,7 @@ impl<S: MessageSink> Messages<S> {
     #[must_use]
     pub fn state(&self, joint: &str, t: Nanos) -> JointState {
         let is_joint = |known: &&KnownSeries<S::Channel>| {
-            known.series.what == What::Channel(Kind::Joint) && known.series.name == joint
+            known.series.what == SeriesKind::Channel(Kind::Joint) && known.series.name == joint
         };
         let known = self.known.iter().find(is_joint);
         let known = known.filter(|known| t <= known.holds_until);

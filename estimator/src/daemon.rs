@@ -160,7 +160,7 @@ async fn serve(config: &Config, setup: Setup, domain: &DomainConfig) -> anyhow::
             domain = new;
             gateway = Watch::default();
         }
-        gateway_log.tell(gateway.look(&domain, &config.robot, now), &channels, now);
+        gateway_log.tell(gateway.poll(&domain, &config.robot, now), &channels, now);
         if watchdog.is_some() && now - Nanos(last_turn.load(Relaxed)) < STALLED {
             let _ = sd_notify::notify(&[NotifyState::Watchdog]);
         }

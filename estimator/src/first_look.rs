@@ -181,7 +181,7 @@ mod tests {
     use super::*;
     use crate::config::Config;
     use proprio_identification::FindingCode;
-    use proprio_topics::csv::{Row, SeriesValue, TableReader, What};
+    use proprio_topics::csv::{Row, SeriesKind, SeriesValue, TableReader};
     use std::path::Path;
 
     /// The samples of a recorded session, as they would be received; forces and torques multiplied
@@ -194,8 +194,8 @@ mod tests {
             .series()
             .iter()
             .map(|series| match series.what {
-                What::Channel(kind) => setup.robot.channel(kind, &series.name),
-                What::Contact => None,
+                SeriesKind::Channel(kind) => setup.robot.channel(kind, &series.name),
+                SeriesKind::Contact => None,
             })
             .collect();
         let (mut row, mut seen) = (Row::default(), Vec::new());

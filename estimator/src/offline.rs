@@ -32,10 +32,10 @@
 use crate::assessment::Assessor;
 use crate::drive::DriveRow;
 use crate::pipeline::{Estimate, Pipeline};
-use crate::sample_log::{ColumnOwner, MissingChannels, check_columns, check_skins, targets};
+use crate::sample_log::{ColumnOwner, MissingChannels, check_columns, check_skins, column_owners};
 use crate::setup::Setup;
 use proprio_identification::online::Hypothesis;
-use proprio_topics::csv::{Row, Series, SeriesValue, TableReader, TableReport, Value, What};
+use proprio_topics::csv::{Row, Series, SeriesKind, SeriesValue, TableReader, TableReport, Value};
 use proprio_topics::{
     Agreement, ContactWrench, DriveEstimate, DriveTorque, JointTorque, Kind, NO_CAUSE, Nanos,
     Reason, Residual,
@@ -218,9 +218,9 @@ pub fn run_on_log(
 fn owners(setup: &Setup, series: &[Series]) -> Result<Vec<Option<ColumnOwner>>, MissingChannels> {
     check_columns(&setup.robot, series, |_| true)?;
     check_skins(setup, series)?;
-    let mut owners = targets(&setup.robot, series);
+    let mut owners = column_owners(&setup.robot, series);
     for (series, owner) in series.iter().zip(&mut owners) {
-        if let What::Channel(kind @ Kind::Skin) = series.what {
+        if let SeriesKind::Channel(kind @ Kind::Skin) = series.what {
             let channel = setup.channel(kind, &series.name);
             *owner = channel.map(ColumnOwner::Channel);
         }

@@ -10,7 +10,9 @@ use proprio_identification::dataset::DatasetError;
 use proprio_identification::dataset::recording::SkippedRows;
 use proprio_identification::robot::Channel;
 use proprio_identification::{Dataset, LogRole, Recording, Robot, parallel};
-use proprio_topics::csv::{self, Row, Series, SeriesValue, TableReader, TableReport, Value, What};
+use proprio_topics::csv::{
+    self, Row, Series, SeriesKind, SeriesValue, TableReader, TableReport, Value,
+};
 use proprio_topics::{Kind, Nanos};
 use std::io::Read;
 use std::ops::Range;
@@ -111,10 +113,10 @@ pub(crate) enum ColumnOwner {
 }
 
 /// Per series of a log its channel or contact; none if the robot has no such.
-pub(crate) fn targets(robot: &Robot, series: &[Series]) -> Vec<Option<ColumnOwner>> {
+pub(crate) fn column_owners(robot: &Robot, series: &[Series]) -> Vec<Option<ColumnOwner>> {
     let target = |series: &Series| match series.what {
-        What::Channel(kind) => robot.channel(kind, &series.name).map(ColumnOwner::Channel),
-        What::Contact => robot.contact(&series.name).map(ColumnOwner::Contact),
+        SeriesKind::Channel(kind) => robot.channel(kind, &series.name).map(ColumnOwner::Channel),
+        SeriesKind::Contact => robot.contact(&series.name).map(ColumnOwner::Contact),
     };
     series.iter().map(target).collect()
 }
@@ -138,13 +140,13 @@ fn read_in_segments(
     let mut ended = fill(&mut text, &mut log, block)?;
     let Some((header, mut before)) = header(&text) else {
         let mut rows = TableReader::new(text.chain(log))?;
-        let (mut part, targets) = PartialRecording::new(robot, &rows)?;
-        part.take(&mut rows, &targets)?;
+        let (mut part, owners) = PartialRecording::new(robot, &rows)?;
+        part.take(&mut rows, &owners)?;
         return Ok(part.finish());
     };
     let header: Vec<u8> = text.drain(..header).collect();
     let table = TableReader::new(header.as_slice())?;
-    let (mut all, targets) = PartialRecording::new(robot, &table)?;
+    let (mut all, owners) = PartialRecording::new(robot, &table)?;
     let empty = all.clone();
     all.report = table.report().clone();
     loop {
@@ -163,7 +165,7 @@ fn read_in_segments(
                     return Ok(None);
                 }
                 let mut part = empty.clone();
-                part.take(&mut table.further(segment), &targets)?;
+                part.take(&mut table.further(segment), &owners)?;
                 Ok(part.is_stamped.then(|| (part, lines(segment))))
             },
         );
@@ -171,7 +173,7 @@ fn read_in_segments(
             parts.into_iter().collect::<Result<_, _>>()?;
         let Some(parts) = parts.filter(|_| end > 0 || ended) else {
             let mut rest = empty;
-            rest.take(&mut table.further(text.chain(log)), &targets)?;
+            rest.take(&mut table.further(text.chain(log)), &owners)?;
             all.append(rest, before);
             break;
         };
@@ -245,19 +247,19 @@ impl PartialRecording {
     ) -> Result<(Self, Vec<Option<ColumnOwner>>), SampleLogError> {
         // A log may lack an F/T sensor, but no joint and no IMU.
         check_columns(robot, table.series(), |c| c.kind != Kind::Wrench)?;
-        let targets = targets(robot, table.series());
+        let owners = column_owners(robot, table.series());
         let part = Self {
             recording: Recording::new(robot),
             is_stamped: true,
             report: TableReport::default(),
         };
-        Ok((part, targets))
+        Ok((part, owners))
     }
 
     fn take<R: Read>(
         &mut self,
         rows: &mut TableReader<R>,
-        targets: &[Option<ColumnOwner>],
+        owners: &[Option<ColumnOwner>],
     ) -> Result<(), csv::TableError> {
         let (mut row, mut pseudo) = (Row::default(), Nanos::ZERO);
         while rows.next_row(&mut row)? {
@@ -267,7 +269,7 @@ impl PartialRecording {
                 pseudo
             });
             for SeriesValue { series, value } in &row.items {
-                match (targets.get(*series).copied().flatten(), value) {
+                match (owners.get(*series).copied().flatten(), value) {
                     (Some(ColumnOwner::Channel(channel)), Value::Reading(reading, quality)) => {
                         self.recording.push(channel, t, reading, *quality);
                     }
@@ -316,8 +318,8 @@ pub fn check_columns(
     let columns: Vec<String> = series
         .iter()
         .filter_map(|series| match series.what {
-            What::Channel(kind) => Some(column(kind, &series.name)),
-            What::Contact => None,
+            SeriesKind::Channel(kind) => Some(column(kind, &series.name)),
+            SeriesKind::Contact => None,
         })
         .collect();
     let missing: Vec<String> = robot
@@ -350,7 +352,7 @@ pub fn check_columns(
 /// # Errors
 /// The channels that it lacks.
 pub(crate) fn check_skins(setup: &Setup, series: &[Series]) -> Result<(), MissingChannels> {
-    let is_skin = |series: &&Series| series.what == What::Channel(Kind::Skin);
+    let is_skin = |series: &&Series| series.what == SeriesKind::Channel(Kind::Skin);
     let logged: Vec<&str> = series
         .iter()
         .filter(is_skin)
@@ -379,8 +381,8 @@ mod tests {
     /// The recording of a log that is not cut.
     fn read_whole(robot: &Robot, log: &str) -> Result<Recording, SampleLogError> {
         let mut rows = TableReader::new(log.as_bytes())?;
-        let (mut part, targets) = PartialRecording::new(robot, &rows)?;
-        part.take(&mut rows, &targets)?;
+        let (mut part, owners) = PartialRecording::new(robot, &rows)?;
+        part.take(&mut rows, &owners)?;
         Ok(part.finish())
     }
 

@@ -6,7 +6,7 @@ use proprio_estimator::differentiate::Window;
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
 use proprio_identification::prior::cad_root;
-use proprio_topics::csv::{Row, TableReader, Value, What};
+use proprio_topics::csv::{Row, SeriesKind, TableReader, Value};
 use proprio_topics::{Nanos, Reading, Source, TorqueBudget};
 use std::cell::{Cell, RefCell};
 use std::path::Path;
@@ -55,7 +55,7 @@ fn last(change: &Change<'_>) -> (Vec<f64>, Vec<TorqueBudget>) {
     for (number, row) in rows.iter().enumerate() {
         for item in &row.items {
             let series = &series[item.series];
-            let (What::Channel(kind), Value::Reading(mut reading, quality)) =
+            let (SeriesKind::Channel(kind), Value::Reading(mut reading, quality)) =
                 (series.what, item.value)
             else {
                 continue;

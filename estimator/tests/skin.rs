@@ -10,7 +10,7 @@ use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
 use proprio_estimator::skin::{Taxel, TaxelMap};
 use proprio_identification::robot::BaseMotion;
-use proprio_topics::csv::{Columns, Series, TableWriter, Value, What};
+use proprio_topics::csv::{Columns, Series, SeriesKind, TableWriter, Value};
 use proprio_topics::{
     ContactState, Imu, JointState as Encoder, Kind, Nanos, Quality, Reading, Reason, Skin,
     Wrench as ForceTorque,
@@ -424,12 +424,12 @@ fn a_table_gives_the_live_estimates() {
     let mut series: Vec<Series> = setup
         .channels()
         .map(|(kind, name)| Series {
-            what: What::Channel(kind),
+            what: SeriesKind::Channel(kind),
             name: name.into(),
         })
         .collect();
     series.push(Series {
-        what: What::Contact,
+        what: SeriesKind::Contact,
         name: "hand".into(),
     });
     let mut table = TableWriter::new(Vec::new(), &series, Columns::All).unwrap();

@@ -92,7 +92,7 @@ async fn serve(config: &Path, plan: Plan, domain: &DomainConfig) -> anyhow::Resu
             _ = interrupt.recv() => break "SIGINT",
             Some(asked) = asked.recv() => gateway.begin(asked),
             () = tokio::time::sleep(LOOK), if gateway.operator.waits() => {
-                gateway.operator.look(&mut gateway.threads, Monotonic.now());
+                gateway.operator.take_replies(&mut gateway.threads, Monotonic.now());
             }
             _ = ticks.tick() => {
                 if let Some(why) = gateway.tick() {
@@ -219,7 +219,7 @@ impl<'a> Gateway<'a> {
         let _ = self.ports.health.send(&self.health, now);
         let _ = self.ports.description.update_connections();
         self.renew(now);
-        self.operator.look(&mut self.threads, now);
+        self.operator.take_replies(&mut self.threads, now);
         if self.threads.iter().any(BusThread::is_lost) {
             return Some("a bus thread has ended unexpectedly");
         }

@@ -141,7 +141,7 @@ impl Channels {
         };
         if let Reading::Wrench(wrench) = &reading.reading {
             let ([fx, fy, fz], [tx, ty, tz]) = (wrench.force, wrench.torque);
-            let frozen = repeats.look(&[fx, fy, fz, tx, ty, tz], quality, LONGEST_COPIES);
+            let frozen = repeats.judge(&[fx, fy, fz, tx, ty, tz], quality, LONGEST_COPIES);
             let beyond = beyond(wrench, running.device.full_scale());
             if frozen != 0 {
                 quality |= Quality::FROZEN;

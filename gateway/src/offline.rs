@@ -8,7 +8,7 @@ use crate::log::{self, LogFormat, Stamps, candump};
 use crate::plan::{BusPlan, ChannelPlan, DevicePlan, Plan};
 use crate::status::BusStatus;
 use proprio_drivers::{Board, Format, Frame, Frames, Mode};
-use proprio_topics::csv::{self, Columns, Series, SeriesValue, Value, What};
+use proprio_topics::csv::{self, Columns, Series, SeriesKind, SeriesValue, Value};
 use proprio_topics::{Counter, JointState, Nanos, Quality, Reading, Refusal, Sample, StampKind};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt::Display;
@@ -210,7 +210,7 @@ pub fn decode_with(
 ) -> Result<DecodeReport, ConversionError> {
     let series: Vec<Series> = (plan.channels.iter())
         .map(|c| Series {
-            what: What::Channel(c.kind),
+            what: SeriesKind::Channel(c.kind),
             name: c.name.clone(),
         })
         .collect();
@@ -602,9 +602,9 @@ impl<'p, W: Write> TableEncoder<'p, W> {
     /// The channel of a series, with its number.
     fn channel(&mut self, series: &Series) -> Option<(u32, &'p ChannelPlan)> {
         let is_it =
-            |c: &&ChannelPlan| What::Channel(c.kind) == series.what && c.name == series.name;
+            |c: &&ChannelPlan| SeriesKind::Channel(c.kind) == series.what && c.name == series.name;
         let channel = self.plan.channels.iter().find(is_it);
-        if channel.is_none() && series.what != What::Contact {
+        if channel.is_none() && series.what != SeriesKind::Contact {
             self.report.unknown_channels.push(series.name.clone());
         }
         let channel = channel?;

@@ -118,7 +118,7 @@ impl Operator {
     }
 
     /// Takes the replies of the devices until `now`, and answers.
-    pub(crate) fn look(&mut self, threads: &mut [BusThread], now: Nanos) {
+    pub(crate) fn take_replies(&mut self, threads: &mut [BusThread], now: Nanos) {
         for (thread, bus) in threads.iter_mut().zip(0..) {
             while let Some((device, reply)) = thread.requests.take() {
                 self.replied(bus, device, reply);
@@ -466,10 +466,11 @@ full_scale_nm = [31.0, 31.0, 31.0]
             device: "ft".to_owned(),
         };
         let mut answered = rig.begin(tare(), now);
-        rig.operator.look(&mut rig.threads, now + REPLY_TIME);
+        rig.operator
+            .take_replies(&mut rig.threads, now + REPLY_TIME);
         assert!(answered.try_recv().is_err() && rig.operator.waits());
         let late = now + REPLY_TIME + Nanos(1);
-        rig.operator.look(&mut rig.threads, late);
+        rig.operator.take_replies(&mut rig.threads, late);
         let error = answered.try_recv().unwrap()["error"].to_string();
         assert!(error.contains("no reply of ft"), "{error}");
         assert!(!rig.operator.waits());

@@ -58,7 +58,7 @@ impl SharedMemory {
 
     /// Makes the writer anew if a domain was passed; until it can be made, samples are lost and
     /// counted.
-    fn look(&mut self, now: Nanos) {
+    fn renew(&mut self, now: Nanos) {
         let robot = &self.robot;
         let create = |domain: &Domain| Writer::create(domain, robot, domain.epoch());
         match self.renewing.ports(now, create) {
@@ -73,13 +73,13 @@ impl SharedMemory {
 
 impl Sink for SharedMemory {
     fn publish(&mut self, sample: &mut Sample, now: Nanos) -> Result<u32, SinkError> {
-        self.look(now);
+        self.renew(now);
         let sent = self.writer.send(sample, now).map_err(|_| SinkError)?;
         Ok(u32::try_from(sent.connected).unwrap_or(u32::MAX))
     }
 
     fn idle(&mut self, now: Nanos) {
-        self.look(now);
+        self.renew(now);
         // A reader that cannot be connected now is connected, or counted as a failure, with the
         // next sample.
         let _ = self.writer.update_connections();

@@ -61,16 +61,16 @@ pub(crate) struct BusThread {
     /// The way to a new domain.
     pub(crate) renewal: Arc<Renewal>,
     /// What tells other gateways that this one commands boards on the interface.
-    _claim: Option<UnixDatagram>,
+    _interface_lock: Option<UnixDatagram>,
     /// The mode that overrides the devices' own.
     pub(crate) mode: Option<Mode>,
-    thread: Finished,
+    thread: JoinOnce,
 }
 
 /// A thread that can be joined once.
-struct Finished(Option<JoinHandle<()>>);
+struct JoinOnce(Option<JoinHandle<()>>);
 
-impl Finished {
+impl JoinOnce {
     fn is_finished(&self) -> bool {
         self.0.as_ref().is_none_or(JoinHandle::is_finished)
     }
@@ -163,9 +163,9 @@ impl BusThread {
             ended,
             requests,
             renewal,
-            _claim: claim,
+            _interface_lock: claim,
             mode,
-            thread: Finished(Some(thread)),
+            thread: JoinOnce(Some(thread)),
         })
     }
 }
@@ -297,9 +297,9 @@ impl BusThread {
             ended: Arc::default(),
             requests,
             renewal: Arc::default(),
-            _claim: None,
+            _interface_lock: None,
             mode: matches!(bus.source, FrameSource::Replay { .. }).then_some(Mode::Listen),
-            thread: Finished(None),
+            thread: JoinOnce(None),
         };
         (this, inbox)
     }

@@ -69,7 +69,7 @@ pub(crate) fn start(
                 let Some(frames) = listen(&bus.source, &domain, &stop) else {
                     continue;
                 };
-                for finding in look(&plan, number, &frames) {
+                for finding in examine(&plan, number, &frames) {
                     if reported.insert((bus.name.clone(), finding.clone())) {
                         tracing::warn!(bus = bus.name, "{finding}");
                     }
@@ -108,7 +108,7 @@ fn listen(source: &FrameSource, domain: &str, stop: &AtomicBool) -> Option<Vec<F
 
 /// What is to be told of bus number `number` with these frames: texts that do not change from look
 /// to look.
-fn look(plan: &Plan, number: usize, frames: &[Frame]) -> Vec<String> {
+fn examine(plan: &Plan, number: usize, frames: &[Frame]) -> Vec<String> {
     let Some(bus) = plan.buses.get(number) else {
         return Vec::new();
     };
@@ -313,7 +313,7 @@ mod tests {
     fn warnings(of: &[Vec<Frame>]) -> Vec<String> {
         let mut frames = of.concat();
         frames.sort_by_key(|frame| frame.t);
-        look(&plan(), 0, &frames)
+        examine(&plan(), 0, &frames)
     }
 
     #[test]

@@ -7,7 +7,7 @@ use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOp
 use mcap::{McapError, parse_record};
 use proprio_bridge::cdr::CdrReader;
 use proprio_drivers::{Format, Frame, Id};
-use proprio_topics::csv::{Columns, Series, TableWriter, Value, What};
+use proprio_topics::csv::{Columns, Series, SeriesKind, TableWriter, Value};
 use proprio_topics::{ContactState, Kind, Nanos, Quality, Reading, StampKind, VALUES};
 use std::collections::BTreeMap;
 use std::io::{self, Read, Write};
@@ -119,7 +119,7 @@ fn is_whole_attachment(record: &[u8]) -> bool {
 struct SampleTable<W: Write> {
     /// Of each channel: the number of its series in the recording, its column once the columns are
     /// known, and its kind.
-    channels: BTreeMap<u16, (usize, Option<usize>, What)>,
+    channels: BTreeMap<u16, (usize, Option<usize>, SeriesKind)>,
     /// By their number in the recording.
     series: BTreeMap<usize, Series>,
     output: Option<W>,
@@ -195,7 +195,7 @@ impl<W: Write> SampleTable<W> {
         &mut self,
         channel: u16,
         column: Option<usize>,
-        what: What,
+        what: SeriesKind,
         message: &[u8],
     ) -> Result<(), ReadError> {
         let Some((t, value)) = value(what, message) else {
@@ -350,11 +350,11 @@ fn frame(is_fd: bool, message: &[u8]) -> Option<Frame> {
 /// The series that has this topic.
 fn series_of(topic: &str) -> Option<Series> {
     let (what, name) = if let Some(name) = topic.strip_prefix("/declared/") {
-        (What::Contact, name)
+        (SeriesKind::Contact, name)
     } else {
         let (kind, name) = topic.strip_prefix("/samples/")?.split_once('/')?;
         let kind = Kind::ALL.into_iter().find(|known| known.word() == kind)?;
-        (What::Channel(kind), name)
+        (SeriesKind::Channel(kind), name)
     };
     Some(Series {
         what,
@@ -363,12 +363,12 @@ fn series_of(topic: &str) -> Option<Series> {
 }
 
 /// A message's stamp and value; `None` if it is none of its kind.
-fn value(what: What, message: &[u8]) -> Option<(Nanos, Value)> {
+fn value(what: SeriesKind, message: &[u8]) -> Option<(Nanos, Value)> {
     let mut parsed = CdrReader::new(message)?;
     let t = Nanos(parsed.i64()?);
     let three = |parsed: &mut CdrReader<'_>| Some([parsed.f64()?, parsed.f64()?, parsed.f64()?]);
     let value = match what {
-        What::Channel(kind) => {
+        SeriesKind::Channel(kind) => {
             let quality = Quality(parsed.u32()?);
             let mut values = [0.0; VALUES];
             for value in values.iter_mut().take(kind.fields().len()) {
@@ -376,7 +376,7 @@ fn value(what: What, message: &[u8]) -> Option<(Nanos, Value)> {
             }
             Value::Reading(Reading::from_values(kind, &values)?, quality)
         }
-        What::Contact => Value::Contact(ContactState {
+        SeriesKind::Contact => Value::Contact(ContactState {
             active: parsed.bool()?,
             position: three(&mut parsed)?,
             position_std: parsed.f64()?,

@@ -6,7 +6,7 @@ use proprio_drivers::{Format, Frame, Id};
 use proprio_recording::{
     About, ReadError, Recorder, Ring, about, frames, is_mcap, to_estimates, to_table,
 };
-use proprio_topics::csv::{Columns, Series, TableWriter, Value, What};
+use proprio_topics::csv::{Columns, Series, SeriesKind, TableWriter, Value};
 use proprio_topics::{
     ContactEstimate, ContactState, ContactWrench, Description, Entry, Header, JointTorque, Kind,
     MAX_CONTACTS, MAX_JOINTS, MAX_SUBTREES, Name, Nanos, Publisher, Quality, Reading, Reason,
@@ -28,12 +28,12 @@ fn series() -> Vec<Series> {
     ];
     let mut series: Vec<Series> = (channels.into_iter())
         .map(|(kind, name)| Series {
-            what: What::Channel(kind),
+            what: SeriesKind::Channel(kind),
             name: name.to_owned(),
         })
         .collect();
     series.push(Series {
-        what: What::Contact,
+        what: SeriesKind::Contact,
         name: "hand".to_owned(),
     });
     series

@@ -5,7 +5,7 @@ use crate::{PATIENCE, now, until};
 use proprio_estimator::offline::EstimateTable;
 use proprio_estimator::pipeline::Estimate;
 use proprio_estimator::setup::Setup;
-use proprio_topics::csv::{self, Columns, Series, Value, What};
+use proprio_topics::csv::{self, Columns, Series, SeriesKind, Value};
 use proprio_topics::ipc::{Domain, Reader, Topic};
 use proprio_topics::{
     BusHealth, ContactEstimate, Counter, DeviceHealth, Kind, Nanos, Reading, Sample, TorqueEstimate,
@@ -220,7 +220,7 @@ impl Recorder {
         let series: Vec<Series> = channels
             .iter()
             .map(|(kind, name)| Series {
-                what: What::Channel(*kind),
+                what: SeriesKind::Channel(*kind),
                 name: name.clone(),
             })
             .collect();
@@ -332,7 +332,7 @@ impl Truth {
                 let found = reader
                     .series()
                     .iter()
-                    .position(|s| s.what == What::Channel(Kind::Joint) && s.name == *j);
+                    .position(|s| s.what == SeriesKind::Channel(Kind::Joint) && s.name == *j);
                 found.unwrap_or_else(|| panic!("the truth has no joint {j}"))
             })
             .collect();

@@ -16,7 +16,7 @@ use proprio_gateway::plan::Plan;
 use proprio_identification::{LogRole, identify};
 use proprio_tests::watch::{Newest, Recorder, rows};
 use proprio_tests::{Rig, can, now, uml};
-use proprio_topics::csv::{self, Columns, Row, Series, Value, What};
+use proprio_topics::csv::{self, Columns, Row, Series, SeriesKind, Value};
 use proprio_topics::{EstimatorHealth, GatewayHealth, Kind, Nanos, Reading};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -149,7 +149,7 @@ fn values(table: &str) -> Values {
     while reader.next_row(&mut row).expect("a row") {
         for item in &row.items {
             let Series {
-                what: What::Channel(kind),
+                what: SeriesKind::Channel(kind),
                 name,
             } = &series[item.series]
             else {

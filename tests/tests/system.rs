@@ -6,7 +6,7 @@ use nix::sys::stat::Mode;
 use nix::unistd::{Pid, mkfifo};
 use proprio_tests::watch::{Newest, open, valid_since};
 use proprio_tests::{Arm, PATIENCE, Rig, now, until};
-use proprio_topics::csv::{Row, TableReader, Value, What};
+use proprio_topics::csv::{Row, SeriesKind, TableReader, Value};
 use proprio_topics::{GatewayHealth, Kind, Nanos, TorqueEstimate};
 use serde_json::Value as Json;
 use std::fs::{self, File};
@@ -183,12 +183,12 @@ fn a_running_system_says_what_it_does() {
     assert!(
         series
             .iter()
-            .any(|s| s.what == What::Contact && s.name == "hand"),
+            .any(|s| s.what == SeriesKind::Contact && s.name == "hand"),
         "{series:?}"
     );
     let ft = series
         .iter()
-        .position(|s| s.what == What::Channel(Kind::Wrench));
+        .position(|s| s.what == SeriesKind::Channel(Kind::Wrench));
     let (mut row, mut last, mut count) = (Row::default(), Nanos::MIN, 0);
     while reader.next_row(&mut row).expect("readable") {
         let t = row.t.expect("a stamp");

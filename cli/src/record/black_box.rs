@@ -295,7 +295,7 @@ impl Faults {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use proprio_topics::csv::What;
+    use proprio_topics::csv::SeriesKind;
     use proprio_topics::{
         BusHealth, Description, Entry, GatewayHealth, Header, JointState, JointTorque, Kind,
         MAX_JOINTS, Name, Publisher, Reading, Reason, Role, TorqueEstimate,
@@ -306,7 +306,7 @@ mod tests {
     #[test]
     fn what_becomes_wrong_is_told_once() {
         let series = [Series {
-            what: What::Channel(Kind::Joint),
+            what: SeriesKind::Channel(Kind::Joint),
             name: "elbow".to_owned(),
         }];
         let name = |text: &str| Name::new(text).unwrap();

@@ -73,7 +73,7 @@ struct Follower<'a> {
 
 impl Follower<'_> {
     /// Looks for what has come or gone.
-    fn look(&mut self) {
+    fn poll(&mut self) {
         if self.domain.as_ref().is_some_and(|it| !it.is_intact()) {
             // Gateway and estimator make a damaged domain again.
             (self.feeds, self.snapshot) = (Feeds::default(), RobotState::default());
@@ -142,9 +142,9 @@ impl Follower<'_> {
         let (Some(domain), feeds) = (&self.domain, &mut self.feeds) else {
             return;
         };
-        gateway.0 = feeds.gateway.look(domain, robot, now);
+        gateway.0 = feeds.gateway.poll(domain, robot, now);
         gateway.1 = feeds.gateway.newest().map(|it| Arc::new(*it));
-        estimator.0 = feeds.estimator.look(domain, robot, now);
+        estimator.0 = feeds.estimator.poll(domain, robot, now);
         estimator.1 = feeds.estimator.newest().map(|it| Arc::new(*it));
     }
 }
@@ -169,7 +169,7 @@ pub(super) fn follow(
         let now = monotonic();
         if now >= look {
             look = now + LOOK;
-            follower.look();
+            follower.poll();
         }
         follower.take();
         if now >= show {

@@ -205,7 +205,7 @@ impl Arrival<'_> {
     /// Its quality, judged by the samples before it, too.
     fn judged(&mut self, values: [f64; 6]) -> Quality {
         match &mut self.sanity {
-            Some(sanity) => sanity.look(self.t, &values, self.quality, self.max_silence),
+            Some(sanity) => sanity.judge(self.t, &values, self.quality, self.max_silence),
             None => self.quality,
         }
     }

@@ -102,7 +102,7 @@ impl Sanity {
         quality: Quality,
     ) -> [f64; 3] {
         // One that stops at once does so with the value itself, which is judged.
-        let is_doubtful = self.derivatives.look(t, &measured, quality);
+        let is_doubtful = self.derivatives.judge(t, &measured, quality);
         match is_doubtful && !self.derivatives.has_stopped() {
             true => [f64::NAN; 3],
             false => measured,
@@ -112,18 +112,18 @@ impl Sanity {
     /// The flags of a reading at `t`, NaN where it has fewer than six values, with `quality` as its
     /// device has it. A reading that repeats itself is no news: after `max_silence` it is frozen,
     /// if its noise makes that impossible.
-    pub(super) fn look(
+    pub(super) fn judge(
         &mut self,
         t: Nanos,
         values: &[f64; 6],
         quality: Quality,
         max_silence: Nanos,
     ) -> Quality {
-        let jumps = self.jumps.look(t, values, quality);
+        let jumps = self.jumps.judge(t, values, quality);
         let period = Nanos::from_seconds(self.jumps.period()).0.max(1);
         let least = u32::try_from(max_silence.0 / period).unwrap_or(LONGEST_COPIES);
         let least = least.clamp(2, LONGEST_COPIES);
-        let is_repeated = self.repeats.look(values, quality, least) != 0;
+        let is_repeated = self.repeats.judge(values, quality, least) != 0;
         self.is_still = self.is_encoder && (is_repeated || self.jumps.has_stopped());
         self.is_stuck &= self.jumps.has_stopped();
         let mut flags = quality;
@@ -177,7 +177,7 @@ mod tests {
             let noise = [7919, 6151, 4099, 3571, 2203, 1447]
                 .map(|a| a * measurement * measurement % 10_007);
             let t = Nanos::from_millis(ms);
-            let flags = sanity.look(t, &noise.map(|n| n as f64), Quality::GOOD, max_silence);
+            let flags = sanity.judge(t, &noise.map(|n| n as f64), Quality::GOOD, max_silence);
             if flags.intersects(Quality::FROZEN) {
                 frozen.push(k);
             }
@@ -196,7 +196,7 @@ mod tests {
         let mut sanity = Sanity::of_encoder(0.0);
         let check = |sanity: &mut Sanity, ms: i64, position: f64| {
             let position = [position, f64::NAN, f64::NAN, f64::NAN, f64::NAN, f64::NAN];
-            sanity.look(
+            sanity.judge(
                 Nanos::from_millis(ms),
                 &position,
                 Quality::GOOD,

@@ -123,7 +123,7 @@ fn temperatures_count_by_their_stamps() {
         while reader.next_row(&mut row).unwrap() {
             for item in &row.items {
                 let of = &series[item.series];
-                if let (What::Channel(kind), Value::Reading(reading, quality)) =
+                if let (SeriesKind::Channel(kind), Value::Reading(reading, quality)) =
                     (of.what, &item.value)
                     && let Some(channel) = pipeline.setup().robot.channel(kind, &of.name)
                 {
@@ -241,7 +241,8 @@ fn without_a_temperature_torques_are_less_certain() {
         assert!(reader.next_row(&mut row).unwrap());
         for item in &row.items {
             let of = &series[item.series];
-            if let (What::Channel(kind), Value::Reading(reading, quality)) = (of.what, &item.value)
+            if let (SeriesKind::Channel(kind), Value::Reading(reading, quality)) =
+                (of.what, &item.value)
                 && let Some(channel) = pipeline.setup().robot.channel(kind, &of.name)
             {
                 pipeline.push(channel, t, reading, *quality);

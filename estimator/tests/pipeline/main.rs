@@ -15,7 +15,7 @@ use proprio_estimator::config::{Config, ContactModel, Occurrence};
 use proprio_estimator::offline;
 use proprio_estimator::pipeline::{Estimate, Pipeline};
 use proprio_estimator::setup::Setup;
-use proprio_topics::csv::{Row, TableReader, Value, What};
+use proprio_topics::csv::{Row, SeriesKind, TableReader, Value};
 use proprio_topics::{
     ContactState, JointState, JointTorque, Kind, Nanos, Quality, Reading, Reason, Wrench,
 };
@@ -144,8 +144,8 @@ fn recording_with(setup: &Setup, seconds: f64, phase: impl Fn(usize) -> f64) -> 
     let mut reader =
         TableReader::new(golden("icub_left_arm_mujoco.csv").leak().as_bytes()).unwrap();
     let channel = |s: &proprio_topics::csv::Series| match s.what {
-        What::Channel(kind) => setup.robot.channel(kind, &s.name),
-        What::Contact => None,
+        SeriesKind::Channel(kind) => setup.robot.channel(kind, &s.name),
+        SeriesKind::Contact => None,
     };
     let series: Vec<_> = reader.series().iter().map(channel).collect();
     let mut rows: Vec<(f64, HashMap<usize, Reading>)> = vec![];

@@ -75,7 +75,7 @@ impl BusOff {
     }
 
     /// The interface has a carrier, or has none, at `now`.
-    pub(super) fn look(&mut self, has_carrier: bool, now: Nanos) {
+    pub(super) fn see_carrier(&mut self, has_carrier: bool, now: Nanos) {
         if !has_carrier && self.state != ControllerState::OnTheBus {
             self.patience = PATIENCE;
         }
@@ -122,7 +122,7 @@ mod tests {
         };
         let mut bus = BusOff::default();
         bus.report(error, MS(0));
-        bus.look(true, MS(10_000));
+        bus.see_carrier(true, MS(10_000));
         assert!(!bus.is_suspected() && !bus.is_off());
     }
 
@@ -135,19 +135,19 @@ mod tests {
             bus
         };
         let mut bus = reported();
-        bus.look(true, PATIENCE - Nanos(1));
+        bus.see_carrier(true, PATIENCE - Nanos(1));
         assert!(!bus.is_off());
-        bus.look(true, PATIENCE);
+        bus.see_carrier(true, PATIENCE);
         assert!(bus.is_off() && !bus.is_suspected());
-        bus.look(true, LINK_WATCH - Nanos(1));
+        bus.see_carrier(true, LINK_WATCH - Nanos(1));
         assert!(bus.is_off());
-        bus.look(true, LINK_WATCH);
+        bus.see_carrier(true, LINK_WATCH);
         assert!(!bus.is_off(), "the carrier is there");
 
         let mut bus = reported();
-        bus.look(false, MS(1));
+        bus.see_carrier(false, MS(1));
         assert!(bus.is_off());
-        bus.look(false, MS(60_000));
+        bus.see_carrier(false, MS(60_000));
         assert!(bus.is_off(), "until the carrier is back");
         bus.report(
             ErrorFrame {
@@ -160,7 +160,7 @@ mod tests {
 
         let mut bus = reported();
         bus.receive();
-        bus.look(true, MS(1000));
+        bus.see_carrier(true, MS(1000));
         assert!(!bus.is_off() && !bus.is_suspected());
     }
 
@@ -175,18 +175,18 @@ mod tests {
             if t % 60 == 59 {
                 own.receive();
             }
-            own.look(true, MS(t));
+            own.see_carrier(true, MS(t));
             beliefs += u32::from(own.is_off() && !was_off);
             was_off = own.is_off();
         }
         assert_eq!(beliefs, 1);
         // A real one is believed at once again.
         own.report(OFF, MS(60_000));
-        own.look(false, MS(60_000));
+        own.see_carrier(false, MS(60_000));
         assert!(own.is_off());
         own.receive();
         own.report(OFF, MS(60_001));
-        own.look(true, MS(60_001) + PATIENCE + PATIENCE);
+        own.see_carrier(true, MS(60_001) + PATIENCE + PATIENCE);
         assert!(own.is_off());
     }
 }

@@ -45,7 +45,7 @@ use std::os::fd::{AsFd, AsRawFd};
 use std::path::{Path, PathBuf};
 
 /// Interval between queries of the interface's flags.
-const CHECK: Nanos = Nanos::from_millis(50);
+const QUERY_PERIOD: Nanos = Nanos::from_millis(50);
 /// Maximum number of kernel filters (`CAN_RAW_FILTER_MAX`).
 const MOST_FILTERS: usize = 512;
 /// Sizes of `struct can_frame` and `struct canfd_frame`.
@@ -59,7 +59,7 @@ const ERROR_STATE: u8 = 2;
 
 /// A raw CAN socket on one interface.
 pub struct SocketCan {
-    named: Adapter,
+    adapter: Adapter,
     /// Where sysfs is.
     sys: PathBuf,
     /// The adapter's interface since the last opening.
@@ -70,14 +70,14 @@ pub struct SocketCan {
     /// The claims to filter by in user space, because they exceed the kernel's maximum.
     claims: Vec<Claim>,
     receiver: Receiver<FD>,
-    adapter: HardwareToMonotonic,
+    adapter_clock: HardwareToMonotonic,
     state: LinkState,
     /// The state has changed outside of `recv`, which must report it.
     changed: bool,
     /// A frame that showed that the link is up again; returned after the state change.
     pending: Option<Frame>,
     /// Time of the next query of the flags.
-    check: Nanos,
+    next_query: Nanos,
     bus_off: BusOff,
     counters: LinkCounters,
 }
@@ -104,13 +104,17 @@ impl SocketCan {
         Self::open_adapter(&adapter, Path::new(adapter::SYS), claims)
     }
 
-    /// As [`SocketCan::open`]; the interface is that of `named` by the sysfs at `sys`
+    /// As [`SocketCan::open`]; the interface is that of `adapter` by the sysfs at `sys`
     /// ([`adapter::SYS`]), now and whenever it is opened again.
     ///
     /// # Errors
     /// As [`SocketCan::open`], and [`OpenError::NoAdapter`].
-    pub fn open_adapter(named: &Adapter, sys: &Path, claims: &[Claim]) -> Result<Self, OpenError> {
-        let interface = named.resolve(sys).map_err(OpenError::NoAdapter)?;
+    pub fn open_adapter(
+        adapter: &Adapter,
+        sys: &Path,
+        claims: &[Claim],
+    ) -> Result<Self, OpenError> {
+        let interface = adapter.resolve(sys).map_err(OpenError::NoAdapter)?;
         let by_kernel = claims.len() <= MOST_FILTERS;
         let filters = if by_kernel {
             filters(claims)
@@ -122,7 +126,7 @@ impl SocketCan {
             .map_err(|e| open_error(&interface, e))?;
         let state = state_of(interface_flags(socket.as_fd(), &interface), false);
         Ok(Self {
-            named: named.clone(),
+            adapter: adapter.clone(),
             sys: sys.to_owned(),
             interface,
             socket,
@@ -133,11 +137,11 @@ impl SocketCan {
                 claims.to_vec()
             },
             receiver,
-            adapter: HardwareToMonotonic::default(),
+            adapter_clock: HardwareToMonotonic::default(),
             state,
             changed: false,
             pending: None,
-            check: Nanos::ZERO,
+            next_query: Nanos::ZERO,
             bus_off: BusOff::default(),
             counters: LinkCounters::default(),
         })
@@ -159,7 +163,7 @@ impl SocketCan {
         }
         self.state = state;
         // Flags that lag behind what has told the change do not undo it at once.
-        self.check = Monotonic.now().saturating_add(CHECK);
+        self.next_query = Monotonic.now().saturating_add(QUERY_PERIOD);
         true
     }
 
@@ -174,26 +178,26 @@ impl SocketCan {
     }
 
     /// Asks, if it is time to, for the interface's flags; returns whether the state has changed.
-    fn checks(&mut self) -> bool {
+    fn query_flags(&mut self) -> bool {
         let now = Monotonic.now();
-        if now < self.check {
+        if now < self.next_query {
             return false;
         }
-        self.check = now.saturating_add(CHECK);
+        self.next_query = now.saturating_add(QUERY_PERIOD);
         // An interface that was deleted and created again needs a new socket.
         if self.state == LinkState::Gone {
-            let Ok(interface) = self.named.resolve(&self.sys) else {
+            let Ok(interface) = self.adapter.resolve(&self.sys) else {
                 return false;
             };
             match open_socket(&interface, &self.filters, &mut self.receiver) {
                 Ok(socket) => (self.socket, self.interface) = (socket, interface),
                 Err(_) => return false,
             }
-            self.adapter = HardwareToMonotonic::default();
+            self.adapter_clock = HardwareToMonotonic::default();
         }
         let flags = interface_flags(self.socket.as_fd(), &self.interface);
         let carrier = matches!(flags, Ok(flags) if flags & libc::IFF_RUNNING != 0);
-        self.bus_off.look(carrier, now);
+        self.bus_off.see_carrier(carrier, now);
         self.set_state(state_of(flags, self.bus_off.is_off()))
     }
 
@@ -208,7 +212,7 @@ impl SocketCan {
                 _ => continue,
             };
             let times = &mut self.receiver.times;
-            let (stamp, kind) = message.control.stamp(times, &mut self.adapter);
+            let (stamp, kind) = message.control.stamp(times, &mut self.adapter_clock);
             let frame = frame.at(times.limit(stamp), kind);
             if let Some(error) = ErrorFrame::of(&frame) {
                 self.counters.error_frames += 1;
@@ -413,7 +417,7 @@ impl Link for SocketCan {
             if let Some(received) = self.next() {
                 return received;
             }
-            if self.checks() {
+            if self.query_flags() {
                 return Received::StateChanged;
             }
             // An endless series of error frames must not hold the caller beyond its deadline.
@@ -421,7 +425,7 @@ impl Link for SocketCan {
                 return Received::TimedOut;
             }
             asked = true;
-            let until = deadline.min(self.check);
+            let until = deadline.min(self.next_query);
             if self.state == LinkState::Gone {
                 // The old socket will not report anything more.
                 sleep_until(until);

@@ -28,6 +28,6 @@ mod columns;
 mod reader;
 mod writer;
 
-pub use columns::{Series, Value, What};
+pub use columns::{Series, SeriesKind, Value};
 pub use reader::{BadRow, Row, SeriesValue, TableError, TableReader, TableReport};
 pub use writer::{Columns, TableWriter};

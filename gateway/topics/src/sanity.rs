@@ -151,7 +151,7 @@ impl<const N: usize> Repeats<N> {
     /// improbable it is.
     ///
     /// A reading of which the device itself says that it is not a measurement is not judged.
-    pub fn look(&mut self, values: &[f64; N], quality: Quality, least: u32) -> u16 {
+    pub fn judge(&mut self, values: &[f64; N], quality: Quality, least: u32) -> u16 {
         let axes = &mut self.axes;
         if quality.intersects(Quality::FROZEN | Quality::SATURATED) {
             axes.iter_mut().for_each(AxisHistory::interrupt);
@@ -451,7 +451,7 @@ impl<const N: usize> Jumps<N> {
     }
 
     /// Takes a reading at `t`, NaN where it has none; returns whether it is doubtful.
-    pub fn look(&mut self, t: Nanos, values: &[f64; N], quality: Quality) -> bool {
+    pub fn judge(&mut self, t: Nanos, values: &[f64; N], quality: Quality) -> bool {
         // An encoder that does not know its zero yet will jump.
         let has_no_zero =
             |path: &AxisPath| quality.contains(Quality::NOT_CALIBRATED) && path.fastest.is_finite();

@@ -133,7 +133,7 @@ fn a_watch_tells_a_killed_gateway_from_one_that_has_left() {
     let config = DomainConfig::new(base.path(), "test");
     let domain = Domain::open(&config).unwrap();
     let mut watch = Watch::<GatewayHealth>::default();
-    let mut state = || watch.look(&domain, "icub", monotonic());
+    let mut state = || watch.poll(&domain, "icub", monotonic());
     assert_eq!(state(), Presence::NotStarted);
     let start = || {
         let mut child = spawn("writer", &config);

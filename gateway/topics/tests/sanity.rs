@@ -54,7 +54,7 @@ impl Sensor {
                 _ => *held.insert(fresh),
             };
         }
-        self.sanity.look(&values, Quality::GOOD, LEAST_RUN)
+        self.sanity.judge(&values, Quality::GOOD, LEAST_RUN)
     }
 
     /// Number of equal readings until the mask is `wanted`. (By chance an axis has been equal
@@ -192,7 +192,7 @@ fn what_the_device_says_itself_is_not_judged() {
     let wrench = |x: f64| [x, x, x, f64::NAN, f64::NAN, f64::NAN];
     for _ in 0..3000 {
         assert_eq!(
-            sanity.look(
+            sanity.judge(
                 &wrench((30.0 * noise.next()).round()),
                 Quality::GOOD,
                 LEAST_RUN
@@ -201,14 +201,14 @@ fn what_the_device_says_itself_is_not_judged() {
         );
     }
     for flag in [Quality::FROZEN, Quality::SATURATED] {
-        assert!((0..100).all(|_| sanity.look(&wrench(5.0), flag, LEAST_RUN) == 0));
+        assert!((0..100).all(|_| sanity.judge(&wrench(5.0), flag, LEAST_RUN) == 0));
     }
     // Without a word it is; the axes that it does not measure are not named.
     let found = (0..20)
-        .map(|_| sanity.look(&wrench(5.0), Quality::GOOD, LEAST_RUN))
+        .map(|_| sanity.judge(&wrench(5.0), Quality::GOOD, LEAST_RUN))
         .last();
     assert_eq!(found, Some(0b111));
-    assert_eq!(sanity.look(&wrench(f64::NAN), Quality::GOOD, LEAST_RUN), 0);
+    assert_eq!(sanity.judge(&wrench(f64::NAN), Quality::GOOD, LEAST_RUN), 0);
 }
 
 /// Three axes, of which none alone is noisy enough; then also one that never changes.
@@ -221,11 +221,11 @@ fn axes_are_judged_together() {
             [x, y, z, constant, constant, constant]
         };
         for _ in 0..3000 {
-            assert_eq!(sanity.look(&fresh(), Quality::GOOD, LEAST_RUN), 0);
+            assert_eq!(sanity.judge(&fresh(), Quality::GOOD, LEAST_RUN), 0);
         }
         let last = fresh();
         let masks: Vec<u16> = (0..60)
-            .map(|_| sanity.look(&last, Quality::GOOD, LEAST_RUN))
+            .map(|_| sanity.judge(&last, Quality::GOOD, LEAST_RUN))
             .collect();
         let all = if constant.is_nan() { 0b111 } else { 0x3F };
         let first = masks.iter().position(|mask| *mask != 0).expect("found");
@@ -233,7 +233,7 @@ fn axes_are_judged_together() {
         assert!(masks[first..].iter().all(|mask| *mask == all), "{masks:?}");
         // What the device says itself parts two runs.
         for _ in 0..3000 {
-            sanity.look(&fresh(), Quality::GOOD, LEAST_RUN);
+            sanity.judge(&fresh(), Quality::GOOD, LEAST_RUN);
         }
         let last = fresh();
         for k in 0..200 {
@@ -241,7 +241,7 @@ fn axes_are_judged_together() {
                 0 => Quality::SATURATED,
                 _ => Quality::GOOD,
             };
-            assert_eq!(sanity.look(&last, quality, LEAST_RUN), 0, "{k}");
+            assert_eq!(sanity.judge(&last, quality, LEAST_RUN), 0, "{k}");
         }
     }
 }
@@ -250,7 +250,7 @@ fn axes_are_judged_together() {
 fn what_was_never_different_is_not_frozen() {
     let mut sanity = Repeats::default();
     let wrench = [1.0, 1.0, 1.0, 0.0, 0.0, 0.0];
-    assert!((0..100_000).all(|_| sanity.look(&wrench, Quality::GOOD, LEAST_RUN) == 0));
+    assert!((0..100_000).all(|_| sanity.judge(&wrench, Quality::GOOD, LEAST_RUN) == 0));
 }
 
 /// A channel of one axis, read every 10 ms.
@@ -263,7 +263,7 @@ struct Channel {
 impl Channel {
     fn read(&mut self, value: f64) -> bool {
         self.t += 10;
-        (self.jumps).look(Nanos::from_millis(self.t), &[value], Quality::GOOD)
+        (self.jumps).judge(Nanos::from_millis(self.t), &[value], Quality::GOOD)
     }
 
     fn doubtful(&mut self, values: &[f64]) -> Vec<bool> {
@@ -342,7 +342,7 @@ fn what_has_changed_is_confirmed_by_the_next_reading() {
     // A tare is no jump.
     let mut channel = noisy(1.0);
     let t = Nanos::from_millis(channel.t + 10);
-    assert!(!channel.jumps.look(t, &[700.0], Quality::ZERO_CHANGED));
+    assert!(!channel.jumps.judge(t, &[700.0], Quality::ZERO_CHANGED));
     channel.t += 10;
     assert!(!channel.read(700.0));
 }

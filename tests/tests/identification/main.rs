@@ -26,7 +26,7 @@ use proprio_estimator::setup::Setup;
 use proprio_estimator::{files, sample_log};
 use proprio_identification::online::{DetectedChange, ObservationCounts, Paused};
 use proprio_identification::{FindingCode, LogRole, Outcome, Severity, Verdict, identify};
-use proprio_topics::csv::{Row, SeriesValue, TableReader, Value, What};
+use proprio_topics::csv::{Row, SeriesKind, SeriesValue, TableReader, Value};
 use proprio_topics::{InertiaEstimate, Nanos, Quality, Reading};
 use serde_json::Value as Json;
 use std::collections::{BTreeMap, BTreeSet};
@@ -461,12 +461,12 @@ fn told_from(log: &str, delay: usize, end: &mut Option<Pipeline>) -> Told {
             {
                 let (t, (what, name)) = (row.t.unwrap(), &series[*number]);
                 match (what, value) {
-                    (What::Channel(kind), Value::Reading(reading, quality)) => {
+                    (SeriesKind::Channel(kind), Value::Reading(reading, quality)) => {
                         if let Some(channel) = pipeline.setup().robot.channel(*kind, name) {
                             pipeline.push(channel, t, reading, *quality);
                         }
                     }
-                    (What::Contact, Value::Contact(state)) => {
+                    (SeriesKind::Contact, Value::Contact(state)) => {
                         let contact = pipeline.setup().robot.contact(name).unwrap();
                         pipeline.declare(contact, t, state);
                     }
@@ -538,11 +538,11 @@ fn inertias_by(
         } in &row.items
         {
             let (what, name) = &series[*number];
-            if let (What::Contact, Value::Contact(state)) = (what, value) {
+            if let (SeriesKind::Contact, Value::Contact(state)) = (what, value) {
                 let contact = pipeline.setup().robot.contact(name).unwrap();
                 pipeline.declare(contact, row.t.unwrap(), state);
             }
-            if let (What::Channel(kind), Value::Reading(reading, quality)) = (what, value)
+            if let (SeriesKind::Channel(kind), Value::Reading(reading, quality)) = (what, value)
                 && let Some(channel) = pipeline.setup().robot.channel(*kind, name)
             {
                 let (t, mut reading, mut quality) = (row.t.unwrap(), *reading, *quality);

@@ -66,7 +66,7 @@ const fn groups(kind: Kind) -> &'static [(Range<usize>, &'static str)] {
 
 /// The kind of a series.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum What {
+pub enum SeriesKind {
     /// A channel of the gateway.
     Channel(Kind),
     /// A contact that is declared present or absent, and where.
@@ -77,7 +77,7 @@ pub enum What {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Series {
     /// Its kind.
-    pub what: What,
+    pub what: SeriesKind,
     /// Its name.
     pub name: String,
 }
@@ -119,22 +119,22 @@ impl Cells {
     }
 }
 
-pub(super) const fn word(what: What) -> &'static str {
+pub(super) const fn word(what: SeriesKind) -> &'static str {
     match what {
-        What::Channel(kind) => kind.word(),
-        What::Contact => "contact",
+        SeriesKind::Channel(kind) => kind.word(),
+        SeriesKind::Contact => "contact",
     }
 }
 
 /// Parses a column's name into kind (`None`: a channel's quality), name and field.
-pub(super) fn parse_column(column: &str) -> Option<(Option<What>, &str, ColumnQuantity)> {
+pub(super) fn parse_column(column: &str) -> Option<(Option<SeriesKind>, &str, ColumnQuantity)> {
     let (front, field) = column.rsplit_once('/')?;
     if let Some((head, name)) = front.split_once('/') {
         let what = match head {
-            "contact" => Some(What::Contact),
+            "contact" => Some(SeriesKind::Contact),
             _ => (Kind::ALL.into_iter())
                 .find(|kind| kind.word() == head)
-                .map(What::Channel),
+                .map(SeriesKind::Channel),
         };
         if let Some(what) = what
             && !name.is_empty()
@@ -145,11 +145,11 @@ pub(super) fn parse_column(column: &str) -> Option<(Option<What>, &str, ColumnQu
     (field == "quality" && !front.is_empty()).then_some((None, front, ColumnQuantity::Quality))
 }
 
-pub(super) fn parse_field(what: What, field: &str) -> Option<ColumnQuantity> {
-    if field == "quality" && what != What::Contact {
+pub(super) fn parse_field(what: SeriesKind, field: &str) -> Option<ColumnQuantity> {
+    if field == "quality" && what != SeriesKind::Contact {
         return Some(ColumnQuantity::Quality);
     }
-    let What::Channel(kind) = what else {
+    let SeriesKind::Channel(kind) = what else {
         let at = CONTACT.iter().position(|name| *name == field)?;
         return Some(ColumnQuantity::Contact(u8::try_from(at).ok()?));
     };
@@ -171,7 +171,7 @@ pub(super) fn items_of(
     } else {
         Quality(cells.quality as u32)
     };
-    let What::Channel(kind) = series.what else {
+    let SeriesKind::Channel(kind) = series.what else {
         if let Some(state) = contact_of(&cells.contact)? {
             push(Value::Contact(state));
         }
@@ -262,7 +262,7 @@ mod tests {
     #[test]
     fn a_drive_may_report_no_duty() {
         let series = Series {
-            what: What::Channel(Kind::Joint),
+            what: SeriesKind::Channel(Kind::Joint),
             name: "elbow".into(),
         };
         let read = |values: [f64; 4]| {
@@ -292,19 +292,19 @@ mod tests {
     fn what_is_written_is_read_back_bit_for_bit() {
         let series = [
             Series {
-                what: What::Channel(Kind::Joint),
+                what: SeriesKind::Channel(Kind::Joint),
                 name: "elbow".into(),
             },
             Series {
-                what: What::Channel(Kind::Wrench),
+                what: SeriesKind::Channel(Kind::Wrench),
                 name: "ft".into(),
             },
             Series {
-                what: What::Channel(Kind::Imu),
+                what: SeriesKind::Channel(Kind::Imu),
                 name: "chest".into(),
             },
             Series {
-                what: What::Contact,
+                what: SeriesKind::Contact,
                 name: "hand".into(),
             },
         ];
@@ -452,7 +452,7 @@ mod tests {
         ];
         for (kind, reading) in readings {
             let series = [Series {
-                what: What::Channel(kind),
+                what: SeriesKind::Channel(kind),
                 name: "one".into(),
             }];
             let mut writer = TableWriter::new(Vec::new(), &series, Columns::All).unwrap();

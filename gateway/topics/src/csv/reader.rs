@@ -1,7 +1,7 @@
 //! Reads a table row by row. Unusable rows are skipped, counted and reported with the reason.
 
 use super::columns::{
-    Cells, ColumnQuantity, Series, Value, What, items_of, parse_column, parse_field, word,
+    Cells, ColumnQuantity, Series, SeriesKind, Value, items_of, parse_column, parse_field, word,
 };
 use crate::Nanos;
 use std::borrow::ToOwned;
@@ -197,7 +197,7 @@ impl<R: io::Read> TableReader<R> {
         for (at, channel) in qualities {
             let found = series
                 .iter()
-                .position(|s: &Series| s.name == channel && s.what != What::Contact);
+                .position(|s: &Series| s.name == channel && s.what != SeriesKind::Contact);
             match (found, columns.get_mut(at)) {
                 (Some(number), Some(column)) => {
                     *column = Some(TableColumn {

@@ -1,7 +1,7 @@
 //! Writes a table row by row. Values of one instant share a row.
 
 use super::columns::{
-    Cells, ColumnQuantity, Series, Value, What, contact_fields, field_word, readings, spread,
+    Cells, ColumnQuantity, Series, SeriesKind, Value, contact_fields, field_word, readings, spread,
     usual, word,
 };
 use crate::{Kind, Nanos};
@@ -24,7 +24,7 @@ pub enum Columns {
 pub struct TableWriter<W> {
     output: W,
     /// Per series: its first column and its fields.
-    series: Vec<(What, usize, Vec<ColumnQuantity>)>,
+    series: Vec<(SeriesKind, usize, Vec<ColumnQuantity>)>,
     /// The current row, one cell per column after `t`; NaN is empty.
     cells: Vec<f64>,
     /// The text of the current row.
@@ -185,8 +185,8 @@ fn write_integer(text: &mut Vec<u8>, value: i32) {
     text.extend_from_slice(digits.get(at..).unwrap_or_default());
 }
 
-fn fields_of(what: What, columns: Columns) -> Vec<ColumnQuantity> {
-    let What::Channel(kind) = what else {
+fn fields_of(what: SeriesKind, columns: Columns) -> Vec<ColumnQuantity> {
+    let SeriesKind::Channel(kind) = what else {
         return contact_fields().collect();
     };
     let values = |kind: Kind, count| {

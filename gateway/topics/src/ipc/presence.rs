@@ -77,7 +77,7 @@ impl<T: Topic, S: Service> Default for Watch<T, S> {
 impl<T: Topic, S: Service> Watch<T, S> {
     /// Whether it is there at `now`. Makes system calls; the first that finds it opens a port. If
     /// it has ended and another one has started since the last call, that is told by two calls.
-    pub fn look(&mut self, domain: &Domain<S>, robot: &str, now: Nanos) -> Presence {
+    pub fn poll(&mut self, domain: &Domain<S>, robot: &str, now: Nanos) -> Presence {
         if self.reader.is_none() {
             self.reader = Reader::open_in(domain, robot).ok();
         }
@@ -148,8 +148,8 @@ impl Domain {
             let robots = watches.iter_mut().map(|(name, gateway, estimator)| {
                 let now = monotonic();
                 RobotPresence {
-                    gateway: gateway.look(self, name, now),
-                    estimator: estimator.look(self, name, now),
+                    gateway: gateway.poll(self, name, now),
+                    estimator: estimator.poll(self, name, now),
                     name: name.clone(),
                 }
             });
@@ -209,7 +209,7 @@ mod tests {
         let domain = Domain::open(&DomainConfig::new(base.path(), "test")).unwrap();
         let start = || Writer::<GatewayHealth>::create(&domain, "icub", 1).unwrap();
         let mut watch = Watch::<GatewayHealth>::default();
-        let mut presence_at = |now| watch.look(&domain, "icub", now);
+        let mut presence_at = |now| watch.poll(&domain, "icub", now);
         let (t, tick) = (Nanos::from_millis(5000), Nanos(1));
 
         let mut first = start();

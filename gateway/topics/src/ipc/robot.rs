@@ -735,7 +735,7 @@ impl Attacher {
                 *passed = false;
             }
         }
-        let missing = self.look(now);
+        let missing = self.poll(now);
         *self
             .shared
             .missing
@@ -743,7 +743,7 @@ impl Attacher {
             .unwrap_or_else(PoisonError::into_inner) = missing;
     }
 
-    fn look(&mut self, now: Nanos) -> Missing {
+    fn poll(&mut self, now: Nanos) -> Missing {
         if let Err(problem) = self.renew_domain() {
             return Missing {
                 problem: Some(problem),
@@ -755,8 +755,8 @@ impl Attacher {
             return Missing::default();
         };
         let robot = &self.robot;
-        let gateway = self.gateway.look(domain, robot, now);
-        let estimator = self.estimator.look(domain, robot, now);
+        let gateway = self.gateway.poll(domain, robot, now);
+        let estimator = self.estimator.poll(domain, robot, now);
         if (gateway, estimator) == (Presence::NotStarted, Presence::NotStarted) && problem.is_none()
         {
             let others = domain.robot_names();
