@@ -44,14 +44,14 @@ pub(crate) fn estimate_noise(
             .iter()
             .map(|segment| segment.noise[0][channel].clone())
             .collect();
-        let walk = (channel < unknowns.wrenches()).then(|| {
+        let walk = fastest.get(channel).map(|fastest| {
             for (segment, left) in segments.iter().zip(&mut left) {
                 let drift = segment.offset_drift(unknowns, channel);
                 for (range, offset) in segment.ranges.iter().zip(drift) {
                     left[range.clone()].iter_mut().for_each(|x| *x += offset);
                 }
             }
-            remove_random_walk(segments, &mut left, fastest[channel])
+            remove_random_walk(segments, &mut left, *fastest)
         });
         let (square, time) = noise::autocorrelation_time(&left);
         let seen: f64 = segments.iter().map(|segment| segment.seen[channel]).sum();
