@@ -358,8 +358,8 @@ pub struct Identification {
     pub save_every_s: f64,
     /// Uncertainty of the URDF's inertial parameters of links that were not identified: the
     /// relative standard deviation of a link's mass, and of its mass distribution
-    /// ([`proprio_identification::prior::cad_root`]). Torques that depend on such links get the
-    /// corresponding standard deviation. 0: they are exact.
+    /// ([`proprio_identification::prior::link_cad_root`]). Torques that depend on such links get
+    /// the corresponding standard deviation. 0: they are exact.
     pub urdf_relative_std: f64,
     /// Whether `proprio identify` also identifies the gain error of each force/torque sensor, and
     /// which entries of it.

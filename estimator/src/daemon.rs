@@ -41,8 +41,8 @@ const HEALTH_PERIOD: Nanos = Nanos::from_millis(100);
 /// How often the budget of a torque is published while somebody reads them, of one joint after
 /// another.
 const BUDGET_PERIOD: Nanos = Nanos::from_millis(10);
-/// A missing temperature is reported after this number of health periods, 10 s: boards send it every
-/// few seconds at best.
+/// A missing temperature is reported after this number of health periods, 10 s: boards send it
+/// every few seconds at best.
 const MISSING_TEMPERATURE: u32 = 100;
 /// A data plane whose loop has not run for this long is stalled.
 const STALLED: Nanos = Nanos::from_millis(500);

@@ -11,7 +11,7 @@ use proprio_dynamics::calibration::{
 use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::{RigidInertia, Wrench};
 use proprio_identification::Robot;
-use proprio_identification::prior::cad_root;
+use proprio_identification::prior::link_cad_root;
 use proprio_topics::Nanos;
 
 /// Standard deviation of the gain of an F/T sensor that was not calibrated here, relative: usual
@@ -52,7 +52,7 @@ pub struct PosteriorBlock<'a> {
     /// Per sensor, its offset.
     pub offsets: &'a [Wrench],
     /// Per sensor, the drift of its offset: standard deviation after one second [torque; force].
-    pub drift: &'a [[f64; 6]],
+    pub drift_std: &'a [[f64; 6]],
     /// The instant of the offsets.
     pub known: Nanos,
 }
@@ -238,7 +238,7 @@ impl InertialState {
                 let root = with_calibrations(&group, root, &calibrated);
                 let (root, kinds) = with_gains(robot, &group, &root, kinds);
                 let _ = covariance.add_calibrated(group.links, group.sensors, &kinds, root);
-                for (&sensor, rate) in group.sensors.iter().zip(group.drift) {
+                for (&sensor, rate) in group.sensors.iter().zip(group.drift_std) {
                     let _ = covariance.set_drift(sensor, *rate, group.known);
                 }
                 continue;
@@ -360,6 +360,6 @@ fn with_gains(
 
 /// The root of a link's prior covariance.
 fn prior_root(cad: &RigidInertia, relative: f64) -> DMatrix<f64> {
-    let root = cad_root(cad, relative);
+    let root = link_cad_root(cad, relative);
     DMatrix::from_fn(10, 10, |i, j| root[(i, j)])
 }

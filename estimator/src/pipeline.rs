@@ -2,10 +2,10 @@
 //! each of these stamps gives one estimate.
 //!
 //! # The path of a reading
-//! 1. [`Pipeline::push`] (`arrival`) judges a sample by those before it ([`proprio_topics::sanity`]: one that
-//!    repeats or jumps is flagged) and stores it in its channel's buffer (`buffers`,
-//!    [`crate::history`], [`crate::differentiate`]). A sample of the trigger channel also queues
-//!    its stamp.
+//! 1. [`Pipeline::push`] (`arrival`) judges a sample by those before it
+//!    ([`proprio_topics::sanity`]: one that repeats or jumps is flagged) and stores it in its
+//!    channel's buffer (`buffers`, [`crate::history`], [`crate::differentiate`]). A sample of the
+//!    trigger channel also queues its stamp.
 //! 2. [`Pipeline::poll`] releases the oldest queued stamp `t` when all its samples are there.
 //! 3. Every channel is evaluated at `t` (`inputs`). F/T readings are corrected for calibration,
 //!    temperature and offset.

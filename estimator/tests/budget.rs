@@ -5,7 +5,7 @@ use proprio_estimator::config::Config;
 use proprio_estimator::differentiate::Window;
 use proprio_estimator::pipeline::Pipeline;
 use proprio_estimator::setup::Setup;
-use proprio_identification::prior::cad_root;
+use proprio_identification::prior::link_cad_root;
 use proprio_topics::csv::{Row, SeriesKind, TableReader, Value};
 use proprio_topics::{Nanos, Reading, Source, TorqueBudget};
 use std::cell::{Cell, RefCell};
@@ -188,7 +188,7 @@ fn each_part_is_what_an_error_of_its_input_does() {
         let number = (0..robot.model.link_count())
             .find(|number| robot.model.link_name(*number) == link)
             .unwrap();
-        let root = cad_root(&robot.model.inertias()[number], robot.urdf_relative_std);
+        let root = link_cad_root(&robot.model.inertias()[number], robot.urdf_relative_std);
         let changed = (0..10).map(|row| {
             with_setup(&|setup| {
                 let mut parameters = setup.initial.model.inertias()[number].parameters();

@@ -8,7 +8,7 @@ use proprio_estimator::config::Config;
 use proprio_estimator::sample_log;
 use proprio_estimator::setup::Setup;
 use proprio_identification::forecast::SensorNoise;
-use proprio_identification::prior::cad_root;
+use proprio_identification::prior::link_cad_root;
 use proprio_identification::robot::{BaseMotion, ChannelRole};
 use proprio_identification::{CovarianceRoot, LogRole, Outcome, Robot, Verdict, identify};
 use proprio_planning::excite::{Planner, Task};
@@ -68,7 +68,7 @@ fn truth(robot: &Robot, seed: u64) -> Robot {
     let mut rng = fastrand::Rng::with_seed(seed);
     let mut truth = robot.clone();
     for (link, cad) in robot.model.inertias().iter().enumerate() {
-        let root = cad_root(cad, robot.urdf_relative_std);
+        let root = link_cad_root(cad, robot.urdf_relative_std);
         let drawn = (0..1000).map(|_| {
             let mut phi = cad.parameters();
             for row in 0..10 {

@@ -76,7 +76,7 @@ impl Dataset {
             temperatures.sort_by_key(|(t, _)| *t);
         }
         cleaning::clean(&mut recording, robot);
-        recording.span();
+        recording.set_span();
         for channel in &recording.channels {
             let imu = &recording.imu;
             let is_empty = match channel.role {

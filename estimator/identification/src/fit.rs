@@ -2,7 +2,6 @@
 //! converge.
 
 use crate::finding::{Finding, FindingCode};
-use crate::hypothesis;
 use crate::linear::information::Information;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_estimate::estimate_noise;
@@ -10,9 +9,10 @@ use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::noise_model::Seconds;
 use crate::measurement::reduction::ReducedLog;
 use crate::measurement::unknowns::{ExtraParameter, Unknowns};
+use crate::nested_test;
+use crate::prepared_log::{PreparedLog, reduced_segments, sample, segment_residuals};
 use crate::prior::{MapEstimate, Posterior, Prior, PriorError};
 use crate::robot::{IdentificationInput, Robot};
-use crate::training::{PreparedLog, reduced_segments, sample, segment_residuals};
 use nalgebra::DVector;
 use proprio_dynamics::DynamicsError;
 use proprio_dynamics::calibration::{Kind, Unknown};
@@ -33,10 +33,6 @@ pub enum IdentifyError {
     #[error("no parameters can be fitted to the logs: {0}")]
     MapEstimate(#[from] PriorError),
 }
-
-/// A load is accepted if, without its side of the log, the noise variances of its part of the robot
-/// are smaller by this factor (geometric mean over the channels there).
-pub(crate) const LOAD_VARIANCE_RATIO: f64 = 2.0;
 
 /// Most rounds of noise and MAP estimate.
 const ROUNDS: usize = 14;
@@ -206,7 +202,7 @@ pub(crate) fn negative_rotors(
     }
     let root = fit.covariance_root();
     let mut findings = Vec::new();
-    let significant = hypothesis::deviations(unknowns.extra.len());
+    let significant = nested_test::deviate(unknowns.extra.len());
     for (extra, column) in unknowns.extra.iter().zip(unknowns.inertial()..) {
         let ExtraParameter::RotorInertia(dof) = *extra else {
             continue;

@@ -118,7 +118,7 @@ impl<'a> Forecast<'a> {
         let square = each(|noise| noise.deviation, 1.0 / (RATE * seconds));
         let noise = NoiseModel {
             time: vec![1.0; square.len()],
-            drift: each(|noise| noise.drift, 1.0),
+            drift_variance: each(|noise| noise.drift, 1.0),
             block: square.clone(),
             least: square.clone(),
             square,

@@ -2,33 +2,34 @@
 #![cfg_attr(not(test), warn(clippy::too_many_lines))]
 
 mod arithmetic;
-mod batch;
 mod cross_validation;
 pub mod dataset;
 mod diagnose;
 mod finding;
 mod fit;
 pub mod forecast;
-mod hypothesis;
+mod identify;
 pub mod linear;
 mod measurement;
+mod nested_test;
 pub mod online;
 pub mod parallel;
 mod payload;
+mod prepared_log;
 pub mod prior;
 mod report;
 pub mod robot;
 pub mod statistics;
-mod training;
 
-pub use batch::{Progress, identify};
 pub use dataset::recording::Recording;
 pub use dataset::{Dataset, LogRole};
 pub use diagnose::plausibility::implausible;
 pub use finding::{Finding, FindingCode, Severity};
 pub use fit::IdentifyError;
+pub use identify::{Progress, identify};
 pub use measurement::unknowns::COULOMB_SPEED;
 pub use payload::{KnownParameters, Payload, PayloadError, payload};
+pub use prepared_log::{Excluded, judged};
 pub use report::outcome::{
     BaseParameterOutcome, Both, CalibrationOutcome, ChannelNoise, CovarianceRoot, Curve,
     FrictionOutcome, InForce, JointOutcome, LinkOutcome, LogOutcome, ModelComparison,
@@ -37,4 +38,3 @@ pub use report::outcome::{
 };
 pub use report::prediction::predicted;
 pub use robot::Robot;
-pub use training::{Excluded, judged};

@@ -58,7 +58,7 @@
 //! rows.
 
 pub(crate) mod bank;
-mod channel;
+mod noise_tracker;
 mod rows;
 mod selection;
 pub mod state;
@@ -149,13 +149,13 @@ impl Online {
         let relative = robot.urdf_relative_std;
         let prior = Arc::new(Prior::new(cad)?.with_relative_std(relative));
         let solution = Solution {
-            data: Nanos::MIN,
+            data_until: Nanos::MIN,
             components: components.iter().map(|c| c.unknown(cad, offsets)).collect(),
             doubts: vec![Doubt::COMPLETE; model.dof_count()],
         };
         let layouts = components.iter().map(|component| &*component.layout);
         let job = Box::new(SolutionJob {
-            data: Nanos::MIN,
+            data_until: Nanos::MIN,
             components: (components.iter().zip(&solution.components))
                 .map(|(component, known)| {
                     ComponentJob::new(component, known.clone(), period, &prior, relative)
@@ -266,24 +266,26 @@ impl Online {
         let mut job = self.job.take()?;
         self.is_away = true;
         self.snapshot = Some(self.newest);
-        job.data = self.newest;
+        job.data_until = self.newest;
         std::mem::swap(&mut job.ticks, &mut self.ticks);
         job.tick_count = std::mem::take(&mut self.tick_count);
         for (part, component) in job.components.iter_mut().zip(&mut self.components) {
             component.join();
             // Both have the same unknowns.
             let _ = part.information.copy_from(&component.information);
-            std::mem::swap(&mut part.learnt, &mut component.learnt);
+            std::mem::swap(&mut part.accepted_rows, &mut component.accepted_rows);
             std::mem::swap(&mut part.rejected_rows, &mut component.rejected_rows);
-            component.learnt.clear();
+            component.accepted_rows.clear();
             component.rejected_rows.clear();
             component.waits = false;
             part.has_new_zero = component.is_outdated;
             part.is_disturbed = component.is_disturbed;
             part.cosines.copy_from_slice(&component.cosines);
-            part.whitened.copy_from_slice(&component.whitened);
-            component.whitened.copy_from_slice(&component.variances);
-            part.motion = component.motion;
+            part.row_variances.copy_from_slice(&component.row_variances);
+            component
+                .row_variances
+                .copy_from_slice(&component.variances);
+            part.seconds_in_motion = component.seconds_in_motion;
             part.rows = component.rows;
         }
         Some(job)
@@ -316,7 +318,7 @@ impl Online {
         std::mem::swap(&mut self.solution, &mut job.solution);
         for (part, component) in job.components.iter_mut().zip(&mut self.components) {
             component.variances.copy_from_slice(&part.variances);
-            component.drift_rates.copy_from_slice(&part.drift_rates);
+            component.drift_std.copy_from_slice(&part.drift_std);
             component.is_outdated &=
                 component.waits || !part.has_new_zero || part.failure.is_some();
             component.may_judge = part.failure.is_none() && !component.is_outdated;
@@ -341,7 +343,7 @@ impl Online {
                     DetectedChange::Offset => component.counts.offset_changes += 1,
                     DetectedChange::Load => component.counts.load_changes += 1,
                     DetectedChange::Anew => {
-                        (component.motion, component.rows) = (0.0, 0);
+                        (component.seconds_in_motion, component.rows) = (0.0, 0);
                     }
                 }
                 component.pending.clear();
@@ -533,8 +535,8 @@ mod tests {
             .solve(&DVector::from_vec(y), 1e-12)
             .unwrap();
         known.estimate = explains.as_slice().to_vec();
-        known.spread = DMatrix::zeros(unknowns, unknowns);
-        component.drift_rates.fill(1e5);
+        known.covariance_root = DMatrix::zeros(unknowns, unknowns);
+        component.drift_std.fill(1e5);
         let now = Nanos::from_seconds(100.0);
         for (offset, since, exceeds_gate) in [
             (0.0, 0.0, false),
@@ -543,7 +545,7 @@ mod tests {
             (3e7, 100.0, true),
         ] {
             known.estimate[3] = explains[3] + offset;
-            known.data = Nanos::from_seconds(100.0 - since);
+            known.data_until = Nanos::from_seconds(100.0 - since);
             assert_eq!(
                 component.exceeds_gate(&known, now),
                 exceeds_gate,

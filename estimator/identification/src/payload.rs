@@ -10,15 +10,15 @@
 //! What `d` explains is eliminated, so the covariance of `p` contains the uncertainty of the robot;
 //! and that of the sensors' gains: every weight scales with them, and cross-talk turns moments.
 
-use crate::batch::{self, exclude_disturbed, plausible_model, prepare_logs};
 use crate::dataset::Dataset;
 use crate::diagnose::load::{Normal, body};
 use crate::diagnose::undeclared;
 use crate::finding::Finding;
 use crate::fit::IdentifyError;
+use crate::identify::{self, exclude_disturbed, plausible_model, prepare_logs};
 
+use crate::prepared_log::training_instants;
 use crate::robot::{IdentificationInput, Robot};
-use crate::training::training_instants;
 use nalgebra::{DMatrix, SMatrix, SVector};
 use proprio_dynamics::model::Frame;
 use proprio_dynamics::regressor::LINK_PARAMETERS;
@@ -88,7 +88,7 @@ pub fn payload(
     inputs: &[IdentificationInput],
 ) -> Result<Payload, PayloadError> {
     let name = || robot.model.link_name(frame.link).to_owned();
-    let inputs = batch::chosen_inputs(robot, inputs);
+    let inputs = identify::chosen_inputs(robot, inputs);
     let mut logs = prepare_logs(robot, datasets);
     let measurement = match plausible_model(robot, &inputs, &mut logs)? {
         ControlFlow::Continue(measurement) => measurement,

@@ -93,7 +93,7 @@ pub const GREATEST_TAU: f64 = 1.0;
 /// Unknown quality of CAD: data without information leave `tau` at its greatest.
 const UNKNOWN_QUALITY: Expected = Expected {
     median: GREATEST_TAU,
-    spread: 1.0,
+    log_std: 1.0,
 };
 
 /// Uncertainty factor of the stated quality of CAD: two of three CAD models are within it. It is
@@ -208,11 +208,11 @@ pub struct Prior {
     expected: Expected,
 }
 
-/// The prior of `tau`: `ln tau ~ N(ln median, spread^2)`.
+/// The prior of `tau`: `ln tau ~ N(ln median, log_std^2)`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Expected {
     median: f64,
-    spread: f64,
+    log_std: f64,
 }
 
 impl Prior {
@@ -258,8 +258,8 @@ impl Prior {
     }
 
     /// With a stated quality of CAD: masses and second moments have the relative error `relative`,
-    /// to a factor of 1.5. That is `tau = relative / sqrt 2` ([`crate::prior::cad_root`]). Zero:
-    /// CAD is exact.
+    /// to a factor of 1.5. That is `tau = relative / sqrt 2` ([`crate::prior::link_cad_root`]).
+    /// Zero: CAD is exact.
     #[must_use]
     pub fn with_relative_std(self, relative: f64) -> Self {
         self.with_quality(relative, QUALITY_FACTOR.ln())
@@ -276,9 +276,9 @@ impl Prior {
         self.with_quality(relative, 1.0)
     }
 
-    fn with_quality(self, relative: f64, spread: f64) -> Self {
+    fn with_quality(self, relative: f64, log_std: f64) -> Self {
         let median = (relative * FRAC_1_SQRT_2).clamp(LEAST_TAU, GREATEST_TAU);
-        let expected = Expected { median, spread };
+        let expected = Expected { median, log_std };
         Self { expected, ..self }
     }
 
@@ -436,7 +436,7 @@ fn check_finite(what: &'static str, values: &[f64]) -> Result<(), PriorError> {
 /// The `tau` at which the evidence is stationary: `(gamma / 10) e(tau) + tau^2 ln tau = D`, where
 /// the middle term is that of `ln tau ~ N(0, 1)`.
 fn stationary_tau(divergence: f64, effective: f64, expected: Expected) -> f64 {
-    let of_prior = |tau: f64| (tau / expected.median).ln() / (expected.spread * expected.spread);
+    let of_prior = |tau: f64| (tau / expected.median).ln() / (expected.log_std * expected.log_std);
     let slope = |tau: f64| {
         effective / 10.0 * mean_divergence(tau) / (tau * tau) + of_prior(tau)
             - divergence / (tau * tau)
@@ -497,7 +497,7 @@ fn digamma(mut x: f64) -> f64 {
 /// `tau = relative / sqrt 2` to second order. Bodies lighter than [`LEAST_MASS`] or thinner than
 /// [`LEAST_RADIUS`] are raised to these; otherwise the place of a point mass would be exact.
 #[must_use]
-pub fn cad_root(inertia: &RigidInertia, relative: f64) -> SMatrix<f64, 10, 10> {
+pub fn link_cad_root(inertia: &RigidInertia, relative: f64) -> SMatrix<f64, 10, 10> {
     let (_, l, _) = floored(0, inertia);
     let mut root = Matrix10::zeros();
     for (row, (i, j)) in PLACES.into_iter().enumerate() {

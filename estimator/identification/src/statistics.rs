@@ -1,21 +1,23 @@
 //! Quantiles: of normal variables, of chi-square variables by the cube root approximation of Wilson
 //! and Hilferty (1931), and of numbers.
 //!
-//! The approximation is within 1 % of the quantile from three degrees of freedom on, and a few per
-//! cent too large for one.
+//! Up to a level of 3.1 the approximation is within 1 % of the quantile from three degrees of
+//! freedom on, and a few per cent too large for one. Beyond, it is too large: at a level of 5 by 8 %
+//! with three degrees of freedom, 4 % with six, 2 % with twelve. A test at that level gives a false
+//! alarm with .28, .44 and .61 of the normal variable's probability.
 
 /// The value that a chi-square variable with `freedom` degrees of freedom exceeds with the
 /// probability that a normal one exceeds `level`.
 pub fn chi_square(freedom: usize, level: f64) -> f64 {
-    let (k, spread) = cube(freedom);
-    k * (1.0 - spread + level * spread.sqrt()).powi(3)
+    let (k, variance) = cube(freedom);
+    k * (1.0 - variance + level * variance.sqrt()).powi(3)
 }
 
 /// The normal deviate as improbable as `square` is for a chi-square variable: the inverse of
 /// [`chi_square`].
 pub fn deviate(square: f64, freedom: usize) -> f64 {
-    let (k, spread) = cube(freedom);
-    ((square / k).cbrt() - (1.0 - spread)) / spread.sqrt()
+    let (k, variance) = cube(freedom);
+    ((square / k).cbrt() - (1.0 - variance)) / variance.sqrt()
 }
 
 /// The standard normal deviate that is exceeded with this probability, from 1e-300 to 0.5.

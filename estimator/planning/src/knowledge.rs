@@ -23,7 +23,7 @@ use proprio_dynamics::regressor::identifiable::{
 };
 use proprio_dynamics::spatial::Vec3;
 use proprio_identification::forecast::{Forecast, ForecastError, SensorNoise};
-use proprio_identification::prior::cad_root;
+use proprio_identification::prior::link_cad_root;
 use proprio_identification::{CovarianceRoot, Robot};
 use proprio_topics::Nanos;
 
@@ -124,7 +124,7 @@ fn remaining(robot: &Robot, subspace: &Identifiable) -> CovarianceRoot {
     let mut weighted = null.clone();
     for (link, cad) in robot.model.inertias().iter().enumerate() {
         let first = LINK_PARAMETERS * link;
-        let inverse = cad_root(cad, robot.urdf_relative_std)
+        let inverse = link_cad_root(cad, robot.urdf_relative_std)
             .transpose()
             .try_inverse();
         // Without an inverse CAD is exact.
@@ -204,7 +204,7 @@ impl Knowledge {
         let cad = workspace.deviations(robot, &at_rest(robot, &SensorNoise::stated(robot), None)?);
         let end = workspace.deviations(robot, &remaining(robot, &subspace));
         let spreads: Vec<_> = (robot.model.inertias().iter())
-            .map(|cad| cad_root(cad, robot.urdf_relative_std).transpose())
+            .map(|cad| link_cad_root(cad, robot.urdf_relative_std).transpose())
             .collect();
         let torque = |((dof, rows), (cad, end)): ((usize, Option<&DMatrix<f64>>), _)| {
             let (cad, end): (&Deviation, &Deviation) = (cad, end);

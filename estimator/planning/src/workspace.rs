@@ -15,7 +15,7 @@ use proprio_dynamics::{
     Solver,
 };
 use proprio_identification::dataset::observation::Observation;
-use proprio_identification::prior::cad_root;
+use proprio_identification::prior::link_cad_root;
 use proprio_identification::robot::BaseMotion;
 use proprio_identification::{CovarianceRoot, Robot};
 use proprio_topics::{Nanos, Reason};
@@ -291,7 +291,7 @@ impl Workspace {
             for (link, cad) in robot.model.inertias().iter().enumerate() {
                 let first = LINK_PARAMETERS * link;
                 if !is_in(first) {
-                    let root = cad_root(cad, robot.urdf_relative_std);
+                    let root = link_cad_root(cad, robot.urdf_relative_std);
                     let spread = rows.columns(first, LINK_PARAMETERS) * root.transpose();
                     (0..rest.len()).for_each(|i| rest[i] += spread.row(i).norm_squared());
                 }

@@ -11,9 +11,9 @@
 //!
 //! A solution goes to this pipeline's parameters ([`InertialState`]), to readers
 //! ([`InertiaEstimate`]) and, from time to time, as text to the file `identification.state`
-//! ([`Job::state`]). It never goes to parameters.toml, which `proprio identify` alone writes. At the
-//! start identification begins with parameters.toml if the configuration names one, and the file of
-//! an earlier run replaces that ([`super::Pipeline::resume`]).
+//! ([`Job::state`]). It never goes to parameters.toml, which `proprio identify` alone writes. At
+//! the start identification begins with parameters.toml if the configuration names one, and the
+//! file of an earlier run replaces that ([`super::Pipeline::resume`]).
 
 mod centred;
 
@@ -129,8 +129,8 @@ fn covariance(setup: &Setup, solution: &Solution) -> Covariance {
         sensors: &component.sensors,
         root: (component.root.nrows() > 0).then_some(&component.root),
         offsets: &component.offsets,
-        drift: &component.drift,
-        known: component.data,
+        drift_std: &component.drift_std,
+        known: component.data_until,
     });
     setup.initial.covariance_with(&setup.robot, blocks)
 }
@@ -138,7 +138,7 @@ fn covariance(setup: &Setup, solution: &Solution) -> Covariance {
 /// Writes a solution as the message that is published.
 fn write_inertia(setup: &Setup, solution: &Solution, out: &mut InertiaEstimate) {
     let name = |text: &str| Name::new(text).unwrap_or(Name::EMPTY);
-    out.header.acquired = solution.data;
+    out.header.acquired = solution.data_until;
     let (mut links, mut offsets) = (0, 0);
     for (component, group) in solution.components.iter().zip(0..) {
         let parameters = 10 * component.links.len();
@@ -158,7 +158,7 @@ fn write_inertia(setup: &Setup, solution: &Solution, out: &mut InertiaEstimate) 
                 name: name(setup.robot.model.link_name(link)),
                 parameters: body.parameters(),
                 standard_deviation: std::array::from_fn(|i| deviation(10 * index + i)),
-                motion: component.motion,
+                motion: component.seconds_in_motion,
                 rows: component.rows,
                 group,
                 accepted,

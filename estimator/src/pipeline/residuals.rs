@@ -24,8 +24,8 @@
 //!
 //! A contact that is detected from the start on may as well be a wrong offset, a wrong mounting, or
 //! another direction of gravity. So it counts only once the residual of its sub-tree has been
-//! plausible without it for [`CONFIRMED`]. One that was there before the residual could not be tested,
-//! because of a fault, may still be there after it.
+//! plausible without it for [`CONFIRMED`]. One that was there before the residual could not be
+//! tested, because of a fault, may still be there after it.
 
 use super::offset_steps::OffsetStep;
 use nalgebra::{Matrix6, Vector6};

@@ -1,5 +1,6 @@
-//! Validity of the outputs: the channels that each one depends on, the faults of these, and all else
-//! that speaks against a result. [`Judge`] writes torques and contact wrenches with their reasons.
+//! Validity of the outputs: the channels that each one depends on, the faults of these, and all
+//! else that speaks against a result. [`Judge`] writes torques and contact wrenches with their
+//! reasons.
 
 use super::contacts::Place;
 use super::offset_steps::OffsetStepCover;

@@ -13,7 +13,7 @@ use proprio_dynamics::{
     Structure,
 };
 use proprio_estimator::propagation::{Covariance, Propagation};
-use proprio_identification::prior::cad_root;
+use proprio_identification::prior::link_cad_root;
 use proprio_topics::{Nanos, Source};
 use proptest::prelude::*;
 
@@ -490,7 +490,7 @@ fn the_uncertainty_of_a_urdf_is_relative_and_does_not_depend_on_the_frame() {
         &Mat3::from_diagonal(&Vec3::new(0.02, 0.03, 0.04)),
     );
     let covariance = |body: &RigidInertia| {
-        let root = cad_root(body, relative);
+        let root = link_cad_root(body, relative);
         root.transpose() * root
     };
     let p = covariance(&body);

@@ -368,7 +368,7 @@ fn an_uncertain_calibration_stays_uncertain_during_on_line_identification() {
         sensors: &[0],
         root: Some(&root),
         offsets: &offset,
-        drift: &[[0.0; 6]],
+        drift_std: &[[0.0; 6]],
         known: Nanos::ZERO,
     };
     let links: Vec<usize> = (0..setup.robot.model.inertias().len()).collect();
@@ -393,7 +393,7 @@ fn an_uncertain_calibration_stays_uncertain_during_on_line_identification() {
             sensors: &[],
             root: Some(&exact),
             offsets: &[],
-            drift: &[],
+            drift_std: &[],
             known: Nanos::ZERO,
         };
         torques(
@@ -469,7 +469,7 @@ fn the_gain_of_a_sensor_is_as_uncertain_as_usual() {
         sensors: &[0],
         root: Some(&exact),
         offsets: &offset,
-        drift: &[[0.0; 6]],
+        drift_std: &[[0.0; 6]],
         known: Nanos::ZERO,
     };
     let covariance = (setup.initial).covariance_with(&setup.robot, std::iter::once(group));

@@ -35,7 +35,7 @@ fn an_offset_that_wanders_is_followed_and_known_to_wander() {
         let mut end = None;
         let (told, counts) = inertias_by(learning(&sessions), &log, alter, &mut end);
         let pipeline = end.expect("the pipeline");
-        let drift = pipeline.identification().unwrap().solution().components[0].drift[0];
+        let drift = pipeline.identification().unwrap().solution().components[0].drift_std[0];
         // [torque; force]
         let found: Vec<f64> = (0..6).map(|i| drift[(i + 3) % 6] / noise[i]).collect();
         println!("{found:.3?} {counts:?}");
@@ -122,7 +122,7 @@ fn offsets_do_not_drift_during_a_declared_contact() {
     };
     let log = declared(&sessions.log("train"), from, f64::INFINITY);
     let (published, counts) = inertias_by(learning(&sessions), &log, alter, &mut end);
-    let drift = end.unwrap().identification().unwrap().solution().components[0].drift[0][5];
+    let drift = end.unwrap().identification().unwrap().solution().components[0].drift_std[0][5];
     let after: Vec<f64> = published
         .iter()
         .filter(|(t, _)| t.seconds() > from + 3.0)

@@ -37,7 +37,7 @@ trait AnyStream {
 
 impl Recording {
     /// Sets the stamps of the first and the last sample.
-    pub(crate) fn span(&mut self) {
+    pub(crate) fn set_span(&mut self) {
         let (mut first, mut last) = (Nanos::MAX, Nanos::MIN);
         for channel in self.channels.clone() {
             for stream in self.streams(channel.role) {

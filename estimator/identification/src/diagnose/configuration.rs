@@ -42,16 +42,16 @@ use crate::diagnose::configuration::fault::{
 };
 use crate::diagnose::configuration::mounting::{Mounting, mountings};
 use crate::finding::{Finding, FindingCode};
-use crate::hypothesis::accepted;
 use crate::linear::nuisance::NuisanceFilter;
 use crate::measurement::channels::{attribute_to, sensor_name};
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::nuisance_prior;
 use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::Unknowns;
+use crate::nested_test::accepted;
 use crate::online::bank::hypothesis::{GRAVITY, MotionReading};
+use crate::prepared_log::PreparedLog;
 use crate::robot::{BaseMotion, IdentificationInput, Robot};
-use crate::training::PreparedLog;
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
 use proprio_dynamics::spatial::Vec3;
 use proprio_dynamics::{DynamicsError, Structure};

@@ -20,9 +20,9 @@ use crate::diagnose::load::LoadChange;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::NoiseModel;
 use crate::measurement::reduction::{LogSegment, residuals};
+use crate::prepared_log::{PreparedLog, SEGMENT_INSTANTS};
 use crate::statistics::chi_square;
 use crate::statistics::quantile;
-use crate::training::{PreparedLog, SEGMENT_INSTANTS};
 use nalgebra::DVector;
 
 /// Normal deviate beyond which a block's square is outlying: one block in three million by chance.

@@ -5,14 +5,14 @@
 
 use crate::dataset::observation::{Annotated, Observation, SubtreeSet};
 use crate::fit::NoiseAndMap;
-use crate::hypothesis::needed;
 use crate::linear::information::Information;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::{LogSegment, ReducedLog, blocks, reduce};
 use crate::measurement::unknowns::Unknowns;
+use crate::nested_test::needed;
 use crate::parallel;
+use crate::prepared_log::{PreparedLog, reduced_segments};
 use crate::prior::Prior;
-use crate::training::{PreparedLog, reduced_segments};
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SMatrix, SVector};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_topics::Nanos;

@@ -4,8 +4,8 @@
 use crate::dataset::{Dataset, LogRole};
 use crate::diagnose::configuration;
 use crate::finding::{Finding, FindingCode};
+use crate::prepared_log::{folds, prepare, stamps_apart};
 use crate::robot::{IdentificationInput, Robot};
-use crate::training::{folds, prepare, stamps_apart};
 
 /// Findings that mean that a log, or the configuration, is wrong. (Others mean that a log contains
 /// little information or that some instants are lost.)

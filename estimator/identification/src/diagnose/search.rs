@@ -4,7 +4,7 @@
 //! Every hypothesis is judged by the same evidence, the cost of a fit with it: squared residuals
 //! plus twice the prior's cost, at the prior's scale. The hypothesis that lowers the cost the most
 //! is accepted if it does so by more than parameters and noise do ([`crate::hypothesis`]); then the
-//! next beside it ([`crate::hypothesis::accepted`]). What is found is reported, not corrected.
+//! next beside it ([`crate::nested_test::accepted`]). What is found is reported, not corrected.
 //!
 //! # Encoder sign
 //! Other rows: positions, velocities and accelerations are negated. Tested before gains of the F/T
@@ -31,18 +31,18 @@ use crate::arithmetic::dot;
 use crate::dataset::observation::{Annotated, Observation};
 use crate::finding::{Finding, FindingCode};
 use crate::fit::{Identified, NoiseAndMap, added};
-use crate::hypothesis::{accepted, deviations, needed};
 use crate::linear::information::Information;
 use crate::measurement::channels::sensor_name;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::{LogSegment, reduce, reduce_with, residuals};
 use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::Unknowns;
+use crate::nested_test::{accepted, deviate, needed};
 use crate::online::bank::hypothesis::MotionReading;
+use crate::prepared_log::PreparedLog;
 use crate::prior::{MapEstimate, Posterior};
 use crate::report::outcome::TimeOffset;
 use crate::robot::Robot;
-use crate::training::PreparedLog;
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::model::{Joint, JointKind};
 use std::f64::consts::FRAC_1_SQRT_2;
@@ -453,7 +453,7 @@ impl<'a> Search<'a> {
 
         let (robot, unknowns) = (self.identified.robot(), self.identified.unknowns());
         let (sensors, torques) = (unknowns.sensors.len(), unknowns.joints.len());
-        let significance = deviations(sensors + torques + 1);
+        let significance = deviate(sensors + torques + 1);
         let is_long = |(seconds, deviation): Estimate| {
             seconds.abs() > MIN_DELAY.max(significance * deviation)
         };

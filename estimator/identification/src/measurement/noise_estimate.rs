@@ -67,7 +67,7 @@ pub(crate) fn estimate_noise(
         let (step, block) = walk.unwrap_or((0.0, square * time));
         model.square.push(square / share);
         model.time.push(time);
-        model.drift.push(step / BLOCK / share);
+        model.drift_variance.push(step / BLOCK / share);
         model.block.push(block / share);
     }
     model.least = alike(unknowns, segments, &model);

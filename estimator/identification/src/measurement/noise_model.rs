@@ -12,7 +12,7 @@ pub(crate) struct NoiseModel {
     /// Per channel: integrated autocorrelation time of that residual, in observations.
     pub time: Vec<f64>,
     /// Per channel: rate of the offset's random walk [unit^2/s].
-    pub drift: Vec<f64>,
+    pub drift_variance: Vec<f64>,
     /// Per channel: variance of a row for which block means have the variance that was found for
     /// them beside the random walk.
     pub block: Vec<f64>,
@@ -30,7 +30,7 @@ impl NoiseModel {
         Self {
             square: start.clone(),
             time: vec![1.0; channels],
-            drift: vec![0.0; channels],
+            drift_variance: vec![0.0; channels],
             block: start,
             least,
             seconds: Seconds::default(),
@@ -88,7 +88,7 @@ impl NoiseModel {
             for channel in (0..own.len()).filter(|&channel| others[channel] > own[channel]) {
                 greatest.square[channel] = other.square[channel];
                 greatest.time[channel] = other.time[channel];
-                greatest.drift[channel] = other.drift[channel];
+                greatest.drift_variance[channel] = other.drift_variance[channel];
                 greatest.block[channel] = other.block[channel];
             }
         }
@@ -116,7 +116,7 @@ impl NoiseModel {
     /// Variances of the steps of all nuisance parameters over this time.
     pub(crate) fn steps(&self, unknowns: &Unknowns, seconds: f64) -> Vec<f64> {
         let mut variances = vec![0.0; unknowns.nuisance()];
-        for (channel, rate) in self.drift.iter().enumerate() {
+        for (channel, rate) in self.drift_variance.iter().enumerate() {
             variances[unknowns.offset_of(channel)] = rate * seconds;
         }
         variances

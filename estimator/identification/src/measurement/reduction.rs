@@ -390,7 +390,7 @@ pub(crate) mod tests {
             square: squares.to_vec(),
             time: vec![2.0; 2],
             block: vec![1e-3; 2],
-            drift: squares.map(|x| 0.01 * x).to_vec(),
+            drift_variance: squares.map(|x| 0.01 * x).to_vec(),
             least: vec![1e-9; 2],
             seconds: Seconds::default(),
         };
@@ -630,7 +630,7 @@ pub(crate) mod tests {
             let ratio = noise.square[channel].sqrt() / HIP_AND_FOOT[channel];
             println!(
                 "channel {channel}: {ratio:.3}, time {:.2}, drift {:.2e}",
-                noise.time[channel], noise.drift[channel]
+                noise.time[channel], noise.drift_variance[channel]
             );
             // The quieter sensor has a quarter of the other's noise. Its lower limit is half of the
             // mean noise of both.
@@ -669,11 +669,11 @@ pub(crate) mod tests {
             println!(
                 "channel {channel}: {:.3}, drift {:.2e}",
                 square.sqrt() / expected,
-                noise.drift[channel]
+                noise.drift_variance[channel]
             );
         }
         let whole: f64 = [3, 4, 5, 9, 10, 11]
-            .map(|channel| noise.drift[channel])
+            .map(|channel| noise.drift_variance[channel])
             .iter()
             .sum();
         let expected = 6.0 * 0.003 * 0.003 / 0.01;

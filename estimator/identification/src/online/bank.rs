@@ -32,14 +32,14 @@
 
 mod evidence;
 pub(crate) mod hypothesis;
-mod unit;
+mod subtree_hypotheses;
 
 pub use hypothesis::{Hypothesis, MotionReading, WrenchReading};
 
 use crate::online::component::ComponentLayout;
 use crate::online::solution::{DetectedChange, Doubt, OnlineError, Solution};
 use crate::robot::{Robot, stated_noise};
-use evidence::{HypothesisFit, HypothesisPosterior, SMALL, SubtreeUnknowns, TickRows, dot};
+use evidence::{HypothesisPosterior, SMALL, SharedDesign, SubtreeUnknowns, TickRows, dot};
 use hypothesis::SeenMotion;
 use nalgebra::Vector6;
 use proprio_dynamics::model::Model;
@@ -48,7 +48,7 @@ use proprio_dynamics::spatial::{RigidInertia, Wrench};
 use proprio_dynamics::{ContactSet, FrameMotion, JointState, Kinematics, Solver, Structure};
 use proprio_topics::Nanos;
 use std::collections::VecDeque;
-use unit::{CONTACT, SubtreeHypotheses, hypotheses};
+use subtree_hypotheses::{CONTACT, SubtreeHypotheses, hypotheses};
 
 /// Deviations within which the torque of a hypothesis lies that is not refuted. At four, the
 /// promise, almost half of the room remains for the uncertainty of that torque itself.
@@ -83,7 +83,7 @@ pub(crate) struct Tick {
     /// The components that move, a bit each.
     pub(crate) moving: u64,
     /// Those that have learnt it.
-    learnt: u64,
+    learnt_by: u64,
 }
 
 impl Tick {
@@ -95,7 +95,7 @@ impl Tick {
             readings: vec![Wrench::zero(); sensors],
             active: ContactSet::EMPTY,
             moving: 0,
-            learnt: 0,
+            learnt_by: 0,
         }
     }
 
@@ -127,7 +127,7 @@ pub(crate) fn bits(components: impl Iterator<Item = usize>) -> u64 {
 #[derive(Clone, Debug)]
 pub(crate) struct Bank {
     equations: TickEquations,
-    units: Vec<SubtreeHypotheses>,
+    subtrees: Vec<SubtreeHypotheses>,
     waiting: Vec<Tick>,
     /// The last [`LATEST`], waiting or not.
     latest: Vec<Tick>,
@@ -158,7 +158,7 @@ impl Bank {
     ) -> Result<Self, OnlineError> {
         let (model, structure) = (&robot.model, &robot.structure);
         let stacked = StackedRegressor::new(structure);
-        let mut units = Vec::new();
+        let mut subtrees = Vec::new();
         for (component, layout) in components.enumerate() {
             for &number in &layout.subtrees {
                 let subtree = &stacked.subtrees()[number];
@@ -166,7 +166,7 @@ impl Bank {
                 let contacts = &structure.subtrees()[number].contacts;
                 let contacts = contacts.intersection(&layout.intermittent);
                 let at_start = hypotheses(&unknowns, robot, &contacts);
-                units.push(SubtreeHypotheses::new(
+                subtrees.push(SubtreeHypotheses::new(
                     component, number, unknowns, at_start,
                 ));
             }
@@ -174,7 +174,7 @@ impl Bank {
         let sensors = structure.sensors().iter();
         let stated = sensors.map(|cut| stated_noise(cut).map(|sigma| sigma * sigma));
         Ok(Self {
-            units,
+            subtrees,
             equations: TickEquations {
                 variances: stated.collect(),
                 kinematics: Kinematics::new(model, robot.base_link)?,
@@ -209,32 +209,45 @@ impl Bank {
         for mut tick in now {
             for (component, (_, slots)) in decided.iter().enumerate() {
                 if slots.binary_search(&tick.slot).is_ok() {
-                    tick.learnt |= bit(component);
+                    tick.learnt_by |= bit(component);
                 }
             }
-            let is_learnt = |component: usize| tick.learnt & tick.moving & bit(component) != 0;
+            let is_learnt = |component: usize| tick.learnt_by & tick.moving & bit(component) != 0;
             let mut views: Vec<MotionReading> = Vec::new();
-            for unit in self.units.iter().filter(|unit| is_learnt(unit.component)) {
-                views.extend(unit.fits.iter().map(|fit| fit.view));
+            for subtree in self
+                .subtrees
+                .iter()
+                .filter(|subtree| is_learnt(subtree.component))
+            {
+                views.extend(subtree.fits.iter().map(|fit| fit.motion_reading));
             }
-            while let Some(view) = views.pop() {
-                views.retain(|other| *other != view);
-                let Some(shifted) = self.equations.shifted(&tick, view, &self.units) else {
+            while let Some(motion_reading) = views.pop() {
+                views.retain(|other| *other != motion_reading);
+                let Some(shifted) = self
+                    .equations
+                    .shifted(&tick, motion_reading, &self.subtrees)
+                else {
                     continue;
                 };
-                if !self.equations.update(&tick, view) {
+                if !self.equations.update(&tick, motion_reading) {
                     continue;
                 }
-                let units = self.units.iter_mut().zip(&shifted);
-                for (unit, shifted) in units.filter(|(unit, _)| is_learnt(unit.component)) {
-                    let rows = self.equations.rows(unit, &tick, shifted);
-                    for fit in unit.fits.iter_mut().filter(|fit| fit.view == view) {
-                        fit.add(&unit.columns, &rows);
+                let subtrees = self.subtrees.iter_mut().zip(&shifted);
+                for (subtree, shifted) in
+                    subtrees.filter(|(subtree, _)| is_learnt(subtree.component))
+                {
+                    let rows = self.equations.rows(subtree, &tick, shifted);
+                    for fit in subtree
+                        .fits
+                        .iter_mut()
+                        .filter(|fit| fit.motion_reading == motion_reading)
+                    {
+                        fit.add(&subtree.columns, &rows);
                     }
                 }
             }
-            self.since_last += usize::from(tick.learnt != 0);
-            if tick.learnt != 0 && self.since_last >= APART {
+            self.since_last += usize::from(tick.learnt_by != 0);
+            if tick.learnt_by != 0 && self.since_last >= APART {
                 self.since_last = 0;
                 if self.recent.len() == POSTURES {
                     self.recent.pop_front();
@@ -259,18 +272,18 @@ impl Bank {
         let all = self.latest.iter().chain(ticks);
         let rejected: Vec<&Tick> = all.filter(|tick| slots.contains(&tick.slot)).collect();
         let (mut jump, mut contact) = (0.0, f64::NEG_INFINITY);
-        for unit in (self.units.iter()).filter(|unit| unit.component == component) {
-            let mut fits = unit.changes();
+        for subtree in (self.subtrees.iter()).filter(|subtree| subtree.component == component) {
+            let mut fits = subtree.changes();
             for tick in &rejected {
                 if self.equations.update(tick, MotionReading::AsStated) {
-                    let rows = self.equations.rows(unit, tick, &[]);
+                    let rows = self.equations.rows(subtree, tick, &[]);
                     for fit in &mut fits {
-                        fit.add(&unit.columns, &rows);
+                        fit.add(&subtree.columns, &rows);
                     }
                 }
             }
-            let evidence = |fit: &mut HypothesisFit| {
-                (0..WEIGHINGS).for_each(|_| fit.weigh(&unit.columns));
+            let evidence = |fit: &mut SharedDesign| {
+                (0..WEIGHINGS).for_each(|_| fit.weigh(&subtree.columns));
                 fit.branches[0].log_evidence
             };
             let mut evidence = fits.iter_mut().map(evidence);
@@ -285,16 +298,23 @@ impl Bank {
     /// Weighs all hypotheses. What is wrong with the robot, rather than with one sub-tree, must be
     /// compatible with the others, too.
     fn weigh(&mut self) {
-        self.units.iter_mut().for_each(SubtreeHypotheses::weigh);
-        let evidence: Vec<_> = self.units.iter().map(SubtreeHypotheses::evidence).collect();
-        for (number, unit) in self.units.iter_mut().enumerate() {
-            unit.decide(|view, sight| {
+        self.subtrees.iter_mut().for_each(SubtreeHypotheses::weigh);
+        let evidence: Vec<_> = self
+            .subtrees
+            .iter()
+            .map(SubtreeHypotheses::evidence)
+            .collect();
+        for (number, subtree) in self.subtrees.iter_mut().enumerate() {
+            subtree.decide(|motion_reading, wrench_reading| {
                 let others = evidence.iter().enumerate();
                 let others = others.filter(|(other, _)| *other != number);
-                let weight = |(_, of_unit): (usize, &Vec<(MotionReading, WrenchReading, f64)>)| {
-                    let same = of_unit.iter().find(|own| (own.0, own.1) == (view, sight));
-                    same.map(|own| own.2)
-                };
+                let weight =
+                    |(_, of_subtree): (usize, &Vec<(MotionReading, WrenchReading, f64)>)| {
+                        let same = of_subtree
+                            .iter()
+                            .find(|own| (own.0, own.1) == (motion_reading, wrench_reading));
+                        same.map(|own| own.2)
+                    };
                 others.filter_map(weight).sum()
             });
         }
@@ -305,17 +325,17 @@ impl Bank {
     /// what was learnt does not explain their readings. Of those that begin `anew` nothing is
     /// known.
     pub(crate) fn doubt(&mut self, solution: &mut Solution, disturbed: u64, anew: u64) {
-        let (equations, units, recent) = (&mut self.equations, &self.units, &self.recent);
+        let (equations, subtrees, recent) = (&mut self.equations, &self.subtrees, &self.recent);
         let in_use = equations.in_use(solution);
         let mut doubts: Vec<Option<Doubt>> = vec![None; solution.doubts.len()];
         for component in &mut solution.components {
             component.leading = None;
         }
-        for unit in units.iter() {
-            let dofs = equations.dofs(&unit.columns.sensors, Some(unit.subtree));
-            let leading = unit.leading();
-            let (is_doubtful, is_settled) = (unit.is_doubtful(), unit.is_settled());
-            let of_component = &mut solution.components[unit.component].leading;
+        for subtree in subtrees.iter() {
+            let dofs = equations.dofs(&subtree.columns.sensors, Some(subtree.subtree));
+            let leading = subtree.leading();
+            let (is_doubtful, is_settled) = (subtree.is_doubtful(), subtree.is_settled());
+            let of_component = &mut solution.components[subtree.component].leading;
             *of_component = of_component.or(leading);
             let mut add = |dof: usize, deviation: f64| {
                 let doubt = doubts[dof].get_or_insert(Doubt::NONE);
@@ -324,30 +344,31 @@ impl Bank {
             };
             // The first postures of a motion do not show yet what is wrong, nor how far apart the
             // torques will be.
-            let learnt = solution.components[unit.component].motion;
-            let is_begun = learnt > 0.0 && learnt < BEGUN || anew & bit(unit.component) != 0;
-            let is_shown = unit.fits[0].ticks() >= SHOWN && disturbed & bit(unit.component) == 0;
+            let seconds = solution.components[subtree.component].seconds_in_motion;
+            let is_begun = seconds > 0.0 && seconds < BEGUN || anew & bit(subtree.component) != 0;
+            let is_shown =
+                subtree.fits[0].ticks() >= SHOWN && disturbed & bit(subtree.component) == 0;
             if is_doubtful || is_begun || !is_settled {
-                let beyond = equations.dofs(&measured_with(unit, units), None);
+                let beyond = equations.dofs(&measured_with(subtree, subtrees), None);
                 beyond.iter().for_each(|&dof| add(dof, f64::INFINITY));
             }
             if is_doubtful || is_begun || !is_settled && !is_shown {
                 dofs.iter().for_each(|&dof| add(dof, f64::INFINITY));
                 continue;
             }
-            let learnt = |tick: &&Tick| tick.learnt & bit(unit.component) != 0;
-            if recent.iter().any(|tick| learnt(&tick)) {
+            let is_learnt = |tick: &&Tick| tick.learnt_by & bit(subtree.component) != 0;
+            if recent.iter().any(|tick| is_learnt(&tick)) {
                 dofs.iter().for_each(|&dof| add(dof, 0.0));
             }
-            let alternatives = unit.alternatives();
+            let alternatives = subtree.alternatives();
             if alternatives.is_empty() {
                 continue;
             }
-            for tick in recent.iter().filter(learnt) {
+            for tick in recent.iter().filter(is_learnt) {
                 let published = equations.torques(tick, &Hypothesis::AS_STATED, &in_use, &dofs);
                 for other in &alternatives {
                     let torques =
-                        equations.alternative(tick, (&unit.columns, other), &in_use, &dofs);
+                        equations.alternative(tick, (&subtree.columns, other), &in_use, &dofs);
                     for (&dof, both) in dofs.iter().zip(published.iter().zip(torques)) {
                         if let (Some((published, _)), Some((torque, own))) = both {
                             add(dof, ((torque - published).abs() / COVERED).max(own));
@@ -364,41 +385,44 @@ impl Bank {
     /// Forgets what a change of a component concerns.
     pub(crate) fn forget(&mut self, component: usize, change: DetectedChange) {
         let model = &self.equations.model;
-        let units = self.units.iter_mut();
-        let own = units.filter(|unit| unit.component == component);
-        own.for_each(|unit| match change {
-            DetectedChange::Anew => unit.begin_anew(),
-            DetectedChange::Offset => unit.forget(&unit.offsets()),
-            DetectedChange::Load => unit.forget(&unit.loads(model)),
+        let subtrees = self.subtrees.iter_mut();
+        let own = subtrees.filter(|subtree| subtree.component == component);
+        own.for_each(|subtree| match change {
+            DetectedChange::Anew => subtree.begin_anew(),
+            DetectedChange::Offset => subtree.forget(&subtree.offsets()),
+            DetectedChange::Load => subtree.forget(&subtree.loads(model)),
         });
     }
 
     /// Whether a contact may have been there since the start.
     pub(crate) fn may_have_begun_in_contact(&self, component: usize) -> bool {
-        let mut own = self.units.iter().filter(|unit| unit.component == component);
+        let mut own = self
+            .subtrees
+            .iter()
+            .filter(|subtree| subtree.component == component);
         own.any(SubtreeHypotheses::may_have_begun_in_contact)
     }
 }
 
 impl TickEquations {
     /// Sets the regressor to a tick; false if it can not be computed.
-    fn update(&mut self, tick: &Tick, view: MotionReading) -> bool {
-        self.set_kinematics(tick, view)
+    fn update(&mut self, tick: &Tick, motion_reading: MotionReading) -> bool {
+        self.set_kinematics(tick, motion_reading)
             && self
                 .stacked
                 .update(&self.kinematics, &tick.readings, &tick.active, &[])
                 .is_ok()
     }
 
-    /// The rows of a unit at a tick, to which the regressor is set.
+    /// The rows of a sub-tree at a tick, to which the regressor is set.
     fn rows<'a>(
         &'a self,
-        unit: &SubtreeHypotheses,
+        subtree: &SubtreeHypotheses,
         tick: &'a Tick,
         shifted: &'a [Vector6<f64>],
     ) -> TickRows<'a> {
         TickRows {
-            rows: &self.stacked.subtrees()[unit.subtree],
+            rows: &self.stacked.subtrees()[subtree.subtree],
             structure: &self.structure,
             kinematics: &self.kinematics,
             readings: &tick.readings,
@@ -407,34 +431,34 @@ impl TickEquations {
         }
     }
 
-    /// Of each unit, the wrench that its reference leaves if what a view estimates is a little off,
-    /// each in turn; none if it can not be computed.
+    /// Of each sub-tree, the wrench that its reference leaves if what is estimated of the motion is
+    /// a little off, each in turn; none if it can not be computed.
     fn shifted(
         &mut self,
         tick: &Tick,
-        view: MotionReading,
-        units: &[SubtreeHypotheses],
+        motion_reading: MotionReading,
+        subtrees: &[SubtreeHypotheses],
     ) -> Option<Vec<Vec<Vector6<f64>>>> {
-        let mut shifted = vec![Vec::new(); units.len()];
-        let unknowns = view.unknowns();
+        let mut shifted = vec![Vec::new(); subtrees.len()];
+        let unknowns = motion_reading.unknowns();
         for place in 0..unknowns {
             let mut values = vec![0.0; unknowns];
             values[place] = SMALL;
-            if !self.update(tick, view.at(&values)) {
+            if !self.update(tick, motion_reading.at(&values)) {
                 return None;
             }
-            for (unit, shifted) in units.iter().zip(&mut shifted) {
-                let rows = &self.stacked.subtrees()[unit.subtree];
-                shifted.push(unit.columns.wrench_left(rows)?);
+            for (subtree, shifted) in subtrees.iter().zip(&mut shifted) {
+                let rows = &self.stacked.subtrees()[subtree.subtree];
+                shifted.push(subtree.columns.wrench_left(rows)?);
             }
         }
         Some(shifted)
     }
 
-    fn set_kinematics(&mut self, tick: &Tick, view: MotionReading) -> bool {
+    fn set_kinematics(&mut self, tick: &Tick, motion_reading: MotionReading) -> bool {
         self.motion
             .copy_from(tick.motion.state(), &tick.motion.base);
-        self.motion.see(view);
+        self.motion.see(motion_reading);
         let (kinematics, motion) = (&mut self.kinematics, &self.motion);
         let set = kinematics.set_base(&self.model, tick.base_link);
         set.and_then(|()| kinematics.update(&self.model, motion.state(), &motion.base))
@@ -456,9 +480,9 @@ impl TickEquations {
             active.insert(contact);
         }
         let readings: Vec<Wrench> = (0..tick.readings.len())
-            .map(|sensor| hypothesis.sight.reading(sensor, &tick.readings))
+            .map(|sensor| hypothesis.wrench_reading.reading(sensor, &tick.readings))
             .collect();
-        if !self.set_kinematics(tick, hypothesis.view) {
+        if !self.set_kinematics(tick, hypothesis.motion_reading) {
             return nothing;
         }
         let (model, structure, kinematics) = (&self.model, &self.structure, &self.kinematics);
@@ -495,11 +519,12 @@ impl TickEquations {
             parameters[place] = *value;
         }
         let torques = self.torques(tick, &other.hypothesis, &parameters, dofs);
-        let shifted: Vec<_> = (0..other.of_view.len())
+        let shifted: Vec<_> = (0..other.of_motion_reading.len())
             .map(|place| {
-                let (mut values, mut hypothesis) = (other.of_view.clone(), other.hypothesis);
+                let (mut values, mut hypothesis) =
+                    (other.of_motion_reading.clone(), other.hypothesis);
                 values[place] += SMALL;
-                hypothesis.view = hypothesis.view.at(&values);
+                hypothesis.motion_reading = hypothesis.motion_reading.at(&values);
                 self.torques(tick, &hypothesis, &parameters, dofs)
             })
             .collect();
@@ -510,8 +535,11 @@ impl TickEquations {
                 let other = all[number].as_ref();
                 other.map(|(other, _)| (other - torque) / SMALL)
             };
-            let of_view = shifted.iter().map(to_view).collect::<Option<Vec<f64>>>()?;
-            Some((torque, other.deviation(columns, &sensitivity, &of_view)))
+            let of_motion_reading = shifted.iter().map(to_view).collect::<Option<Vec<f64>>>()?;
+            Some((
+                torque,
+                other.deviation(columns, &sensitivity, &of_motion_reading),
+            ))
         };
         let torques = torques.into_iter().enumerate();
         torques.map(with_deviation).collect()
@@ -566,12 +594,16 @@ impl TickEquations {
     }
 }
 
-/// The sensors whose offsets follow from those of a unit, from sub-tree to sub-tree: no other one
-/// weighs them alone.
-fn measured_with(unit: &SubtreeHypotheses, units: &[SubtreeHypotheses]) -> Vec<usize> {
-    let others = || units.iter().filter(|other| other.subtree != unit.subtree);
+/// The sensors whose offsets follow from those of a sub-tree, from sub-tree to sub-tree: no other
+/// one weighs them alone.
+fn measured_with(subtree: &SubtreeHypotheses, subtrees: &[SubtreeHypotheses]) -> Vec<usize> {
+    let others = || {
+        subtrees
+            .iter()
+            .filter(|other| other.subtree != subtree.subtree)
+    };
     let is_alone = |sensor: &usize| others().any(|other| other.columns.sensors == [*sensor]);
-    let mut found = unit.columns.sensors.clone();
+    let mut found = subtree.columns.sensors.clone();
     found.retain(|sensor| !is_alone(sensor));
     let mut checked = 0;
     while let Some(&sensor) = found.get(checked) {
@@ -721,18 +753,27 @@ mod tests {
         }
     }
 
-    /// What a bank makes of a view that has unknowns.
+    /// What a bank makes of a reading of the motion that has unknowns.
     fn estimate(bank: &Bank, is_it: impl Fn(&MotionReading) -> bool) -> MotionReading {
-        let unit = &bank.units[0];
-        let fit = unit.fits.iter().find(|fit| is_it(&fit.view)).unwrap();
-        fit.posterior(&unit.columns, 0).unwrap().hypothesis.view
+        let subtree = &bank.subtrees[0];
+        let fit = subtree
+            .fits
+            .iter()
+            .find(|fit| is_it(&fit.motion_reading))
+            .unwrap();
+        fit.posterior(&subtree.columns, 0)
+            .unwrap()
+            .hypothesis
+            .motion_reading
     }
 
     #[test]
     fn the_zero_and_the_gain_of_an_encoder_are_estimated() {
         for (off, is_small) in [([-0.03, -0.02], true), ([-0.15, -0.1], false)] {
             let bank = Arm::new().learnt(MotionReading::Encoder(1, off));
-            let found = estimate(&bank, |view| matches!(view, MotionReading::Encoder(1, _)));
+            let found = estimate(&bank, |motion_reading| {
+                matches!(motion_reading, MotionReading::Encoder(1, _))
+            });
             let MotionReading::Encoder(_, [offset, gain]) = found else {
                 panic!("{found:?}");
             };
@@ -741,7 +782,7 @@ mod tests {
             let tolerance = if is_small { 0.1 } else { 0.3 };
             assert!((offset / right[0] - 1.0).abs() < tolerance, "{offset}");
             assert!((gain / right[1] - 1.0).abs() < tolerance, "{gain}");
-            let leading = bank.units[0].leading().map(|own| own.view);
+            let leading = bank.subtrees[0].leading().map(|own| own.motion_reading);
             assert_eq!(leading, (!is_small).then_some(found));
         }
     }
@@ -750,18 +791,20 @@ mod tests {
     fn the_tilt_of_the_base_is_estimated_and_harmless_if_small() {
         for (tilt, is_small) in [(0.03, true), (0.2, false)] {
             let bank = Arm::new().learnt(MotionReading::BaseTurned(Vec3::new(0.0, -tilt, 0.0)));
-            let is_it = |view: &MotionReading| matches!(view, MotionReading::BaseTurned(_));
+            let is_it = |motion_reading: &MotionReading| {
+                matches!(motion_reading, MotionReading::BaseTurned(_))
+            };
             let MotionReading::BaseTurned(turn) = estimate(&bank, is_it) else {
                 panic!();
             };
             assert!((turn.y - tilt).abs() < 0.05 * tilt, "{turn}");
             assert!(turn.x.abs() < 0.05 * tilt, "{turn}");
             // The turn about gravity is not seen, and does not count.
-            let unit = &bank.units[0];
-            assert_eq!(unit.is_doubtful(), !is_small, "{tilt}");
+            let subtree = &bank.subtrees[0];
+            assert_eq!(subtree.is_doubtful(), !is_small, "{tilt}");
             if !is_small {
-                let leading = unit.leading().unwrap();
-                assert!(is_it(&leading.view), "{leading:?}");
+                let leading = subtree.leading().unwrap();
+                assert!(is_it(&leading.motion_reading), "{leading:?}");
             }
         }
     }

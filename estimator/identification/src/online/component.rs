@@ -3,8 +3,8 @@
 use crate::arithmetic::{add_multiple, dot, factorise, forward};
 use crate::linear::information::{Information, Panel};
 use crate::linear::simd::{self, VECTORS};
-use crate::online::channel::NoiseTracker;
-use crate::online::rows::{RowBuffer, SubtreeColumns, WhitenedRows, most_rows, row_kinds, spread};
+use crate::online::noise_tracker::NoiseTracker;
+use crate::online::rows::{RowBuffer, SubtreeColumns, WhitenedRows, expand, most_rows, row_kinds};
 use crate::online::solution::{
     BLOCK, ComponentSolution, DetectedChange, ObservationCounts, OnlineObservation, Paused,
 };
@@ -90,9 +90,9 @@ pub(crate) struct Component {
     pub(crate) drift_interval: f64,
     pub(crate) variances: Vec<f64>,
     /// The variances with which the rows for the next job are whitened.
-    pub(crate) whitened: Vec<f64>,
+    pub(crate) row_variances: Vec<f64>,
     /// Standard deviations of the offsets' drift in a second.
-    pub(crate) drift_rates: Vec<f64>,
+    pub(crate) drift_std: Vec<f64>,
     /// Columns of the offsets.
     pub(crate) offsets: Vec<usize>,
     /// Work space for the standard deviations of one drift step.
@@ -100,7 +100,7 @@ pub(crate) struct Component {
     pub(crate) gathered: RowBuffer,
     pub(crate) pending: RowBuffer,
     /// For the next job: absorbed rows, rejected rows.
-    pub(crate) learnt: RowBuffer,
+    pub(crate) accepted_rows: RowBuffer,
     pub(crate) rejected_rows: RowBuffer,
     pub(crate) block_from: Nanos,
     pub(crate) last_drift: Nanos,
@@ -121,11 +121,11 @@ pub(crate) struct Component {
     pub(crate) is_outdated: bool,
     pub(crate) paused: Paused,
     /// The last instant without a fault.
-    seen: Nanos,
+    last_seen: Nanos,
     pub(crate) last_change: Option<DetectedChange>,
     pub(crate) counts: ObservationCounts,
     /// Amount of absorbed data: seconds in motion, rows.
-    pub(crate) motion: f64,
+    pub(crate) seconds_in_motion: f64,
     pub(crate) rows: u64,
     /// The rows of the present observation.
     pub(crate) current_rows: WhitenedRows,
@@ -235,14 +235,14 @@ impl Component {
             limbs,
             information: Information::new(unknowns),
             panel: Panel::new(unknowns, most * per_block),
-            whitened: variances.clone(),
+            row_variances: variances.clone(),
             variances,
-            drift_rates: noise.iter().map(|(_, rate)| *rate).collect(),
+            drift_std: noise.iter().map(|(_, rate)| *rate).collect(),
             offsets: (0..offset_count).collect(),
             deviations: vec![0.0; offset_count],
             gathered: RowBuffer::new(kinds, per_block),
             pending: RowBuffer::new(kinds, per_block),
-            learnt: RowBuffer::new(kinds, per_job),
+            accepted_rows: RowBuffer::new(kinds, per_job),
             rejected_rows: RowBuffer::new(kinds, per_job),
             block_from: Nanos::MIN,
             last_drift: Nanos::MIN,
@@ -256,10 +256,10 @@ impl Component {
             waits: false,
             is_outdated: false,
             paused: Paused::No,
-            seen: Nanos::ZERO,
+            last_seen: Nanos::ZERO,
             last_change: None,
             counts: ObservationCounts::default(),
-            motion: 0.0,
+            seconds_in_motion: 0.0,
             rows: 0,
             current_rows: WhitenedRows::new(kinds, offset_count),
             row: vec![0.0; unknowns],
@@ -278,14 +278,14 @@ impl Component {
         let (links, sensors) = (&self.layout.links, &self.layout.sensors);
         let noise = self.layout.deviations.chunks_exact(6);
         let square = |six: &[f64]| std::array::from_fn(|i| six[i] * six[i]);
-        let drift = self.drift_rates.chunks_exact(6);
+        let drift = self.drift_std.chunks_exact(6);
         ComponentSolution {
             links: links.clone(),
             bodies: links.iter().map(|&link| cad[link]).collect(),
             sensors: sensors.clone(),
             offsets: sensors.iter().map(|&sensor| offsets[sensor]).collect(),
             root: DMatrix::zeros(0, self.layout.reference.len()),
-            drift: drift.map(|six| std::array::from_fn(|i| six[i])).collect(),
+            drift_std: drift.map(|six| std::array::from_fn(|i| six[i])).collect(),
             noise: noise.map(square).collect(),
             worst: vec![[0.0; 6]; sensors.len()],
             tau: f64::NAN,
@@ -305,7 +305,7 @@ impl Component {
         (self.is_disturbed, self.is_persistent) = (false, false);
         self.paused = Paused::No;
         // A contact may be there since: that is to be seen by another motion.
-        (self.motion, self.rows) = (0.0, 0);
+        (self.seconds_in_motion, self.rows) = (0.0, 0);
         self.last_change = Some(DetectedChange::Offset);
         self.counts.changes += 1;
         self.counts.offset_changes += 1;
@@ -313,12 +313,12 @@ impl Component {
 
     pub(crate) fn observe(
         &mut self,
-        seen: &OnlineObservation<'_>,
+        observation: &OnlineObservation<'_>,
         stacked: &StackedRegressor,
         known: &ComponentSolution,
         slot: i64,
     ) {
-        let t = seen.t;
+        let t = observation.t;
         if self.waits {
             (self.block_from, self.last_drift) = (t, t);
             return;
@@ -326,7 +326,7 @@ impl Component {
         if self.block_from == Nanos::MIN {
             (self.block_from, self.last_drift) = (t, t);
         }
-        let intermittent = self.layout.intermittent.intersection(seen.active);
+        let intermittent = self.layout.intermittent.intersection(observation.active);
         if intermittent != self.active {
             // A declaration may be a little late, and its end a little early.
             self.counts.contact += self.gathered.observations() + self.pending.observations();
@@ -339,9 +339,9 @@ impl Component {
             self.close(t, known);
             self.block_from = t;
         }
-        if let Some((reason, channel)) = self.fault(seen) {
+        if let Some((reason, channel)) = self.fault(observation) {
             // A doubtful reading, or a few, are no pause.
-            if reason != Reason::Implausible || t - self.seen >= BLOCK {
+            if reason != Reason::Implausible || t - self.last_seen >= BLOCK {
                 self.paused = Paused::Fault(reason, channel);
             }
             let counts = &mut self.counts;
@@ -355,7 +355,7 @@ impl Component {
             } += 1;
             return;
         }
-        self.seen = t;
+        self.last_seen = t;
         let (kinds, reference) = (&self.layout.kinds, &self.layout.reference);
         let made = (self.current_rows).make(kinds, stacked, reference, &self.variances);
         if made == 0 {
@@ -366,30 +366,30 @@ impl Component {
         self.paused = Paused::No;
         if self.is_disturbed {
             self.paused = Paused::Suspected;
-            self.follow_tilt(seen);
+            self.follow_tilt(observation);
         }
         self.gathered.push(slot, &self.current_rows);
-        self.gathered.has_moved |= self.is_moved(seen);
+        self.gathered.has_moved |= self.is_moved(observation);
     }
 
     /// The first fault of a channel that it needs.
-    fn fault(&self, seen: &OnlineObservation<'_>) -> Option<(Reason, ChannelRole)> {
+    fn fault(&self, observation: &OnlineObservation<'_>) -> Option<(Reason, ChannelRole)> {
         let of_sensors = (self.layout.sensors.iter())
-            .filter_map(|&s| Some((*seen.sensors.get(s)?, ChannelRole::Sensor(s))));
-        let base = seen.kinematics.base();
+            .filter_map(|&s| Some((*observation.sensors.get(s)?, ChannelRole::Sensor(s))));
+        let base = observation.kinematics.base();
         let of_joints = (self.layout.dofs[base].iter())
-            .filter_map(|dof| Some((*seen.joints.get(dof)?, ChannelRole::Joint(dof))));
-        let mut faults = std::iter::once((seen.base, ChannelRole::Base))
+            .filter_map(|dof| Some((*observation.joints.get(dof)?, ChannelRole::Joint(dof))));
+        let mut faults = std::iter::once((observation.base, ChannelRole::Base))
             .chain(of_sensors)
             .chain(of_joints);
         faults.find(|(reason, _)| *reason != Reason::None)
     }
 
     /// Notes how far each sensor has tilted since the present disturbance began.
-    fn follow_tilt(&mut self, seen: &OnlineObservation<'_>) {
+    fn follow_tilt(&mut self, observation: &OnlineObservation<'_>) {
         let directions = self.directions.iter_mut().zip(&mut self.cosines);
         for (&link, (began, cosine)) in self.layout.carriers.iter().zip(directions) {
-            let acceleration = seen.kinematics.motion(link).proper_acceleration;
+            let acceleration = observation.kinematics.motion(link).proper_acceleration;
             let direction = acceleration / acceleration.norm().max(1e-3);
             if *began == Vec3::zeros() {
                 *began = direction;
@@ -399,9 +399,13 @@ impl Component {
     }
 
     /// Whether something moves that its rows depend on.
-    pub(crate) fn is_moved(&self, seen: &OnlineObservation<'_>) -> bool {
-        let base = seen.kinematics.base();
-        seen.is_base_moved || !seen.moved.intersection(&self.layout.dofs[base]).is_empty()
+    pub(crate) fn is_moved(&self, observation: &OnlineObservation<'_>) -> bool {
+        let base = observation.kinematics.base();
+        observation.is_base_moved
+            || !observation
+                .moved
+                .intersection(&self.layout.dofs[base])
+                .is_empty()
     }
 
     /// Ends a block: gate, drift of the offsets, then rows are absorbed or rejected.
@@ -438,8 +442,8 @@ impl Component {
         }
         if self.drift_time > 0.0 && self.drift_time >= self.drift_interval {
             self.join();
-            for (to, drift_rates) in self.deviations.iter_mut().zip(&self.drift_rates) {
-                *to = drift_rates * self.drift_time.sqrt();
+            for (to, drift_std) in self.deviations.iter_mut().zip(&self.drift_std) {
+                *to = drift_std * self.drift_time.sqrt();
             }
             self.drift_time = 0.0;
             let _ = self.information.drift(&self.offsets, &self.deviations);
@@ -482,7 +486,7 @@ impl Component {
                 } else if a.len() == self.row.len() {
                     let _ = self.panel.push_row(a, y);
                 } else {
-                    spread(kind, a, &mut self.row);
+                    expand(kind, a, &mut self.row);
                     let _ = self.panel.push_row(&self.row, y);
                 }
             }
@@ -494,12 +498,12 @@ impl Component {
         let observations = self.pending.observations();
         self.counts.learnt += observations;
         if self.pending.is_moving() {
-            self.motion += self.pending.span;
+            self.seconds_in_motion += self.pending.span;
         } else {
             self.counts.still += observations;
         }
         self.rows += self.pending.len() as u64;
-        self.learnt.take_from(&self.pending);
+        self.accepted_rows.take_from(&self.pending);
         self.pending.clear();
     }
 
@@ -508,9 +512,10 @@ impl Component {
     pub(crate) fn exceeds_gate(&mut self, known: &ComponentSolution, t: Nanos) -> bool {
         let unknowns = self.layout.reference.len();
         let offset_count = self.offsets.len();
-        let root_time = (t - known.data).seconds().max(0.0).sqrt();
+        let root_time = (t - known.data_until).seconds().max(0.0).sqrt();
         let projected_width = unknowns + offset_count;
-        if known.estimate.len() != unknowns || known.spread.shape() != (unknowns, unknowns) {
+        if known.estimate.len() != unknowns || known.covariance_root.shape() != (unknowns, unknowns)
+        {
             return false;
         }
         let GateBuffers {
@@ -544,11 +549,11 @@ impl Component {
                     projected[m * projected_width..][..projected_width].split_at_mut(unknowns);
                 walk.fill(0.0);
                 for (value, &channel) in row.iter().zip(&kind.columns[..kind.offsets]) {
-                    walk[channel] = value * self.drift_rates[channel] * root_time;
+                    walk[channel] = value * self.drift_std[channel] * root_time;
                 }
                 // U a: the columns of U are [d | s].
                 Arch::new().dispatch(RootProjection {
-                    root: &known.spread,
+                    root: &known.covariance_root,
                     offset_count,
                     columns: &kind.columns,
                     row,

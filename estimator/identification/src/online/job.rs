@@ -1,14 +1,14 @@
-//! A component's part of a job: noise, the most probable bodies, changes, and the parameters in
-//! use.
+//! The job of on-line identification ([`SolutionJob`]), which any thread may run, and each
+//! component's part of it: noise, the most probable bodies, changes, and the parameters in use.
 
 use crate::arithmetic::mean;
 use crate::linear::information::{Information, Panel};
 use crate::measurement::noise_estimate::LEAST_SHARE;
 use crate::online::bank::{self, Bank, LATEST, Tick};
-use crate::online::channel::{NoiseTracker, SecondMean, SecondResiduals, take_scatters};
 use crate::online::component::{Component, ComponentLayout};
+use crate::online::noise_tracker::{NoiseTracker, SecondMean, SecondResiduals, take_scatters};
 use crate::online::parameters::ParameterEstimate;
-use crate::online::rows::{RowBuffer, SubtreeRows, spread};
+use crate::online::rows::{RowBuffer, SubtreeRows, expand};
 use crate::online::selection::{self, ModelSelection};
 use crate::online::solution::{ComponentSolution, DetectedChange, SOLVE, Solution};
 use crate::prior::{Posterior, Prior, PriorError};
@@ -51,7 +51,7 @@ pub(crate) const LONGEST: usize = 100_000;
 pub(crate) struct ComponentJob {
     pub(crate) layout: Arc<ComponentLayout>,
     pub(crate) information: Information,
-    pub(crate) learnt: RowBuffer,
+    pub(crate) accepted_rows: RowBuffer,
     pub(crate) rejected_rows: RowBuffer,
     pub(crate) is_disturbed: bool,
     /// Whether a sensor's offset was forgotten since the solution in use.
@@ -65,20 +65,20 @@ pub(crate) struct ComponentJob {
     /// the parameters used for them.
     pub(crate) before: Option<(DMatrix<f64>, Vec<f64>)>,
     /// The variances with which the rows are whitened.
-    pub(crate) whitened: Vec<f64>,
-    pub(crate) drift_rates: Vec<f64>,
+    pub(crate) row_variances: Vec<f64>,
+    pub(crate) drift_std: Vec<f64>,
     pub(crate) period: f64,
     pub(crate) tau: f64,
     /// Why the last job failed.
     pub(crate) failure: Option<PriorError>,
-    pub(crate) motion: f64,
+    pub(crate) seconds_in_motion: f64,
     pub(crate) rows: u64,
     /// The last valid solution.
     pub(crate) last_valid: ComponentSolution,
     /// The most probable unknowns, `[s | d]`, a root of their covariance, and the parameters; then
     /// the parameters in use and their candidates.
     pub(crate) estimate: Vec<f64>,
-    pub(crate) spread: DMatrix<f64>,
+    pub(crate) covariance_root: DMatrix<f64>,
     pub(crate) newest: ParameterEstimate,
     pub(crate) selection: ModelSelection<ParameterEstimate>,
     /// Whether the parameters in use must be replaced.
@@ -133,7 +133,7 @@ impl ComponentJob {
         Self {
             layout: component.layout.clone(),
             information: component.information.clone(),
-            learnt: component.learnt.clone_room(),
+            accepted_rows: component.accepted_rows.clone_room(),
             rejected_rows: component.rejected_rows.clone_room(),
             is_disturbed: false,
             has_new_zero: false,
@@ -141,15 +141,15 @@ impl ComponentJob {
             variances: component.variances.clone(),
             channels: component.layout.trackers(period.seconds()),
             before: None,
-            whitened: component.variances.clone(),
-            drift_rates: component.drift_rates.clone(),
+            row_variances: component.variances.clone(),
+            drift_std: component.drift_std.clone(),
             period: period.seconds(),
             tau: prior.expected_tau(),
             failure: None,
-            motion: 0.0,
+            seconds_in_motion: 0.0,
             rows: 0,
             estimate: Vec::new(),
-            spread: DMatrix::zeros(0, 0),
+            covariance_root: DMatrix::zeros(0, 0),
             newest: ParameterEstimate::default(),
             selection: ModelSelection::new(
                 component.variances.len(),
@@ -168,7 +168,7 @@ impl ComponentJob {
     pub(crate) fn run(
         &mut self,
         prior: &Prior,
-        data: Nanos,
+        data_until: Nanos,
         solution: &mut ComponentSolution,
         may_end: bool,
         is_rather_a_contact: impl FnOnce(&[i64]) -> bool,
@@ -199,11 +199,11 @@ impl ComponentJob {
                 let newest = &self.newest;
                 self.selection.enter(|| newest.clone());
                 self.write_solution(solution);
-                solution.data = data;
+                solution.data_until = data_until;
             }
         }
         solution.is_accepted = self.failure.is_none();
-        (solution.motion, solution.rows) = (self.motion, self.rows);
+        (solution.seconds_in_motion, solution.rows) = (self.seconds_in_motion, self.rows);
         if solution.is_accepted {
             self.last_valid.clone_from(solution);
         }
@@ -231,10 +231,10 @@ impl ComponentJob {
         self.estimate.clear();
         self.estimate.extend_from_slice(offsets);
         self.estimate.extend_from_slice(bodies);
-        self.spread = fit.covariance_root().transpose();
+        self.covariance_root = fit.covariance_root().transpose();
         self.newest = ParameterEstimate {
             change: bodies.to_vec(),
-            root: self.spread.columns(0, parameters).into_owned(),
+            root: self.covariance_root.columns(0, parameters).into_owned(),
             tau: fit.tau,
             effective: fit.effective,
             bodies: fit.bodies,
@@ -245,8 +245,8 @@ impl ComponentJob {
     /// Judges the candidates by the rows of this second.
     pub(crate) fn judge_candidates(&mut self) {
         // At rest all parameters predict equally well.
-        let is_any = self.learnt.is_moving() && !self.estimate.is_empty();
-        let Some(span) = SlotRange::of([&self.learnt].into_iter()).filter(|_| is_any) else {
+        let is_any = self.accepted_rows.is_moving() && !self.estimate.is_empty();
+        let Some(span) = SlotRange::of([&self.accepted_rows].into_iter()).filter(|_| is_any) else {
             return;
         };
         let residuals: Vec<TimedMeans> = self
@@ -276,7 +276,7 @@ impl ComponentJob {
             .chain(change)
             .copied()
             .collect();
-        let (series, _) = self.series(&[&self.learnt], span, &unknowns);
+        let (series, _) = self.series(&[&self.accepted_rows], span, &unknowns);
         let per_block = (selection::BLOCK / self.period).round().max(1.0) as usize;
         let starts = (0..span.count).step_by(per_block);
         let blocks = starts.map(|from| {
@@ -316,7 +316,7 @@ impl ComponentJob {
         let slope = solved.columns(0, parameters);
         let offsets = solved.column(parameters) - slope * DVector::from_column_slice(change);
         solution.estimate.clone_from(&self.estimate);
-        solution.spread.clone_from(&self.spread);
+        solution.covariance_root.clone_from(&self.covariance_root);
         // [d | s]: the error of d enters s by the slope.
         let own = root.nrows();
         let mut joint = DMatrix::zeros(own + offset_count, parameters + offset_count);
@@ -333,8 +333,8 @@ impl ComponentJob {
         solution.root = joint;
         (solution.tau, solution.effective) = (in_use.tau, in_use.effective);
         solution.bodies.clone_from(&in_use.bodies);
-        let rates = self.drift_rates.chunks_exact(6);
-        for (to, rates) in solution.drift.iter_mut().zip(rates) {
+        let rates = self.drift_std.chunks_exact(6);
+        for (to, rates) in solution.drift_std.iter_mut().zip(rates) {
             to.copy_from_slice(rates);
         }
         let noise = solution.noise.iter_mut().zip(&mut solution.worst);
@@ -353,7 +353,7 @@ impl ComponentJob {
     pub(crate) fn update_noise(&mut self) {
         let (offset_count, unknowns) = (self.variances.len(), self.information.unknowns());
         let mut seconds = vec![SecondResiduals::NONE; offset_count];
-        let rows = [&self.learnt, &self.rejected_rows];
+        let rows = [&self.accepted_rows, &self.rejected_rows];
         let is_solved =
             self.estimate.len() == unknowns && self.newest.root.ncols() + offset_count == unknowns;
         let Some(span) = SlotRange::of(rows.into_iter()).filter(|_| is_solved) else {
@@ -422,7 +422,7 @@ impl ComponentJob {
                     is_likely_noise,
                 };
             }
-            (self.variances[channel], self.drift_rates[channel]) = own.noise();
+            (self.variances[channel], self.drift_std[channel]) = own.noise();
         }
         self.take_seconds(&seconds);
     }
@@ -456,7 +456,7 @@ impl ComponentJob {
                     };
                     for (value, &channel) in row.iter().zip(&kind.columns[..kind.offsets]) {
                         if *value != 0.0 {
-                            let weight = self.whitened[channel] * value;
+                            let weight = self.row_variances[channel] * value;
                             let sum = &mut series[channel * span.count + place];
                             *sum = if sum.is_nan() { 0.0 } else { *sum } + weight * residual;
                             shown[channel] += weight * value;
@@ -478,7 +478,7 @@ impl ComponentJob {
                 let (width, count) = (kind.width(), rows.slots().len());
                 let all = DMatrixView::from_slice(rows.values(), width, count);
                 let weights = DMatrix::from_fn(count, kind.offsets, |row, place| {
-                    self.whitened[kind.columns[place]] * all[(place, row)]
+                    self.row_variances[kind.columns[place]] * all[(place, row)]
                 });
                 let own = all * &weights;
                 for (place, column) in own.column_iter().enumerate() {
@@ -519,7 +519,7 @@ impl ComponentJob {
         let mut dense = vec![0.0; unknowns];
         for (kind, rows) in self.layout.kinds.iter().zip(self.rejected_rows.iter()) {
             for (row, right, _) in rows.iter() {
-                spread(kind, row, &mut dense);
+                expand(kind, row, &mut dense);
                 let _ = panel.push_row(&dense, right);
             }
             self.rejected_slots.extend(rows.slots());
@@ -620,7 +620,7 @@ impl ComponentJob {
 #[derive(Debug)]
 pub struct SolutionJob {
     pub(crate) prior: Arc<Prior>,
-    pub(crate) data: Nanos,
+    pub(crate) data_until: Nanos,
     pub(crate) components: Vec<ComponentJob>,
     pub(crate) solution: Solution,
     pub(crate) bank: Bank,
@@ -634,7 +634,7 @@ impl SolutionJob {
     /// Takes one or two milliseconds for a single limb, a tenth of a second for 426 linked
     /// unknowns, longer if bodies have changed much, and allocates.
     pub fn run(&mut self) {
-        self.solution.data = self.data;
+        self.solution.data_until = self.data_until;
         for (number, (part, solution)) in (self
             .components
             .iter_mut()
@@ -644,7 +644,7 @@ impl SolutionJob {
             let may_end = part.is_disturbed && self.bank.may_have_begun_in_contact(number);
             let (bank, ticks) = (&mut self.bank, &self.ticks[..self.tick_count]);
             let is_push = |slots: &[i64]| bank.is_rather_a_contact(number, slots, ticks);
-            part.run(&self.prior, self.data, solution, may_end, is_push);
+            part.run(&self.prior, self.data_until, solution, may_end, is_push);
         }
         self.weigh_hypotheses();
     }
@@ -654,7 +654,7 @@ impl SolutionJob {
         let mut decided = Vec::new();
         for part in &self.components {
             let mut slots: Vec<i64> = part
-                .learnt
+                .accepted_rows
                 .iter()
                 .flat_map(SubtreeRows::slots)
                 .copied()

@@ -1,7 +1,7 @@
 //! Sets of parameters for use on-line, and mixtures of two sets.
 
 use crate::linear::information::{Information, InformationError, Panel};
-use crate::prior::cad_root;
+use crate::prior::link_cad_root;
 use nalgebra::DMatrix;
 use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::spatial::RigidInertia;
@@ -26,7 +26,7 @@ impl ParameterEstimate {
         for (place, body) in bodies.iter().enumerate() {
             let at = LINK_PARAMETERS * place;
             root.view_mut((at, at), (LINK_PARAMETERS, LINK_PARAMETERS))
-                .copy_from(&cad_root(body, relative));
+                .copy_from(&link_cad_root(body, relative));
         }
         Self {
             change: vec![0.0; count],

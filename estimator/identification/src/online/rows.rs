@@ -103,7 +103,7 @@ pub(crate) fn most_rows(kinds: &[SubtreeColumns]) -> usize {
 }
 
 /// Expands a row to all unknowns, without its right side.
-pub(crate) fn spread(kind: &SubtreeColumns, row: &[f64], to: &mut [f64]) {
+pub(crate) fn expand(kind: &SubtreeColumns, row: &[f64], to: &mut [f64]) {
     to.fill(0.0);
     for (&column, &value) in kind.columns.iter().zip(row) {
         to[column] = value;

@@ -40,8 +40,8 @@ pub struct OnlineObservation<'a> {
     pub t: Nanos,
     /// Poses and motions of all links.
     pub kinematics: &'a Kinematics,
-    /// Raw F/T readings, with offsets, in their measurement frames; finite even if a sensor is
-    /// faulty.
+    /// Calibrated F/T readings, their offsets still in them, in their measurement frames; finite
+    /// even if a sensor is faulty.
     pub readings: &'a [Wrench],
     /// The present contacts.
     pub active: &'a ContactSet,
@@ -187,14 +187,14 @@ pub struct ComponentSolution {
     pub bodies: Vec<RigidInertia>,
     /// Its sensors.
     pub sensors: Vec<usize>,
-    /// Their offsets, raw minus true reading, in their measurement frames.
+    /// Their offsets, calibrated minus true reading, in their measurement frames.
     pub offsets: Vec<Wrench>,
     /// A root `U` of the covariance `P = U^T U` over [ten per link | torque, force of each sensor's
     /// offset].
     pub root: DMatrix<f64>,
     /// Drift rate of each offset: standard deviation after a second [Nm/s^½, N/s^½], [torque;
     /// force].
-    pub drift: Vec<[f64; 6]>,
+    pub drift_std: Vec<[f64; 6]>,
     /// Variance of one reading about its prediction [Nm^2, N^2], [torque; force]: sensor noise,
     /// vibration, late stamps.
     pub noise: Vec<[f64; 6]>,
@@ -202,31 +202,31 @@ pub struct ComponentSolution {
     /// sensor.
     pub worst: Vec<[f64; 6]>,
     /// The stamp of the newest data used.
-    pub data: Nanos,
+    pub data_until: Nanos,
     /// The prior's weight; NaN before the first solution.
     pub tau: f64,
     /// Number of parameters that the data determine, rather than the prior.
     pub effective: f64,
     /// Duration of motion of its links in the absorbed data \[s\].
-    pub motion: f64,
+    pub seconds_in_motion: f64,
     /// Number of absorbed rows, in motion and at rest.
     pub rows: u64,
-    /// Whether this solution uses the data up to [`Solution::data`]. Otherwise the job failed, and
-    /// the earlier solution is kept.
+    /// Whether this solution uses the data up to [`Solution::data_until`]. Otherwise the job
+    /// failed, and the earlier solution is kept.
     pub is_accepted: bool,
     /// What is likelier than the stated setup.
     pub leading: Option<Hypothesis>,
     /// The most probable unknowns, `[s | d]`, and a root of their covariance over `[d | s]`. The
     /// gate judges new readings by them.
     pub(crate) estimate: Vec<f64>,
-    pub(crate) spread: DMatrix<f64>,
+    pub(crate) covariance_root: DMatrix<f64>,
 }
 
 /// The result of a job.
 #[derive(Clone, Debug, Default)]
 pub struct Solution {
     /// The stamp of the newest data of the job.
-    pub data: Nanos,
+    pub data_until: Nanos,
     /// The solution of each component.
     pub components: Vec<ComponentSolution>,
     /// Per degree of freedom.

@@ -4,6 +4,7 @@
 use crate::finding::{Finding, FindingCode};
 use crate::fit::{Identified, per_column};
 use crate::measurement::unknowns::Unknowns;
+use crate::prepared_log::{PreparedLog, training_logs};
 use crate::report::calibration::{calibrations, channels};
 use crate::report::comparison::Judged;
 use crate::report::log::log_outcome;
@@ -14,7 +15,6 @@ use crate::report::uncertainty::{
     scaled_information, shrunk, subspace, unseen,
 };
 use crate::robot::Robot;
-use crate::training::{PreparedLog, training_logs};
 use nalgebra::DMatrix;
 
 /// The outcome without identified parameters: CAD's, and the reason, with what was found.

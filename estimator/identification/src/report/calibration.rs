@@ -4,9 +4,9 @@ use crate::finding::{Finding, FindingCode};
 use crate::fit::Identified;
 use crate::measurement::channels::{channel_name, sensor_name};
 use crate::measurement::unknowns::ExtraParameter;
+use crate::prepared_log::PreparedLog;
 use crate::report::outcome::{CalibrationOutcome, ChannelNoise};
 use crate::robot::{AXES, Robot};
-use crate::training::PreparedLog;
 use nalgebra::{DMatrix, Matrix6};
 use proprio_dynamics::calibration::{Calibration, Gain, Kind, Unknown, swapped};
 use proprio_dynamics::spatial::Wrench;
@@ -223,7 +223,7 @@ pub(crate) fn channels(
                 unit,
                 deviation: noise.square[channel].sqrt(),
                 autocorrelation_seconds: noise.time[channel] * period,
-                drift: noise.drift[channel].sqrt(),
+                drift: noise.drift_variance[channel].sqrt(),
             }
         })
         .collect()

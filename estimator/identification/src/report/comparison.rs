@@ -8,10 +8,10 @@ use crate::measurement::channels::{attribute_to, channel_of};
 use crate::measurement::reduction::{OFFSET_VARIANCE, Residuals};
 use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::Unknowns;
+use crate::prepared_log::{PreparedLog, training_instants};
 use crate::report::outcome::ModelComparison;
 use crate::report::prediction::{self, JudgedParameters};
 use crate::robot::Robot;
-use crate::training::{PreparedLog, training_instants};
 use nalgebra::{DMatrix, DVector};
 
 /// A joint that moves by less is still \[rad\].

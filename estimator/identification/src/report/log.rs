@@ -8,6 +8,7 @@ use crate::fit::Identified;
 use crate::measurement::channels::{channel_of, sensor_name};
 use crate::measurement::reduction::{LogSegment, Residuals, reduce, residuals};
 use crate::measurement::unknowns::{FRICTION, Unknowns, friction_row};
+use crate::prepared_log::{MIN_FOLD, PreparedLog, SEGMENT_INSTANTS};
 use crate::report::comparison::{
     Judged, STILL, SensorComparison, TorqueSeries, cases, configured_nuisance, three,
 };
@@ -18,7 +19,6 @@ use crate::report::outcome::{
 };
 use crate::report::prediction::PredictionError;
 use crate::robot::{AXES, Robot};
-use crate::training::{MIN_FOLD, PreparedLog, SEGMENT_INSTANTS};
 use proprio_dynamics::Structure;
 use proprio_topics::Nanos;
 
@@ -442,7 +442,9 @@ fn offsets(
             start: axes(index, &|channel| first.x[(channel, 1)]),
             end: axes(index, &|channel| last.x[(channel, 1)]),
             deviation: axes(index, &|channel| deviations[channel]),
-            rate: axes(index, &|channel| identified.noise.drift[channel].sqrt()),
+            rate: axes(index, &|channel| {
+                identified.noise.drift_variance[channel].sqrt()
+            }),
         })
         .collect()
 }

@@ -9,7 +9,7 @@
 
 use crate::dataset::LogRole;
 use crate::finding::Finding;
-use crate::training::Excluded;
+use crate::prepared_log::Excluded;
 use nalgebra::DMatrix;
 use proprio_dynamics::calibration::{Calibration, Kind, Unknown};
 use proprio_dynamics::regressor::identifiable::ParameterColumn;

@@ -3,10 +3,10 @@
 use crate::fit::{Identified, link_inertias};
 use crate::measurement::reduction::ReducedLog;
 use crate::measurement::unknowns::{ExtraParameter, Unknowns};
+use crate::prepared_log::PreparedLog;
 use crate::report::comparison::{STILL, UNREAD};
 use crate::report::outcome::{BaseParameterOutcome, CovarianceRoot, LinkOutcome, RotorOutcome};
 use crate::robot::{IdentificationInput, Robot};
-use crate::training::PreparedLog;
 use nalgebra::{DMatrix, DVector};
 use proprio_dynamics::regressor::LINK_PARAMETERS;
 use proprio_dynamics::regressor::identifiable::{

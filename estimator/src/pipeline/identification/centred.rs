@@ -251,10 +251,10 @@ impl Centred {
 
     /// A signal in the middle: value, first and second derivative, each with its standard error.
     ///
-    /// `statistics` are those of the signal. Two arguments select the window: the standard deviation
-    /// of the samples, NaN if it is not known, and the order of the derivative that matters. The standard
-    /// errors use the noise at rest, because in motion a polynomial's residual is not noise alone.
-    /// They are zero before the first instant at rest.
+    /// `statistics` are those of the signal. Two arguments select the window: the standard
+    /// deviation of the samples, NaN if it is not known, and the order of the derivative that
+    /// matters. The standard errors use the noise at rest, because in motion a polynomial's
+    /// residual is not noise alone. They are zero before the first instant at rest.
     pub(crate) fn fit(
         &self,
         number: usize,

@@ -11,7 +11,7 @@
 //! not below the stated one.
 
 use crate::online::bank::hypothesis::{Hypothesis, MotionReading, WrenchReading};
-use crate::prior::cad_root;
+use crate::prior::link_cad_root;
 use crate::robot::Robot;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SMatrix, Vector6};
 use proprio_dynamics::calibration::UNKNOWN_OFFSET;
@@ -24,7 +24,7 @@ pub(super) const FORCE: f64 = 25.0;
 /// Ticks in which a misfit lasts: the 3 s of a movement, for it depends on the posture. In them it
 /// counts as one.
 pub(super) const LASTING: f64 = 30.0;
-/// An unknown of a view, as in [`MotionReading::at`], whose effect is linear.
+/// An unknown of how the motion is read, as in [`MotionReading::at`], whose effect is linear.
 pub(super) const SMALL: f64 = 1e-3;
 
 /// The unknowns of a sub-tree, `[d | s]`: ten per link, six per sensor.
@@ -45,7 +45,7 @@ impl SubtreeUnknowns {
         let cad = robot.model.inertias();
         let parameters = links.iter().flat_map(|&link| cad[link].parameters());
         let offsets = sensors.iter().flat_map(|&own| offsets[own].torque_first());
-        let root = |&link: &usize| cad_root(&cad[link], robot.urdf_relative_std);
+        let root = |&link: &usize| link_cad_root(&cad[link], robot.urdf_relative_std);
         Self {
             reference: parameters.chain(offsets).collect(),
             roots: links.iter().map(root).collect(),
@@ -119,10 +119,10 @@ impl SubtreeUnknowns {
     }
 }
 
-/// A hypothesis in its [`HypothesisFit`].
+/// A hypothesis in its [`SharedDesign`].
 #[derive(Clone, Debug)]
 pub(super) struct Branch {
-    pub(super) sight: WrenchReading,
+    pub(super) wrench_reading: WrenchReading,
     /// What multiplies the columns of the links, and of each sensor.
     of_links: f64,
     of_sensors: Vec<f64>,
@@ -136,10 +136,10 @@ pub(super) struct Branch {
 }
 
 impl Branch {
-    pub(super) fn new(sight: WrenchReading, prior: f64, sensors: &[usize]) -> Self {
+    pub(super) fn new(wrench_reading: WrenchReading, prior: f64, sensors: &[usize]) -> Self {
         // Noise and offsets stay those of readings in the sensor's own unit. So of the first
         // sensor, it is everything else that is taken in that unit.
-        let (of_links, of_sensors) = match sight {
+        let (of_links, of_sensors) = match wrench_reading {
             WrenchReading::Unit(number, factor) => {
                 let is_first = sensors.first() == Some(&number);
                 let other = if is_first { 1.0 / factor } else { 1.0 };
@@ -150,7 +150,7 @@ impl Branch {
             _ => (1.0, vec![1.0; sensors.len()]),
         };
         Self {
-            sight,
+            wrench_reading,
             of_links,
             of_sensors,
             log_prior: prior.ln(),
@@ -166,14 +166,14 @@ impl Branch {
         let (of_links, offsets) = (now.rows.projected_row(row)).split_at(now.rows.offset_column());
         let changes = (columns.sensors.iter().enumerate()).map(|(place, &sensor)| {
             let reading = now.readings[sensor];
-            let change = match self.sight {
+            let change = match self.wrench_reading {
                 WrenchReading::Unit(..) => {
                     let configured = &columns.reference[columns.first_offset()..];
                     let six = |axis| configured[6 * place + axis];
                     let offset = Wrench::from_torque_first(std::array::from_fn(six));
                     (reading - offset) * (self.of_sensors[place] - 1.0)
                 }
-                sight => sight.reading(sensor, now.readings) - reading,
+                wrench_reading => wrench_reading.reading(sensor, now.readings) - reading,
             };
             dot(&offsets[6 * place..6 * place + 6], &change.torque_first())
         });
@@ -197,7 +197,7 @@ pub(super) struct TickRows<'a> {
     pub(super) structure: &'a Structure,
     pub(super) kinematics: &'a Kinematics,
     pub(super) readings: &'a [Wrench],
-    /// The wrench that CAD and configured offsets leave if one unknown of the view is [`SMALL`],
+    /// The wrench that CAD and configured offsets leave if one unknown of the motion is [`SMALL`],
     /// each in turn.
     pub(super) shifted: &'a [Vector6<f64>],
     /// The stated variances of each sensor's channels, [torque; force].
@@ -206,8 +206,8 @@ pub(super) struct TickRows<'a> {
 
 /// Hypotheses with the same A: they differ in how F/T readings are taken.
 #[derive(Clone, Debug)]
-pub(super) struct HypothesisFit {
-    pub(super) view: MotionReading,
+pub(super) struct SharedDesign {
+    pub(super) motion_reading: MotionReading,
     pub(super) contact: Option<usize>,
     unknowns: usize,
     pub(super) branches: Vec<Branch>,
@@ -219,17 +219,19 @@ pub(super) struct HypothesisFit {
     forgotten: f64,
 }
 
-impl HypothesisFit {
+impl SharedDesign {
     pub(super) fn new(
-        view: MotionReading,
+        motion_reading: MotionReading,
         contact: Option<usize>,
         columns: &SubtreeUnknowns,
         branches: Vec<Branch>,
     ) -> Self {
         Self {
-            view,
+            motion_reading,
             contact,
-            unknowns: columns.count() + view.unknowns() + if contact.is_some() { 3 } else { 0 },
+            unknowns: columns.count()
+                + motion_reading.unknowns()
+                + if contact.is_some() { 3 } else { 0 },
             branches,
             gram: DMatrix::zeros(0, 0),
             rows: 0.0,
@@ -245,8 +247,8 @@ impl HypothesisFit {
 
     pub(super) fn hypothesis(&self, branch: &Branch) -> Hypothesis {
         Hypothesis {
-            view: self.view,
-            sight: branch.sight,
+            motion_reading: self.motion_reading,
+            wrench_reading: branch.wrench_reading,
             contact: self.contact,
         }
     }
@@ -254,7 +256,7 @@ impl HypothesisFit {
     /// What is stated, from the same readings; with this contact from now on.
     pub(super) fn continued(&self, columns: &SubtreeUnknowns, contact: Option<usize>) -> Self {
         let branches = self.branches[..1].to_vec();
-        let mut with = Self::new(self.view, contact, columns, branches);
+        let mut with = Self::new(self.motion_reading, contact, columns, branches);
         if !self.gram.is_empty() {
             let own = (0..self.unknowns).map(Some);
             let own = own.chain((self.unknowns..with.unknowns).map(|_| None));
@@ -390,8 +392,8 @@ impl HypothesisFit {
     /// What is estimated beside `[d | s]`, along the axis where it is largest: a share of
     /// [`FORCE`], or what [`MotionReading::at`] takes.
     ///
-    /// Of a force it is the root mean square. How uncertain a view is counts in the deviation of
-    /// torques instead: the turn of a standing base about gravity is never known, and matters to
+    /// Of a force it is the root mean square. How uncertain the motion is counts in the deviation
+    /// of torques instead: the turn of a standing base about gravity is never known, and matters to
     /// none.
     pub(super) fn extent(&self, columns: &SubtreeUnknowns) -> f64 {
         let Some((factor, right)) = self.system(columns, 0) else {
@@ -399,10 +401,10 @@ impl HypothesisFit {
         };
         let mean = factor.solve(&right);
         let deviation = |axis: usize| {
-            let mut unit = DVector::zeros(self.unknowns);
-            unit[axis] = 1.0;
-            let _ = factor.l_dirty().solve_lower_triangular_mut(&mut unit);
-            unit.norm() * self.branches[0].noise.sqrt()
+            let mut subtree = DVector::zeros(self.unknowns);
+            subtree[axis] = 1.0;
+            let _ = factor.l_dirty().solve_lower_triangular_mut(&mut subtree);
+            subtree.norm() * self.branches[0].noise.sqrt()
         };
         let axes = (columns.count()..self.unknowns).map(|axis| match self.contact {
             Some(_) => mean[axis].hypot(deviation(axis)),
@@ -423,9 +425,9 @@ impl HypothesisFit {
         let (own, extra) = solution.as_slice().split_at(columns.count());
         let mut mean = columns.unscale(own);
         let mut hypothesis = self.hypothesis(branch);
-        hypothesis.view = self.view.at(extra);
+        hypothesis.motion_reading = self.motion_reading.at(extra);
         // The offset is in the sensor's own unit.
-        let offset_factor = |&sensor: &usize| match branch.sight {
+        let offset_factor = |&sensor: &usize| match branch.wrench_reading {
             WrenchReading::Unit(number, factor) if number == sensor => factor,
             _ => 1.0,
         };
@@ -434,7 +436,7 @@ impl HypothesisFit {
         Some(HypothesisPosterior {
             hypothesis,
             mean,
-            of_view: extra[..self.view.unknowns()].to_vec(),
+            of_motion_reading: extra[..self.motion_reading.unknowns()].to_vec(),
             offset_factors,
             factor,
             noise: branch.noise,
@@ -468,7 +470,7 @@ pub(super) struct HypothesisPosterior {
     /// `[d | s]`, in SI units.
     pub(super) mean: Vec<f64>,
     /// What [`MotionReading::at`] takes.
-    pub(super) of_view: Vec<f64>,
+    pub(super) of_motion_reading: Vec<f64>,
     offset_factors: Vec<f64>,
     factor: Cholesky<f64, Dyn>,
     noise: f64,
@@ -481,13 +483,14 @@ impl HypothesisPosterior {
         &self,
         columns: &SubtreeUnknowns,
         sensitivity: &[f64],
-        of_view: &[f64],
+        of_motion_reading: &[f64],
     ) -> f64 {
         let mut scaled = DVector::zeros(self.factor.l_dirty().nrows());
         columns.scale(sensitivity, &mut scaled.as_mut_slice()[..columns.count()]);
         let offsets = columns.first_offset()..columns.count();
         scale_offsets(&mut scaled.as_mut_slice()[offsets], &self.offset_factors);
-        scaled.as_mut_slice()[columns.count()..][..of_view.len()].copy_from_slice(of_view);
+        scaled.as_mut_slice()[columns.count()..][..of_motion_reading.len()]
+            .copy_from_slice(of_motion_reading);
         let factor = self.factor.l_dirty();
         let _ = factor.solve_lower_triangular_mut(&mut scaled);
         scaled.norm() * self.noise.sqrt()
@@ -577,12 +580,12 @@ mod tests {
         (a, y)
     }
 
-    fn fit(sight: WrenchReading) -> HypothesisFit {
-        let branches = vec![Branch::new(sight, 1.0, &[0])];
-        HypothesisFit::new(MotionReading::AsStated, None, &columns(), branches)
+    fn fit(wrench_reading: WrenchReading) -> SharedDesign {
+        let branches = vec![Branch::new(wrench_reading, 1.0, &[0])];
+        SharedDesign::new(MotionReading::AsStated, None, &columns(), branches)
     }
 
-    fn add(fit: &mut HypothesisFit, a: &DMatrix<f64>, y: &DVector<f64>) {
+    fn add(fit: &mut SharedDesign, a: &DMatrix<f64>, y: &DVector<f64>) {
         let all = DMatrix::from_fn(y.len(), UNKNOWNS + 1, |i, j| {
             if j < UNKNOWNS { a[(i, j)] } else { y[i] }
         });
@@ -594,7 +597,7 @@ mod tests {
     }
 
     /// Until the noise has converged.
-    fn weighed(fit: &mut HypothesisFit) -> (f64, f64) {
+    fn weighed(fit: &mut SharedDesign) -> (f64, f64) {
         (0..100).for_each(|_| fit.weigh(&columns()));
         (fit.branches[0].log_evidence, fit.branches[0].noise)
     }
@@ -657,12 +660,12 @@ mod tests {
     #[test]
     fn a_contact_continued_explains_later_rows_alone() {
         let ((a, y), (b, z)) = (rows(61, 40, 0.3), rows(71, 40, 0.3));
-        let mut before = HypothesisFit::new(
+        let mut before = SharedDesign::new(
             MotionReading::AsStated,
             None,
             &columns(),
             [WrenchReading::AsStated, WrenchReading::Unit(0, 4.0)]
-                .map(|sight| Branch::new(sight, 1.0, &[0]))
+                .map(|wrench_reading| Branch::new(wrench_reading, 1.0, &[0]))
                 .to_vec(),
         );
         let all = DMatrix::from_fn(40, UNKNOWNS + 2, |i, j| {

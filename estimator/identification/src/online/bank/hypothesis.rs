@@ -79,9 +79,9 @@ pub enum WrenchReading {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hypothesis {
     /// Joints and base.
-    pub view: MotionReading,
+    pub motion_reading: MotionReading,
     /// F/T sensors.
-    pub sight: WrenchReading,
+    pub wrench_reading: WrenchReading,
     /// The contact that has acted on the robot since the start, as a steady force.
     pub contact: Option<usize>,
 }
@@ -89,15 +89,17 @@ pub struct Hypothesis {
 impl Hypothesis {
     /// Everything is as stated, and no contact acts.
     pub(crate) const AS_STATED: Self = Self {
-        view: MotionReading::AsStated,
-        sight: WrenchReading::AsStated,
+        motion_reading: MotionReading::AsStated,
+        wrench_reading: WrenchReading::AsStated,
         contact: None,
     };
 
     /// The same, before anything is estimated.
     #[must_use]
     pub fn without_estimate(mut self) -> Self {
-        self.view = self.view.at(&[0.0; 3][..self.view.unknowns()]);
+        self.motion_reading = self
+            .motion_reading
+            .at(&[0.0; 3][..self.motion_reading.unknowns()]);
         self
     }
 
@@ -106,7 +108,7 @@ impl Hypothesis {
     pub const fn role(&self) -> Option<ChannelRole> {
         use MotionReading as Motion;
         use WrenchReading as Reading;
-        match (self.view, self.sight) {
+        match (self.motion_reading, self.wrench_reading) {
             (Motion::Reversed(dof) | Motion::Degrees(dof), _) => Some(ChannelRole::Joint(dof)),
             (Motion::Swapped(dof, _) | Motion::Encoder(dof, _), _) => Some(ChannelRole::Joint(dof)),
             (Motion::Upright(_) | Motion::BaseTurned(_), _) => Some(ChannelRole::Base),
@@ -146,12 +148,12 @@ impl fmt::Display for DescribedHypothesis<'_> {
             cut.map_or("?", |cut| robot.model.joint_name(cut.joint()))
         };
         let Hypothesis {
-            view,
-            sight,
+            motion_reading,
+            wrench_reading,
             contact,
         } = self.hypothesis;
         let contact = contact.and_then(|number| robot.contacts.get(number));
-        match (view, sight, contact) {
+        match (motion_reading, wrench_reading, contact) {
             (Motion::Reversed(dof), ..) => write!(f, "the encoder of {} is reversed", joint(dof)),
             (Motion::Degrees(dof), ..) => write!(f, "the encoder of {} reads degrees", joint(dof)),
             (Motion::Swapped(a, b), ..) => {
@@ -232,14 +234,14 @@ impl SeenMotion {
         }
     }
 
-    /// Takes these readings as `view` says.
-    pub(crate) fn see(&mut self, view: MotionReading) {
+    /// Takes these readings of the motion as `motion_reading` says.
+    pub(crate) fn see(&mut self, motion_reading: MotionReading) {
         let each = [
             &mut self.position,
             &mut self.velocity,
             &mut self.acceleration,
         ];
-        match view {
+        match motion_reading {
             MotionReading::AsStated => {}
             MotionReading::Reversed(dof) => each.into_iter().for_each(|values| values[dof] *= -1.0),
             MotionReading::Degrees(dof) => {
@@ -306,7 +308,7 @@ pub(crate) fn quarter_turns() -> Vec<Mat3> {
 }
 
 /// How an F/T sensor may be read: other axes, mirrored or not; other units.
-pub(crate) fn sights(sensor: usize) -> Vec<WrenchReading> {
+pub(crate) fn wrench_readings(sensor: usize) -> Vec<WrenchReading> {
     /// Millinewtons, kilogram-force and pound-force, taken for newtons and the other way round.
     const FACTORS: [f64; 3] = [1e3, GRAVITY, 4.448_222];
     let mut all = vec![WrenchReading::Axes(sensor, -Mat3::identity())];
@@ -316,10 +318,10 @@ pub(crate) fn sights(sensor: usize) -> Vec<WrenchReading> {
             WrenchReading::Axes(sensor, -turn),
         ]);
     }
-    let units = FACTORS
+    let subtrees = FACTORS
         .into_iter()
         .flat_map(|factor| [factor, 1.0 / factor]);
-    all.extend(units.map(|factor| WrenchReading::Unit(sensor, factor)));
+    all.extend(subtrees.map(|factor| WrenchReading::Unit(sensor, factor)));
     all
 }
 

@@ -1,10 +1,10 @@
 //! One sub-tree that can be free of contacts, and all hypotheses about it.
 
 use crate::online::bank::evidence::{
-    Branch, HypothesisFit, HypothesisPosterior, LASTING, SubtreeUnknowns,
+    Branch, HypothesisPosterior, LASTING, SharedDesign, SubtreeUnknowns,
 };
 use crate::online::bank::hypothesis::{
-    Hypothesis, MotionReading, WrenchReading, quarter_turns, sights,
+    Hypothesis, MotionReading, WrenchReading, quarter_turns, wrench_readings,
 };
 use crate::robot::{BaseMotion, Robot, dofs_above, dofs_between};
 use proprio_dynamics::ContactSet;
@@ -41,8 +41,8 @@ pub(super) struct SubtreeHypotheses {
     pub(super) subtree: usize,
     pub(super) columns: SubtreeUnknowns,
     /// The first branch of the first one is that everything is as stated.
-    pub(super) fits: Vec<HypothesisFit>,
-    at_start: Vec<HypothesisFit>,
+    pub(super) fits: Vec<SharedDesign>,
+    at_start: Vec<SharedDesign>,
     /// The number of ticks from which on it is weighed again.
     weigh_from: usize,
     /// How much a tick counts: what exceeds the stated noise is a misfit, which lasts.
@@ -54,7 +54,7 @@ impl SubtreeHypotheses {
         component: usize,
         subtree: usize,
         columns: SubtreeUnknowns,
-        at_start: Vec<HypothesisFit>,
+        at_start: Vec<SharedDesign>,
     ) -> Self {
         Self {
             component,
@@ -74,11 +74,11 @@ impl SubtreeHypotheses {
     }
 
     /// What is stated; with other offsets from now on; then with each contact that may begin now.
-    pub(super) fn changes(&self) -> Vec<HypothesisFit> {
+    pub(super) fn changes(&self) -> Vec<SharedDesign> {
         let contacts = self.at_start.iter().filter_map(|fit| fit.contact).map(Some);
         let continued = |contact| self.fits[0].continued(&self.columns, contact);
         let all = [None, None].into_iter().chain(contacts);
-        let mut fits: Vec<HypothesisFit> = all.map(continued).collect();
+        let mut fits: Vec<SharedDesign> = all.map(continued).collect();
         fits[1].forget(&self.offsets());
         fits
     }
@@ -126,7 +126,7 @@ impl SubtreeHypotheses {
     /// stated, with or without a contact.
     pub(super) fn evidence(&self) -> Vec<(MotionReading, WrenchReading, f64)> {
         let as_stated = (self.fits.iter())
-            .filter(|fit| fit.view == MotionReading::AsStated)
+            .filter(|fit| fit.motion_reading == MotionReading::AsStated)
             .map(|fit| fit.branches[0].log_evidence)
             .fold(f64::NEG_INFINITY, f64::max);
         let without_contact = self.fits.iter().filter(|fit| fit.contact.is_none());
@@ -135,7 +135,7 @@ impl SubtreeHypotheses {
                 let open = fit.branches.iter().filter(|branch| !branch.is_refuted);
                 open.map(move |branch| {
                     let evidence = self.share * (branch.log_evidence - as_stated);
-                    (fit.view, branch.sight, evidence)
+                    (fit.motion_reading, branch.wrench_reading, evidence)
                 })
             })
             .collect()
@@ -148,9 +148,9 @@ impl SubtreeHypotheses {
         let mut best = f64::NEG_INFINITY;
         for fit in &mut self.fits {
             for branch in fit.branches.iter_mut().filter(|branch| !branch.is_refuted) {
-                let other = match (fit.view, branch.sight) {
+                let other = match (fit.motion_reading, branch.wrench_reading) {
                     (MotionReading::AsStated, WrenchReading::AsStated) => 0.0,
-                    (view, sight) => elsewhere(view, sight),
+                    (motion_reading, wrench_reading) => elsewhere(motion_reading, wrench_reading),
                 };
                 branch.log_odds = branch.log_prior + share * branch.log_evidence + other;
                 best = best.max(branch.log_odds);
@@ -173,7 +173,7 @@ impl SubtreeHypotheses {
 
     /// The odds of what is stated, or differs from it by something harmless.
     fn stated(&self) -> f64 {
-        let odds = |fit: &HypothesisFit| fit.branches[0].log_odds;
+        let odds = |fit: &SharedDesign| fit.branches[0].log_odds;
         let own = odds(&self.fits[0]);
         let likelier = self.fits.iter().filter(|fit| odds(fit) > own);
         let harmless = likelier.filter(|fit| self.is_harmless(fit));
@@ -182,8 +182,8 @@ impl SubtreeHypotheses {
 
     /// Whether it is a contact with next to no force, a small tilt of the base, or a small error of
     /// an encoder.
-    fn is_harmless(&self, fit: &HypothesisFit) -> bool {
-        match (fit.contact, fit.view.unknowns()) {
+    fn is_harmless(&self, fit: &SharedDesign) -> bool {
+        match (fit.contact, fit.motion_reading.unknowns()) {
             (Some(_), _) => fit.extent(&self.columns) <= LITTLE,
             (None, 0) => false,
             (None, _) => fit.extent(&self.columns) <= USUAL,
@@ -208,9 +208,10 @@ impl SubtreeHypotheses {
 
     /// Whether everything is as stated, as far as is known.
     pub(super) fn is_settled(&self) -> bool {
-        let is_open = |fit: &HypothesisFit| {
+        let is_open = |fit: &SharedDesign| {
             let mut structural = fit.branches.iter().filter(|branch| {
-                fit.view != MotionReading::AsStated || branch.sight != WrenchReading::AsStated
+                fit.motion_reading != MotionReading::AsStated
+                    || branch.wrench_reading != WrenchReading::AsStated
             });
             structural.any(Branch::needs_cover) && !self.is_harmless(fit)
         };
@@ -235,7 +236,7 @@ impl SubtreeHypotheses {
     }
 
     /// All hypotheses: the fit, and the number of its branch.
-    fn all(&self) -> impl Iterator<Item = (&HypothesisFit, usize, &Branch)> {
+    fn all(&self) -> impl Iterator<Item = (&SharedDesign, usize, &Branch)> {
         self.fits.iter().flat_map(|fit| {
             let branches = fit.branches.iter().enumerate();
             branches.map(move |(number, branch)| (fit, number, branch))
@@ -255,34 +256,34 @@ pub(super) fn hypotheses(
     columns: &SubtreeUnknowns,
     robot: &Robot,
     contacts: &ContactSet,
-) -> Vec<HypothesisFit> {
+) -> Vec<SharedDesign> {
     let sensor_count = robot.structure.sensors().len();
-    let branch = |sight, prior| Branch::new(sight, prior, &columns.sensors);
+    let branch = |wrench_reading, prior| Branch::new(wrench_reading, prior, &columns.sensors);
     let mut first = vec![branch(WrenchReading::AsStated, 1.0)];
     for &sensor in &columns.sensors {
         let others = (0..sensor_count).filter(|other| *other != sensor);
         let swapped =
             others.map(|other| WrenchReading::Swapped(sensor.min(other), sensor.max(other)));
-        let all = sights(sensor).into_iter().chain(swapped);
-        first.extend(all.map(|sight| branch(sight, STRUCTURAL)));
+        let all = wrench_readings(sensor).into_iter().chain(swapped);
+        first.extend(all.map(|wrench_reading| branch(wrench_reading, STRUCTURAL)));
     }
     let stated = MotionReading::AsStated;
-    let mut fits = vec![HypothesisFit::new(stated, None, columns, first)];
+    let mut fits = vec![SharedDesign::new(stated, None, columns, first)];
     let count = contacts.iter().count() as f64;
     fits.extend(contacts.iter().map(|contact| {
         let branches = vec![branch(WrenchReading::AsStated, CONTACT / count)];
-        HypothesisFit::new(stated, Some(contact), columns, branches)
+        SharedDesign::new(stated, Some(contact), columns, branches)
     }));
     fits.extend(
         motion_readings(robot, &columns.links)
             .into_iter()
-            .map(|view| {
-                let prior = match view.unknowns() {
+            .map(|motion_reading| {
+                let prior = match motion_reading.unknowns() {
                     0 => STRUCTURAL,
                     _ => ESTIMATED,
                 };
                 let branches = vec![branch(WrenchReading::AsStated, prior)];
-                HypothesisFit::new(view, None, columns, branches)
+                SharedDesign::new(motion_reading, None, columns, branches)
             }),
     );
     fits

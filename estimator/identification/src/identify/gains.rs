@@ -2,7 +2,7 @@
 
 use crate::fit::{IdentifyError, NoiseAndMap, OffsetDrift, alternate_noise_and_map};
 use crate::measurement::model::MeasurementModel;
-use crate::training::{
+use crate::prepared_log::{
     PreparedLog, SEGMENT_INSTANTS, segment_residuals, segments_of, training_instants,
     training_logs, training_logs_mut,
 };

@@ -210,8 +210,8 @@ impl NoiseTracker {
         self.worst.max(self.candidate.unwrap_or(0.0))
     }
 
-    /// `V`, and the standard deviation of the drift in a second: means over the grid by likelihood
-    /// and prior.
+    /// `V`, and the standard deviation of the drift in a second: means over the grid, weighted by
+    /// likelihood.
     pub(crate) fn noise(&self) -> (f64, f64) {
         let best = (self.filters.as_flattened().iter())
             .map(|filter| filter.likelihood)

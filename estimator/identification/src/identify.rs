@@ -19,7 +19,6 @@
 
 mod gains;
 
-use crate::batch::gains::fit_gains;
 use crate::cross_validation;
 use crate::dataset::{Dataset, LogRole};
 use crate::diagnose::load::LoadChange;
@@ -28,19 +27,20 @@ use crate::diagnose::undeclared;
 use crate::diagnose::{configuration, load};
 use crate::finding::{Finding, FindingCode};
 use crate::fit::{
-    Identified, IdentifyError, LOAD_VARIANCE_RATIO, NoiseAndMap, OffsetDrift, added,
-    alternate_noise_and_map, negative_rotors, parameters_without_cad, per_column, posterior,
-    unsettled, without_negative_rotors,
+    Identified, IdentifyError, NoiseAndMap, OffsetDrift, added, alternate_noise_and_map,
+    negative_rotors, parameters_without_cad, per_column, posterior, unsettled,
+    without_negative_rotors,
 };
+use crate::identify::gains::fit_gains;
 use crate::measurement::model::MeasurementModel;
 use crate::measurement::noise_model::{NoiseModel, Seconds};
-use crate::report::assemble;
-use crate::report::outcome::Outcome;
-use crate::robot::{IdentificationInput, Robot, TorqueSide};
-use crate::training::{
+use crate::prepared_log::{
     PreparedLog, SEGMENT_INSTANTS, no_log, prepare, reduced_segments, refuse_repeated, sample,
     segment_residuals, segments_of, training_instants, training_logs, training_logs_mut,
 };
+use crate::report::assemble;
+use crate::report::outcome::Outcome;
+use crate::robot::{IdentificationInput, Robot, TorqueSide};
 use proprio_dynamics::calibration::{Gain, Kind};
 use std::ops::ControlFlow;
 
@@ -52,6 +52,10 @@ pub struct Progress {
     /// Fraction done, 0 to 1.
     pub done: f64,
 }
+
+/// A load is accepted if, without its side of the log, the noise variances of its part of the robot
+/// are smaller by this factor (geometric mean over the channels there).
+const LOAD_VARIANCE_RATIO: f64 = 2.0;
 
 /// Most fits after which the excluded disturbances may still change.
 const EXCLUSION_ROUNDS: usize = 12;
@@ -300,7 +304,7 @@ impl Exclusion<'_, '_> {
     fn limit_drift(&mut self, noise: &NoiseModel) -> bool {
         self.drift = OffsetDrift::AsStated;
         let fastest = self.drift.fastest(self.measurement);
-        let mut pairs = noise.drift.iter().zip(&fastest);
+        let mut pairs = noise.drift_variance.iter().zip(&fastest);
         pairs.any(|(found, most)| found > most)
     }
 }
@@ -444,7 +448,7 @@ mod tests {
     use crate::dataset::observation::{Annotated, Observation, SubtreeSet};
     use crate::measurement::noise_model::NoiseModel;
     use crate::measurement::reduction::tests::{between_two_sensors, readings};
-    use crate::training::SAMPLE_INSTANTS;
+    use crate::prepared_log::SAMPLE_INSTANTS;
     use proprio_dynamics::ContactSet;
 
     /// A training log of these instants.
