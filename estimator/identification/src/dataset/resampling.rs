@@ -31,8 +31,8 @@ use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{ContactSet, FrameMotion};
 use proprio_topics::{Nanos, Reason};
 
-/// Greatest number of observations per second \[Hz\], one each [`PERIOD`]. A slower log keeps its own
-/// stamps.
+/// Greatest number of observations per second \[Hz\], one each [`PERIOD`]. A slower log keeps its
+/// own stamps.
 pub(crate) const RATE: f64 = 100.0;
 
 impl Recording {
