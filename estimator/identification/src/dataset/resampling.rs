@@ -24,18 +24,16 @@
 use crate::dataset::observation::Observation;
 use crate::dataset::recording::Recording;
 use crate::dataset::smooth::{Scratch, Smoother};
-use crate::dataset::stream::{ImuTrack, is_dense};
+use crate::dataset::stream::{ImuTrack, PERIOD, is_dense};
 use crate::parallel;
 use crate::robot::{BaseMotion, Channel, ChannelRole, Robot};
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{ContactSet, FrameMotion};
 use proprio_topics::{Nanos, Reason};
 
-/// Greatest number of observations per second \[Hz\]. A slower log keeps its own stamps.
+/// Greatest number of observations per second \[Hz\], one each [`PERIOD`]. A slower log keeps its
+/// own stamps.
 pub(crate) const RATE: f64 = 100.0;
-
-/// The time between observations at that rate.
-pub(crate) const PERIOD: Nanos = Nanos::from_millis(10);
 
 impl Recording {
     /// The observations of the log.

@@ -1,7 +1,6 @@
 //! The samples of one channel, and its value at any time.
 
 use crate::arithmetic::add_multiple;
-use crate::dataset::resampling::PERIOD;
 use crate::dataset::smooth::{Scratch, Smoother};
 use proprio_topics::{Nanos, Reason};
 
@@ -94,6 +93,9 @@ impl JointTrack {
         times.iter().map(&mut at).collect()
     }
 }
+
+/// Least time between observations.
+pub(crate) const PERIOD: Nanos = Nanos::from_millis(10);
 
 /// Whether a channel sampled every `spacing` is averaged over blocks of [`PERIOD`].
 pub(crate) fn is_dense(spacing: Nanos) -> bool {
