@@ -27,9 +27,6 @@ const LEVELS: usize = 11;
 /// the offset follows in about a second. As off-line, it may not be faster, or it would follow the
 /// motion that identifies.
 const RATES: [f64; 5] = [0.01, 0.03, 0.1, 0.3, 1.0];
-/// Prior of the drift rate: log-normal about this, its standard deviation a factor of three.
-const RATE: f64 = 0.1;
-const SPREAD: f64 = 1e3;
 /// Memory of the likelihood \[s\].
 const MEMORY: f64 = 60.0;
 /// Length of a pause after which the filters restart, since a contact may have changed the offset
@@ -220,8 +217,7 @@ impl NoiseTracker {
         for (number, row) in self.filters.iter().enumerate() {
             let level = self.level(number);
             for (filter, rate) in row.iter().zip(RATES) {
-                let apart = (rate / RATE).ln() / SPREAD;
-                let weight = (filter.likelihood - best - 0.5 * apart * apart).exp();
+                let weight = (filter.likelihood - best).exp();
                 sums[0] += weight * level;
                 sums[1] += weight * rate * rate * level * self.period;
                 weights += weight;
