@@ -17,6 +17,7 @@ pub mod parallel;
 mod payload;
 mod prepared_log;
 pub mod prior;
+mod readings;
 mod report;
 pub mod robot;
 pub mod statistics;

@@ -1,6 +1,6 @@
 //! Observations: the values of all channels at one time, and annotations by fits.
 
-use crate::online::bank::hypothesis::{MotionReading, SeenMotion};
+use crate::readings::{MotionReading, SeenMotion};
 use crate::robot::{Channel, ChannelRole};
 use proprio_dynamics::spatial::Wrench;
 use proprio_dynamics::{BitSet, ContactSet, FrameMotion};

@@ -1,4 +1,5 @@
-//! Samples of a log, channel by channel, as they were recorded.
+//! Samples of a log, channel by channel, as they were recorded. What the other steps do with a
+//! recording stands with them: `cleaning` (which also finds its span), `inspection`, `resampling`.
 
 use crate::dataset::repeats::ChannelRepeats;
 use crate::dataset::stream::{ImuTrack, JointTrack, MOTION, SampleStream};

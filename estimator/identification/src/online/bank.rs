@@ -31,16 +31,15 @@
 //! second no torque is valid.
 
 mod evidence;
-pub(crate) mod hypothesis;
 mod subtree_hypotheses;
 
-pub use hypothesis::{Hypothesis, MotionReading, WrenchReading};
+pub use crate::readings::{Hypothesis, MotionReading, WrenchReading};
 
 use crate::online::component::ComponentLayout;
 use crate::online::solution::{DetectedChange, Doubt, OnlineError, Solution};
+use crate::readings::SeenMotion;
 use crate::robot::{Robot, stated_noise};
 use evidence::{HypothesisPosterior, SMALL, SharedDesign, SubtreeUnknowns, TickRows, dot};
-use hypothesis::SeenMotion;
 use nalgebra::Vector6;
 use proprio_dynamics::model::Model;
 use proprio_dynamics::regressor::{EstimateRows, LINK_PARAMETERS, StackedRegressor};
@@ -622,7 +621,7 @@ fn measured_with(subtree: &SubtreeHypotheses, subtrees: &[SubtreeHypotheses]) ->
 mod tests {
     use super::*;
     use crate::arithmetic::normals;
-    use crate::online::bank::hypothesis::GRAVITY;
+    use crate::readings::GRAVITY;
     use proprio_dynamics::model::{Frame, MeasurementDirection, MeasurementFrame};
     use proprio_dynamics::spatial::{Pose, Vec3};
     use proprio_dynamics::{

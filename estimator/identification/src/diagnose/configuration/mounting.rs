@@ -1,6 +1,6 @@
 //! Frames and directions of an F/T sensor other than the configured ones.
 
-use crate::online::bank::hypothesis::quarter_turns;
+use crate::readings::quarter_turns;
 use crate::robot::Robot;
 use nalgebra::{Matrix6, Rotation3, Vector6};
 use proprio_dynamics::SensorCut;

@@ -10,8 +10,8 @@
 //! are the Gram matrix of `[A | y]`, in which ticks add up. The noise is the most likely one, but
 //! not below the stated one.
 
-use crate::online::bank::hypothesis::{Hypothesis, MotionReading, WrenchReading};
 use crate::prior::link_cad_root;
+use crate::readings::{Hypothesis, MotionReading, WrenchReading};
 use crate::robot::Robot;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SMatrix, Vector6};
 use proprio_dynamics::calibration::UNKNOWN_OFFSET;

@@ -3,9 +3,7 @@
 use crate::online::bank::evidence::{
     Branch, HypothesisPosterior, LASTING, SharedDesign, SubtreeUnknowns,
 };
-use crate::online::bank::hypothesis::{
-    Hypothesis, MotionReading, WrenchReading, quarter_turns, wrench_readings,
-};
+use crate::readings::{Hypothesis, MotionReading, WrenchReading, quarter_turns, wrench_readings};
 use crate::robot::{BaseMotion, Robot, dofs_above, dofs_between};
 use proprio_dynamics::ContactSet;
 use proprio_dynamics::model::{JointKind, Model};

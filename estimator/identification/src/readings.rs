@@ -318,10 +318,10 @@ pub(crate) fn wrench_readings(sensor: usize) -> Vec<WrenchReading> {
             WrenchReading::Axes(sensor, -turn),
         ]);
     }
-    let subtrees = FACTORS
+    let units = FACTORS
         .into_iter()
         .flat_map(|factor| [factor, 1.0 / factor]);
-    all.extend(subtrees.map(|factor| WrenchReading::Unit(sensor, factor)));
+    all.extend(units.map(|factor| WrenchReading::Unit(sensor, factor)));
     all
 }
 
