@@ -116,7 +116,7 @@ pub(crate) fn input(path: &Path) -> anyhow::Result<Box<dyn Read + Send>> {
         return Ok(Box::new(std::io::stdin()));
     }
     let file = File::open(path).with_context(|| format!("{}: cannot be read", path.display()))?;
-    let length = file.metadata().map(|m| m.len()).unwrap_or(0);
+    let length = file.metadata().map_or(0, |m| m.len());
     // Show progress if standard error is a terminal.
     if length > 64 << 20 && std::io::stderr().is_terminal() {
         let bar = indicatif::ProgressBar::new(length).with_style(

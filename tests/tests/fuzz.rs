@@ -61,7 +61,7 @@ fn try_mutations(name: &str) {
         } else {
             8192
         });
-        for _ in 0..1 + random.u8(..6) {
+        for _ in 0..=random.u8(..6) {
             mutate(&mut bytes, &seeds[random.usize(..seeds.len())], &mut random);
         }
         let start = now();

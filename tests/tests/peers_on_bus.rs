@@ -101,9 +101,11 @@ impl Host {
             self.recorder.take();
             enough(&self.recorder.taken).then_some(())
         });
-        if found.is_none() {
-            panic!("never: {what}; {:?}", self.health.fresh().devices());
-        }
+        assert!(
+            found.is_some(),
+            "never: {what}; {:?}",
+            self.health.fresh().devices()
+        );
         std::mem::take(&mut self.recorder.taken)
     }
 

@@ -296,12 +296,11 @@ type Play<'a> = &'a dyn Fn(&Rig, &str) -> Box<dyn FnMut() -> bool>;
 fn live_is_replay(buses: [&str; 2], play: impl Fn(&Rig, &str) -> Box<dyn FnMut() -> bool>) {
     // If the machine stalls for longer than half the wait, samples are late; then try again.
     let tries = 5;
-    if !(0..tries).any(|_| one_live_is_replay(buses, &play)) {
-        panic!(
-            "samples were late in each of {tries} tries: this machine is too slow for the \
-             configured wait"
-        );
-    }
+    assert!(
+        (0..tries).any(|_| one_live_is_replay(buses, &play)),
+        "samples were late in each of {tries} tries: this machine is too slow for the \
+         configured wait"
+    );
 }
 
 /// The configuration with its times in ms multiplied by `slower`, except the wait, which gets its

@@ -35,7 +35,7 @@ fn too_many_numbers_are_refused() {
             let text = ARM
                 .replace(place, &format!("{place}{key} = {numbers}\n"))
                 .replace("        ", "");
-            let error = Config::parse(&text).unwrap_err().to_string();
+            let error = Config::parse(&text).unwrap_err();
             let given = numbers.matches('0').count();
             assert!(
                 error.contains(&format!("{given} numbers where 3 are needed")),

@@ -271,7 +271,7 @@ impl Drives {
             let Some(leading) = dof_of(&leader) else {
                 continue;
             };
-            let mut common = dependences.get(leading).cloned().unwrap_or_default();
+            let mut common = dependences.get(leading).copied().unwrap_or_default();
             for own in rest.iter_mut().filter(|own| is_ungrouped(own)) {
                 let Some(dof) = dof_of(own) else { continue };
                 if subtree_of(dof) != subtree_of(leading) {

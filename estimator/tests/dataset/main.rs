@@ -558,7 +558,7 @@ fn derivatives_that_are_noise_are_not_used() {
             let [_, velocity, acceleration] = motion(1, Nanos(*t).seconds());
             let given = [acceleration + 12.0 * noise.normal(), velocity];
             let given = given.map(|own| if row[0].is_nan() { f64::NAN } else { own });
-            row.extend_from_slice(&given[..1 + usize::from(has_velocity)]);
+            row.extend_from_slice(&given[..=usize::from(has_velocity)]);
         }
         let instants = table.dataset(&robot);
         let [noisy] = instants.findings() else {

@@ -249,7 +249,7 @@ impl Wiring {
             });
         }
         for shaft in &self.plan.shafts {
-            self.check(shaft)?;
+            Self::check(shaft)?;
         }
         let shafts = self.plan.shafts.iter();
         let shown = shafts.filter_map(|shaft| self.shown(shaft)).collect();
@@ -257,7 +257,7 @@ impl Wiring {
     }
 
     /// Checks that each quantity of a shaft has one input, and the position has one.
-    fn check(&self, shaft: &ShaftPlan) -> Result<(), String> {
+    fn check(shaft: &ShaftPlan) -> Result<(), String> {
         let at = format!("joint {:?}", shaft.name);
         let by = |input: &InputPlan| match &input.origin {
             Origin::Device(_, name) => format!("device {name:?}"),

@@ -73,7 +73,7 @@ pub fn apply(cpu: Option<usize>, priority: Option<i32>) -> Vec<String> {
         let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
         let set = u8::try_from(priority)
             .map_err(|e| e.to_string())
-            .and_then(|p| ThreadPriorityValue::try_from(p).map_err(|e| e.to_string()))
+            .and_then(ThreadPriorityValue::try_from)
             .and_then(|p| {
                 set_thread_priority_and_policy(
                     thread_native_id(),

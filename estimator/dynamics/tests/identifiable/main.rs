@@ -685,7 +685,7 @@ fn with_contacts(
 ) -> (Structure, ContactSet) {
     let sensors = robot.sensors(model, random);
     let plain = Structure::new(model, &sensors, &[], Structure::LENGTH_SCALE).unwrap();
-    let contacts: Vec<ContactSpec> = (0..1 + random.below(4))
+    let contacts: Vec<ContactSpec> = (0..=random.below(4))
         .map(|_| {
             let (mut contact, _) = common::contact(model, random);
             if contact.kind != ContactKind::Wrench {

@@ -330,7 +330,7 @@ impl Bank {
         for component in &mut solution.components {
             component.leading = None;
         }
-        for subtree in subtrees.iter() {
+        for subtree in subtrees {
             let dofs = equations.dofs(&subtree.columns.sensors, Some(subtree.subtree));
             let leading = subtree.leading();
             let (is_doubtful, is_settled) = (subtree.is_doubtful(), subtree.is_settled());

@@ -91,7 +91,7 @@ pub(in crate::log) fn parse_line(line: &[u8]) -> Result<ParsedLine, LineError> {
             frame.whole |= direction.is_some();
             (frame, direction, StampForm::Origin)
         }
-        [b' ', ..] | [b'[', ..] => {
+        [b' ' | b'[', ..] => {
             let (direction, flags) = columns.map_or((None, (false, false)), |(d, f)| (Some(d), f));
             let frame = parse_screen_frame(identifier()?, after.trim_ascii_start(), flags)?;
             (frame, direction, StampForm::Relative)

@@ -56,9 +56,8 @@ impl DomainConfig {
             || "default".to_owned(),
             |v| v.to_string_lossy().into_owned(),
         );
-        let base = set("PROPRIO_RUNTIME_DIR")
-            .map(PathBuf::from)
-            .unwrap_or_else(|| {
+        let base = set("PROPRIO_RUNTIME_DIR").map_or_else(
+            || {
                 let system = PathBuf::from("/run/proprio");
                 let _ = DirBuilder::new().mode(0o755).create(&system);
                 // If another user owns a domain of this name there, do not silently choose another
@@ -72,7 +71,9 @@ impl DomainConfig {
                     Some(dir) => PathBuf::from(dir).join("proprio"),
                     None => PathBuf::from(format!("{SHM}/proprio-{}", geteuid())),
                 }
-            });
+            },
+            PathBuf::from,
+        );
         Self { base, name }
     }
 

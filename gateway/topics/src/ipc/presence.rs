@@ -116,7 +116,7 @@ impl<T: Topic, S: Service> Watch<T, S> {
         self.went
     }
 
-    /// The newest health that [`Watch::look`] has seen.
+    /// The newest health that [`Watch::poll`] has seen.
     #[must_use]
     pub const fn newest(&self) -> Option<&T> {
         self.newest.as_ref()
