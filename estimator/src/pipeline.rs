@@ -77,6 +77,7 @@ mod inputs;
 mod offset_steps;
 mod prediction;
 mod residuals;
+mod significance;
 mod solution;
 mod validity;
 

@@ -2,9 +2,9 @@
 //! and Hilferty (1931), and of numbers.
 //!
 //! Up to a level of 3.1 the approximation is within 1 % of the quantile from three degrees of
-//! freedom on, and a few per cent too large for one. Beyond, it is too large: at a level of 5 by 8 %
-//! with three degrees of freedom, 4 % with six, 2 % with twelve. A test at that level gives a false
-//! alarm with .28, .44 and .61 of the normal variable's probability.
+//! freedom on, and a few per cent too large for one. Beyond, it is too large: at a level of 5 by
+//! 8 % with three degrees of freedom, 4 % with six, 2 % with twelve. A test at that level gives a
+//! false alarm with .28, .44 and .61 of the normal variable's probability.
 
 /// The value that a chi-square variable with `freedom` degrees of freedom exceeds with the
 /// probability that a normal one exceeds `level`.

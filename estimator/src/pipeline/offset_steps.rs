@@ -8,7 +8,7 @@
 //! same in the axes of the sensor, while a contact rarely does. So it is refuted as soon as the
 //! residual has changed there significantly since it settled.
 
-use super::residuals::{SIGNIFICANT, kept};
+use super::significance::{SIGNIFICANT, kept};
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::model::Model;
 use proprio_dynamics::spatial::{Pose, Wrench};

@@ -28,6 +28,7 @@
 //! tested, because of a fault, may still be there after it.
 
 use super::offset_steps::OffsetStep;
+use super::significance::{SIGNIFICANT, TIME_CONSTANT, kept};
 use nalgebra::{Matrix6, Vector6};
 use proprio_dynamics::spatial::{Vec3, Wrench};
 use proprio_dynamics::{
@@ -36,19 +37,6 @@ use proprio_dynamics::{
 };
 use proprio_identification::statistics::deviate;
 use proprio_topics::Nanos;
-
-/// The deviate above which a residual is significant. By chance one test of six degrees of freedom
-/// exceeds it with probability 1.3e-7 (2.9e-7 if [`deviate`] were exact). The mean has some ten
-/// independent values a second, so it does every nine days in each sub-tree; that of the instant
-/// every two hours at 1 kHz, if there were no error but the noise of single readings.
-pub(super) const SIGNIFICANT: f64 = 5.0;
-/// Time constant of mean residuals.
-const TIME_CONSTANT: Nanos = Nanos::from_millis(50);
-
-/// The part of an exponential mean that is left after this time.
-pub(super) fn kept(since: Nanos) -> f64 {
-    (-since.seconds() / TIME_CONSTANT.seconds()).exp()
-}
 
 /// The deviate up to which a residual is plausible: 99 % of instants without an unknown wrench.
 const PLAUSIBLE: f64 = 2.326;
