@@ -180,8 +180,9 @@ impl Question<'_> {
             rows: Vec::new(),
         };
         let mut kinematics = Kinematics::new(model, self.regime.base).unwrap();
-        // A wrench has three rows per state that depend on the second moments, a single torque has
-        // one row; the part that needs the most states decides.
+        // A wrench has three rows per state that depend on the second moments. A single torque has
+        // one row, and contacts that are always present may leave no more. The part that needs the
+        // most states decides.
         let most = (0..columns)
             .filter_map(|piece| {
                 Some(
@@ -195,7 +196,7 @@ impl Question<'_> {
             .max();
         let most = 10 * most.unwrap_or(0) + 6 * sensors.len();
         let states = 10
-            + if self.measured == Measurement::Torques {
+            + if self.measured == Measurement::Torques || !self.regime.contacts.is_empty() {
                 most
             } else {
                 most / 2
