@@ -341,11 +341,11 @@ impl Listener {
     }
 
     /// The number of a series, which is added if it is new.
-    fn number(&mut self, what: SeriesKind, name: &str) -> usize {
-        let known = (self.series.iter()).position(|one| one.what == what && one.name == name);
+    fn number(&mut self, kind: SeriesKind, name: &str) -> usize {
+        let known = (self.series.iter()).position(|one| one.kind == kind && one.name == name);
         known.unwrap_or_else(|| {
             let name = name.to_owned();
-            self.series.push(Series { what, name });
+            self.series.push(Series { kind, name });
             self.series.len() - 1
         })
     }

@@ -165,7 +165,7 @@ impl<S: MessageSink> Messages<S> {
     pub fn know(&mut self, series: &[Series]) -> Result<(), S::Error> {
         for (number, one) in series.iter().enumerate().skip(self.known.len()) {
             let name = &one.name;
-            let (topic, definition, standard) = match one.what {
+            let (topic, definition, standard) = match one.kind {
                 SeriesKind::Channel(kind) => (
                     format!("/samples/{kind}/{name}"),
                     definitions::sample(kind),
@@ -268,7 +268,7 @@ impl<S: MessageSink> Messages<S> {
         let (sink, Some(known)) = (&mut self.sink, self.known.get_mut(series)) else {
             return Ok(());
         };
-        match (known.series.what, value) {
+        match (known.series.kind, value) {
             (SeriesKind::Channel(main), Value::Reading(reading, quality)) => {
                 let kind = reading.kind();
                 let name = known.series.name.as_str();
@@ -387,7 +387,7 @@ impl<S: MessageSink> Messages<S> {
     #[must_use]
     pub fn state(&self, joint: &str, t: Nanos) -> JointState {
         let is_joint = |known: &&KnownSeries<S::Channel>| {
-            known.series.what == SeriesKind::Channel(Kind::Joint) && known.series.name == joint
+            known.series.kind == SeriesKind::Channel(Kind::Joint) && known.series.name == joint
         };
         let known = self.known.iter().find(is_joint);
         let known = known.filter(|known| t <= known.holds_until);

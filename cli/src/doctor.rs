@@ -240,7 +240,9 @@ fn interface(name: &str, system: &str, health: &InterfaceHealth) -> CheckResult 
                  restart-ms 100`"
             )
         }
-        _ => return ok(INTERFACE, says),
+        Controller::Active | Controller::Stopped | Controller::Sleeping | Controller::Unknown => {
+            return ok(INTERFACE, says);
+        }
     };
     lacking(INTERFACE, says, hint)
 }

@@ -193,7 +193,7 @@ mod tests {
         let series: Vec<Option<usize>> = reader
             .series()
             .iter()
-            .map(|series| match series.what {
+            .map(|series| match series.kind {
                 SeriesKind::Channel(kind) => setup.robot.channel(kind, &series.name),
                 SeriesKind::Contact => None,
             })

@@ -238,8 +238,8 @@ impl InertialState {
                 let root = with_calibrations(&group, root, &calibrated);
                 let (root, kinds) = with_gains(robot, &group, &root, kinds);
                 let _ = covariance.add_calibrated(group.links, group.sensors, &kinds, root);
-                for (&sensor, rate) in group.sensors.iter().zip(group.drift_std) {
-                    let _ = covariance.set_drift(sensor, *rate, group.known);
+                for (&sensor, drift_std) in group.sensors.iter().zip(group.drift_std) {
+                    let _ = covariance.set_drift(sensor, *drift_std, group.known);
                 }
                 continue;
             }

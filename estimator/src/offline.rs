@@ -220,7 +220,7 @@ fn owners(setup: &Setup, series: &[Series]) -> Result<Vec<Option<ColumnOwner>>, 
     check_skins(setup, series)?;
     let mut owners = column_owners(&setup.robot, series);
     for (series, owner) in series.iter().zip(&mut owners) {
-        if let SeriesKind::Channel(kind @ Kind::Skin) = series.what {
+        if let SeriesKind::Channel(kind @ Kind::Skin) = series.kind {
             let channel = setup.channel(kind, &series.name);
             *owner = channel.map(ColumnOwner::Channel);
         }

@@ -114,7 +114,7 @@ pub(crate) enum ColumnOwner {
 
 /// Per series of a log its channel or contact; none if the robot has no such.
 pub(crate) fn column_owners(robot: &Robot, series: &[Series]) -> Vec<Option<ColumnOwner>> {
-    let target = |series: &Series| match series.what {
+    let target = |series: &Series| match series.kind {
         SeriesKind::Channel(kind) => robot.channel(kind, &series.name).map(ColumnOwner::Channel),
         SeriesKind::Contact => robot.contact(&series.name).map(ColumnOwner::Contact),
     };
@@ -317,7 +317,7 @@ pub fn check_columns(
     let column = |kind: Kind, name: &str| format!("{}/{name}", kind.word());
     let columns: Vec<String> = series
         .iter()
-        .filter_map(|series| match series.what {
+        .filter_map(|series| match series.kind {
             SeriesKind::Channel(kind) => Some(column(kind, &series.name)),
             SeriesKind::Contact => None,
         })
@@ -352,7 +352,7 @@ pub fn check_columns(
 /// # Errors
 /// The channels that it lacks.
 pub(crate) fn check_skins(setup: &Setup, series: &[Series]) -> Result<(), MissingChannels> {
-    let is_skin = |series: &&Series| series.what == SeriesKind::Channel(Kind::Skin);
+    let is_skin = |series: &&Series| series.kind == SeriesKind::Channel(Kind::Skin);
     let logged: Vec<&str> = series
         .iter()
         .filter(is_skin)

@@ -56,7 +56,7 @@ fn last(change: &Change<'_>) -> (Vec<f64>, Vec<TorqueBudget>) {
         for item in &row.items {
             let series = &series[item.series];
             let (SeriesKind::Channel(kind), Value::Reading(mut reading, quality)) =
-                (series.what, item.value)
+                (series.kind, item.value)
             else {
                 continue;
             };

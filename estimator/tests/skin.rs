@@ -424,12 +424,12 @@ fn a_table_gives_the_live_estimates() {
     let mut series: Vec<Series> = setup
         .channels()
         .map(|(kind, name)| Series {
-            what: SeriesKind::Channel(kind),
+            kind: SeriesKind::Channel(kind),
             name: name.into(),
         })
         .collect();
     series.push(Series {
-        what: SeriesKind::Contact,
+        kind: SeriesKind::Contact,
         name: "hand".into(),
     });
     let mut table = TableWriter::new(Vec::new(), &series, Columns::All).unwrap();

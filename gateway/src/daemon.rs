@@ -34,8 +34,8 @@ use tokio::signal::unix::{SignalKind, signal};
 const HEALTH_PERIOD: Duration = Duration::from_millis(100);
 /// Delay from the start to the first frame of a replayed log.
 const REPLAY_DELAY: Nanos = Nanos::from_millis(200);
-/// Time between two looks for what the bus threads have replied, while something was asked.
-const LOOK: Duration = Duration::from_millis(5);
+/// How often replies of the bus threads are taken, while something was asked.
+const REPLY_PERIOD: Duration = Duration::from_millis(5);
 
 /// Runs the gateway until SIGTERM, SIGINT, or the end of its logs.
 ///
@@ -91,7 +91,7 @@ async fn serve(config: &Path, plan: Plan, domain: &DomainConfig) -> anyhow::Resu
             _ = terminate.recv() => break "SIGTERM",
             _ = interrupt.recv() => break "SIGINT",
             Some(asked) = asked.recv() => gateway.begin(asked),
-            () = tokio::time::sleep(LOOK), if gateway.operator.waits() => {
+            () = tokio::time::sleep(REPLY_PERIOD), if gateway.operator.waits() => {
                 gateway.operator.take_replies(&mut gateway.threads, Monotonic.now());
             }
             _ = ticks.tick() => {

@@ -210,7 +210,7 @@ pub fn decode_with(
 ) -> Result<DecodeReport, ConversionError> {
     let series: Vec<Series> = (plan.channels.iter())
         .map(|c| Series {
-            what: SeriesKind::Channel(c.kind),
+            kind: SeriesKind::Channel(c.kind),
             name: c.name.clone(),
         })
         .collect();
@@ -602,9 +602,9 @@ impl<'p, W: Write> TableEncoder<'p, W> {
     /// The channel of a series, with its number.
     fn channel(&mut self, series: &Series) -> Option<(u32, &'p ChannelPlan)> {
         let is_it =
-            |c: &&ChannelPlan| SeriesKind::Channel(c.kind) == series.what && c.name == series.name;
+            |c: &&ChannelPlan| SeriesKind::Channel(c.kind) == series.kind && c.name == series.name;
         let channel = self.plan.channels.iter().find(is_it);
-        if channel.is_none() && series.what != SeriesKind::Contact {
+        if channel.is_none() && series.kind != SeriesKind::Contact {
             self.report.unknown_channels.push(series.name.clone());
         }
         let channel = channel?;

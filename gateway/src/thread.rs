@@ -113,8 +113,8 @@ impl BusThread {
         let devices = BusDevices::new(number, bus, mode, Arc::clone(&status))?;
         let (name, claims) = (&domain.config().name, devices.claims());
         let link = open_own(plan, bus, number, name, &claims, replay_start)?;
-        let claim = match &bus.source {
-            FrameSource::SocketCan(adapter) if !listens => claim_interface(adapter),
+        let interface_lock = match &bus.source {
+            FrameSource::SocketCan(adapter) if !listens => lock_interface(adapter),
             _ => None,
         };
         let (requests, inbox) = inbox(bus.devices.len());
@@ -163,7 +163,7 @@ impl BusThread {
             ended,
             requests,
             renewal,
-            _interface_lock: claim,
+            _interface_lock: interface_lock,
             mode,
             thread: JoinOnce(Some(thread)),
         })
@@ -206,7 +206,7 @@ impl BusLoop {
 /// Claims the interface of `adapter` for a gateway that commands boards, and warns if another one
 /// has: when either ends, it stops the boards of both. The claim is the name of an abstract socket.
 /// It belongs to the network namespace as the interface does, and ends with its process.
-fn claim_interface(adapter: &Adapter) -> Option<UnixDatagram> {
+fn lock_interface(adapter: &Adapter) -> Option<UnixDatagram> {
     let interface = adapter.resolve(Path::new(adapter::SYS)).ok()?;
     let name = format!("proprio/commands/{interface}");
     let address = SocketAddr::from_abstract_name(name).ok()?;
@@ -332,11 +332,11 @@ mod tests {
     fn an_interface_is_claimed_by_one_gateway_at_a_time() {
         let adapter = Adapter::Interface(format!("none{}", std::process::id()));
         let other = Adapter::Interface(format!("other{}", std::process::id()));
-        let first = claim_interface(&adapter);
-        assert!(first.is_some() && claim_interface(&adapter).is_none());
-        assert!(claim_interface(&other).is_some());
+        let first = lock_interface(&adapter);
+        assert!(first.is_some() && lock_interface(&adapter).is_none());
+        assert!(lock_interface(&other).is_some());
         drop(first);
-        assert!(claim_interface(&adapter).is_some());
+        assert!(lock_interface(&adapter).is_some());
     }
 
     #[test]

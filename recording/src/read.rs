@@ -165,7 +165,7 @@ impl<W: Write> SampleTable<W> {
         {
             let column = self.column(number);
             self.channels
-                .insert(channel.id, (number, column, series.what));
+                .insert(channel.id, (number, column, series.kind));
             if self.writer.is_none() {
                 // A channel's main reading comes first.
                 self.series.entry(number).or_insert(series);
@@ -349,15 +349,15 @@ fn frame(is_fd: bool, message: &[u8]) -> Option<Frame> {
 
 /// The series that has this topic.
 fn series_of(topic: &str) -> Option<Series> {
-    let (what, name) = if let Some(name) = topic.strip_prefix("/declared/") {
+    let (kind, name) = if let Some(name) = topic.strip_prefix("/declared/") {
         (SeriesKind::Contact, name)
     } else {
-        let (kind, name) = topic.strip_prefix("/samples/")?.split_once('/')?;
-        let kind = Kind::ALL.into_iter().find(|known| known.word() == kind)?;
+        let (word, name) = topic.strip_prefix("/samples/")?.split_once('/')?;
+        let kind = Kind::ALL.into_iter().find(|known| known.word() == word)?;
         (SeriesKind::Channel(kind), name)
     };
     Some(Series {
-        what,
+        kind,
         name: name.to_owned(),
     })
 }

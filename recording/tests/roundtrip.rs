@@ -28,12 +28,12 @@ fn series() -> Vec<Series> {
     ];
     let mut series: Vec<Series> = (channels.into_iter())
         .map(|(kind, name)| Series {
-            what: SeriesKind::Channel(kind),
+            kind: SeriesKind::Channel(kind),
             name: name.to_owned(),
         })
         .collect();
     series.push(Series {
-        what: SeriesKind::Contact,
+        kind: SeriesKind::Contact,
         name: "hand".to_owned(),
     });
     series

@@ -220,7 +220,7 @@ impl Recorder {
         let series: Vec<Series> = channels
             .iter()
             .map(|(kind, name)| Series {
-                what: SeriesKind::Channel(*kind),
+                kind: SeriesKind::Channel(*kind),
                 name: name.clone(),
             })
             .collect();
@@ -332,7 +332,7 @@ impl Truth {
                 let found = reader
                     .series()
                     .iter()
-                    .position(|s| s.what == SeriesKind::Channel(Kind::Joint) && s.name == *j);
+                    .position(|s| s.kind == SeriesKind::Channel(Kind::Joint) && s.name == *j);
                 found.unwrap_or_else(|| panic!("the truth has no joint {j}"))
             })
             .collect();

@@ -149,7 +149,7 @@ fn values(table: &str) -> Values {
     while reader.next_row(&mut row).expect("a row") {
         for item in &row.items {
             let Series {
-                what: SeriesKind::Channel(kind),
+                kind: SeriesKind::Channel(kind),
                 name,
             } = &series[item.series]
             else {

@@ -183,12 +183,12 @@ fn a_running_system_says_what_it_does() {
     assert!(
         series
             .iter()
-            .any(|s| s.what == SeriesKind::Contact && s.name == "hand"),
+            .any(|s| s.kind == SeriesKind::Contact && s.name == "hand"),
         "{series:?}"
     );
     let ft = series
         .iter()
-        .position(|s| s.what == SeriesKind::Channel(Kind::Wrench));
+        .position(|s| s.kind == SeriesKind::Channel(Kind::Wrench));
     let (mut row, mut last, mut count) = (Row::default(), Nanos::MIN, 0);
     while reader.next_row(&mut row).expect("readable") {
         let t = row.t.expect("a stamp");

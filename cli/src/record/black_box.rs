@@ -306,7 +306,7 @@ mod tests {
     #[test]
     fn what_becomes_wrong_is_told_once() {
         let series = [Series {
-            what: SeriesKind::Channel(Kind::Joint),
+            kind: SeriesKind::Channel(Kind::Joint),
             name: "elbow".to_owned(),
         }];
         let name = |text: &str| Name::new(text).unwrap();

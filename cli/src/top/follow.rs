@@ -17,7 +17,7 @@ const TURN: Duration = Duration::from_millis(20);
 /// How often what was heard is shown.
 const SHOW: Nanos = Nanos::from_millis(100);
 /// How often it is looked for robots, for topics that nobody published before, and for damage.
-const LOOK: Nanos = Nanos::from_millis(500);
+const POLL_PERIOD: Nanos = Nanos::from_millis(500);
 
 /// A topic, as soon as somebody publishes it.
 struct TopicFeed<T: Topic>(Option<Reader<T>>);
@@ -164,23 +164,23 @@ pub(super) fn follow(
         feeds: Feeds::default(),
         snapshot: RobotState::default(),
     };
-    let (mut look, mut show) = (Nanos::MIN, Nanos::MIN);
+    let (mut next_poll, mut next_show) = (Nanos::MIN, Nanos::MIN);
     loop {
         let now = monotonic();
-        if now >= look {
-            look = now + LOOK;
+        if now >= next_poll {
+            next_poll = now + POLL_PERIOD;
             follower.poll();
         }
         follower.take();
-        if now >= show {
-            show = now + SHOW;
+        if now >= next_show {
+            next_show = now + SHOW;
             let now = monotonic();
             follower.watch(now);
             follower.snapshot.tick(now);
             let _ = out.try_send(follower.snapshot.clone());
         }
         match wanted.recv_timeout(TURN) {
-            Ok(name) => (follower.wanted, look) = (Some(name), Nanos::MIN),
+            Ok(name) => (follower.wanted, next_poll) = (Some(name), Nanos::MIN),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => return,
         }

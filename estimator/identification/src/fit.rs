@@ -202,7 +202,7 @@ pub(crate) fn negative_rotors(
     }
     let root = fit.covariance_root();
     let mut findings = Vec::new();
-    let significant = nested_test::deviate(unknowns.extra.len());
+    let significant = nested_test::threshold(unknowns.extra.len());
     for (extra, column) in unknowns.extra.iter().zip(unknowns.inertial()..) {
         let ExtraParameter::RotorInertia(dof) = *extra else {
             continue;

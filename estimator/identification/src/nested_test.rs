@@ -20,7 +20,7 @@ pub(crate) fn needed(freedom: usize, tried: usize) -> f64 {
 }
 
 /// The threshold for one unknown of either sign, in standard deviations.
-pub(crate) fn deviate(tried: usize) -> f64 {
+pub(crate) fn threshold(tried: usize) -> f64 {
     needed(1, tried).sqrt()
 }
 

@@ -16,7 +16,6 @@ use crate::diagnose::undeclared;
 use crate::finding::Finding;
 use crate::fit::IdentifyError;
 use crate::identify::{self, exclude_disturbed, plausible_model, prepare_logs};
-
 use crate::prepared_log::training_instants;
 use crate::robot::{IdentificationInput, Robot};
 use nalgebra::{DMatrix, SMatrix, SVector};

@@ -124,7 +124,7 @@ fn temperatures_count_by_their_stamps() {
             for item in &row.items {
                 let of = &series[item.series];
                 if let (SeriesKind::Channel(kind), Value::Reading(reading, quality)) =
-                    (of.what, &item.value)
+                    (of.kind, &item.value)
                     && let Some(channel) = pipeline.setup().robot.channel(kind, &of.name)
                 {
                     let late = matches!(reading, Reading::Temperature(_));
@@ -242,7 +242,7 @@ fn without_a_temperature_torques_are_less_certain() {
         for item in &row.items {
             let of = &series[item.series];
             if let (SeriesKind::Channel(kind), Value::Reading(reading, quality)) =
-                (of.what, &item.value)
+                (of.kind, &item.value)
                 && let Some(channel) = pipeline.setup().robot.channel(kind, &of.name)
             {
                 pipeline.push(channel, t, reading, *quality);

@@ -143,7 +143,7 @@ fn recording(setup: &Setup, seconds: f64) -> Vec<Event> {
 fn recording_with(setup: &Setup, seconds: f64, phase: impl Fn(usize) -> f64) -> Vec<Event> {
     let mut reader =
         TableReader::new(golden("icub_left_arm_mujoco.csv").leak().as_bytes()).unwrap();
-    let channel = |s: &proprio_topics::csv::Series| match s.what {
+    let channel = |s: &proprio_topics::csv::Series| match s.kind {
         SeriesKind::Channel(kind) => setup.robot.channel(kind, &s.name),
         SeriesKind::Contact => None,
     };

@@ -92,9 +92,9 @@ fn group(key: &[u8]) -> SocketAddrV4 {
 
 /// A socket of bus `name` in `group`.
 fn join(name: &str, group: SocketAddrV4) -> Result<Socket, OpenError> {
-    let done = |what: &str, done: io::Result<()>| {
+    let check = |what: &str, result: io::Result<()>| {
         let action = format!("{what} for virtual bus {name}");
-        done.map_err(|cause| OpenError::System { action, cause })
+        result.map_err(|cause| OpenError::System { action, cause })
     };
     let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP));
     let socket = socket.map_err(|cause| OpenError::System {
@@ -103,26 +103,26 @@ fn join(name: &str, group: SocketAddrV4) -> Result<Socket, OpenError> {
     })?;
     // Every multicast datagram goes to all sockets that share the address this way.
     // SO_REUSEPORT would additionally require that all of them belong to one user.
-    done("share the address", socket.set_reuse_address(true))?;
+    check("share the address", socket.set_reuse_address(true))?;
     // Bound to the group, so that datagrams to this port of another group or of the host do not
     // arrive here. The buffer fills from here on, so options that concern its frames are set
     // before.
     let stamps = setsockopt(&socket, sockopt::ReceiveTimestampns, &true);
-    done("enable time stamps", stamps.map_err(Into::into))?;
+    check("enable time stamps", stamps.map_err(Into::into))?;
     let drops = setsockopt(&socket, sockopt::RxqOvfl, &1);
-    done("enable drop counts", drops.map_err(Into::into))?;
+    check("enable drop counts", drops.map_err(Into::into))?;
     enlarge_receive_buffer(&socket, RECEIVE_BUFFER);
-    done(&format!("bind to {group}"), socket.bind(&group.into()))?;
+    check(&format!("bind to {group}"), socket.bind(&group.into()))?;
     // Always through lo, also without a route (as in a new network namespace), and never through
     // another interface.
     let ip = Ipv4Addr::LOCALHOST;
     let lo = "through 127.0.0.1 (is the loopback interface up? `ip link set lo up`)";
-    done(&format!("send {lo}"), socket.set_multicast_if_v4(&ip))?;
-    done("limit frames to this host", socket.set_multicast_ttl_v4(0))?;
-    done("reach this host", socket.set_multicast_loop_v4(true))?;
+    check(&format!("send {lo}"), socket.set_multicast_if_v4(&ip))?;
+    check("limit frames to this host", socket.set_multicast_ttl_v4(0))?;
+    check("reach this host", socket.set_multicast_loop_v4(true))?;
     let joined = socket.join_multicast_v4(group.ip(), &ip);
-    done(&format!("join {group} {lo}"), joined)?;
-    done("set up the socket", socket.set_nonblocking(true))?;
+    check(&format!("join {group} {lo}"), joined)?;
+    check("set up the socket", socket.set_nonblocking(true))?;
     Ok(socket)
 }
 

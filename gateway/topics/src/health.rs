@@ -217,6 +217,7 @@ impl BusHealth {
         last_frame: Nanos::MIN,
         last_turn: Nanos::MIN,
         load: f64::NAN,
+        // Zero is a link that is up, and an interface and controller that are not known.
         ..zerocopy::transmute!([0_u8; size_of::<Self>()])
     };
 }
@@ -496,7 +497,7 @@ pub struct GatewayHealth {
 }
 
 impl DeviceHealth {
-    /// Without a name and with all counts zero.
+    /// Without a name, waiting, with all counts zero.
     pub const EMPTY: Self = zerocopy::transmute!([0_u8; size_of::<Self>()]);
 
     /// The value of a counter.

@@ -447,7 +447,7 @@ fn told_from(log: &str, delay: usize, end: &mut Option<Pipeline>) -> Told {
     let series: Vec<_> = reader
         .series()
         .iter()
-        .map(|s| (s.what, s.name.clone()))
+        .map(|s| (s.kind, s.name.clone()))
         .collect();
     let (mut row, mut job, mut age) = (Row::default(), None, 0);
     let (mut estimates, mut said, mut changes) = (vec![], vec![], vec![]);
@@ -528,7 +528,7 @@ fn inertias_by(
     let series: Vec<_> = reader
         .series()
         .iter()
-        .map(|s| (s.what, s.name.clone()))
+        .map(|s| (s.kind, s.name.clone()))
         .collect();
     let (mut row, mut told) = (Row::default(), vec![]);
     while reader.next_row(&mut row).unwrap() {

@@ -30,7 +30,7 @@ impl TrueTorques {
                 reader
                     .series()
                     .iter()
-                    .position(|s| s.what == csv::SeriesKind::Channel(Kind::Joint) && s.name == *j)
+                    .position(|s| s.kind == csv::SeriesKind::Channel(Kind::Joint) && s.name == *j)
             })
             .collect();
         let mut this = Self {

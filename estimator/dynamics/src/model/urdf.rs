@@ -815,11 +815,11 @@ impl Model {
         let robot = robot(&document)?;
         let mut warnings = Vec::new();
         let (sensors, unread) = read_sensors(robot, &mut warnings);
-        let (links, numbers) = read_links(robot, &mut warnings)?;
-        let (mut joints, numbers) = read_joints(robot, &numbers, &mut warnings)?;
+        let (links, link_numbers) = read_links(robot, &mut warnings)?;
+        let (mut joints, joint_numbers) = read_joints(robot, &link_numbers, &mut warnings)?;
         let tree = Tree::build(&links, &joints, &mut warnings)?;
         check_kept(keep, &joints, &sensors)?;
-        let coordinates = Coordinates::of(&mut joints, &numbers, &mut warnings)?;
+        let coordinates = Coordinates::of(&mut joints, &joint_numbers, &mut warnings)?;
         Folding {
             links: &links,
             joints: &joints,

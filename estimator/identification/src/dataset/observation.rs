@@ -74,14 +74,14 @@ impl Observation {
 
     /// As a hypothesis takes the readings of joints and base.
     #[must_use]
-    pub(crate) fn seen(self, view: MotionReading) -> Self {
+    pub(crate) fn read_as(self, motion_reading: MotionReading) -> Self {
         let mut motion = SeenMotion {
             position: self.position,
             velocity: self.velocity,
             acceleration: self.acceleration,
             base: self.base,
         };
-        motion.see(view);
+        motion.see(motion_reading);
         Self {
             position: motion.position,
             velocity: motion.velocity,

@@ -265,7 +265,9 @@ impl ConfigurationEvidence {
             variances[torque] = Structure::LENGTH_SCALE.powi(2);
         }
         for instant in stretch {
-            let mut rows = measurement.rows(instant);
+            let Ok(mut rows) = measurement.checked_rows(instant) else {
+                continue;
+            };
             self.instants += 1;
             let mut lines = DMatrix::zeros(rows.count, last + 1);
             if self.base.is_some() {
@@ -487,7 +489,7 @@ fn gravity_columns(
 ) {
     let mut right = |axis: Vec3| {
         let upright = MotionReading::Upright(axis);
-        let other = instant.clone().map(|own| own.seen(upright));
+        let other = instant.clone().map(|own| own.read_as(upright));
         let rows = measurement.rows(&other);
         (rows.count == lines.nrows()).then(|| DVector::from_vec(rows.r))
     };

@@ -8,7 +8,7 @@
 //! Per part of the robot (a sub-tree between F/T sensors, or all measured joint torques) and block
 //! of 0.1 s, the whitened square of the mean residual is compared with that of blocks in
 //! which the robot moves as much. Outlying blocks are excluded with a margin, and the fit is
-//! repeated ([`crate::batch`]) until the excluded set does not change.
+//! repeated ([`crate::identify`]) until the excluded set does not change.
 //!
 //! See also [`crate::diagnose::load`] (a body that is picked up or put down). A sensor's offset
 //! that jumps is excluded as a contact is, from the jump on: to start the offset afresh there

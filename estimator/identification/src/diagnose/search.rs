@@ -3,7 +3,7 @@
 //!
 //! Every hypothesis is judged by the same evidence, the cost of a fit with it: squared residuals
 //! plus twice the prior's cost, at the prior's scale. The hypothesis that lowers the cost the most
-//! is accepted if it does so by more than parameters and noise do ([`crate::hypothesis`]); then the
+//! is accepted if it does so by more than parameters and noise do ([`crate::nested_test`]); then the
 //! next beside it ([`crate::nested_test::accepted`]). What is found is reported, not corrected.
 //!
 //! # Encoder sign
@@ -37,7 +37,7 @@ use crate::measurement::model::MeasurementModel;
 use crate::measurement::reduction::{LogSegment, reduce, reduce_with, residuals};
 use crate::measurement::rows::MeasurementRows;
 use crate::measurement::unknowns::Unknowns;
-use crate::nested_test::{accepted, deviate, needed};
+use crate::nested_test::{accepted, needed, threshold};
 use crate::prepared_log::PreparedLog;
 use crate::prior::{MapEstimate, Posterior};
 use crate::readings::MotionReading;
@@ -149,8 +149,9 @@ pub(crate) fn wrong_signs(
         let (mut measurement, mut reduced) = (measurement.clone(), Vec::new());
         for LogSegment { instants, .. } in &segments {
             let other = |own: &Annotated| {
-                let views = negated.iter().map(|&dof| MotionReading::Reversed(dof));
-                own.clone().map(|own| views.fold(own, Observation::seen))
+                let readings = negated.iter().map(|&dof| MotionReading::Reversed(dof));
+                own.clone()
+                    .map(|own| readings.fold(own, Observation::read_as))
             };
             let instants: Vec<Annotated> = instants.iter().map(other).collect();
             let segment = LogSegment::alone(&instants);
@@ -233,7 +234,7 @@ impl SegmentColumns<'_> {
             // The row holds at the true position: the measured one minus the error. The small
             // change of the offset terms is ignored.
             let step = MotionReading::Encoder(dof, [STEP, 0.0]);
-            let instant = self.instants[number].clone().map(|own| own.seen(step));
+            let instant = self.instants[number].clone().map(|own| own.read_as(step));
             let moved = measurement.rows(&instant);
             if moved.count == rows.count {
                 for row in 0..rows.count {
@@ -453,7 +454,7 @@ impl<'a> Search<'a> {
 
         let (robot, unknowns) = (self.identified.robot(), self.identified.unknowns());
         let (sensors, torques) = (unknowns.sensors.len(), unknowns.joints.len());
-        let significance = deviate(sensors + torques + 1);
+        let significance = threshold(sensors + torques + 1);
         let is_long = |(seconds, deviation): Estimate| {
             seconds.abs() > MIN_DELAY.max(significance * deviation)
         };

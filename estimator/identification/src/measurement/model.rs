@@ -353,13 +353,17 @@ impl<'a> MeasurementModel<'a> {
 
     /// The rows of an observation. Sub-trees with a missing reading, missing torques, and sub-trees
     /// under an undeclared disturbance ([`Annotated::disturbed`]) have none, nor has an observation
-    /// whose motion is not finite.
+    /// whose motion is not finite. (Its sizes are those of the robot.)
     pub(crate) fn rows(&mut self, observation: &Annotated) -> MeasurementRows {
         let rows = self.checked_rows(observation);
         rows.unwrap_or_else(|_| MeasurementRows::new(&self.unknowns))
     }
 
-    fn checked_rows(&mut self, observation: &Annotated) -> Result<MeasurementRows, DynamicsError> {
+    /// The same; the error says why there are none.
+    pub(crate) fn checked_rows(
+        &mut self,
+        observation: &Annotated,
+    ) -> Result<MeasurementRows, DynamicsError> {
         let mut rows = MeasurementRows::new(&self.unknowns);
         self.move_to(observation)?;
         if self.wrench {

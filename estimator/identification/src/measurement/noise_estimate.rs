@@ -44,6 +44,7 @@ pub(crate) fn estimate_noise(
             .iter()
             .map(|segment| segment.noise[0][channel].clone())
             .collect();
+        // Those of F/T sensors, which come first, have a limit; the others do not drift.
         let walk = fastest.get(channel).map(|fastest| {
             for (segment, left) in segments.iter().zip(&mut left) {
                 let drift = segment.offset_drift(unknowns, channel);

@@ -22,12 +22,20 @@ pub(crate) struct MeasurementRows {
 }
 
 impl MeasurementRows {
+    /// None yet, with room for as many as there are channels: few observations have more.
     pub(crate) fn new(unknowns: &Unknowns) -> Self {
+        let (parameters, nuisance) = (unknowns.parameters(), unknowns.nuisance());
+        let channels = unknowns.channels();
         Self {
-            parameters: unknowns.parameters(),
-            nuisance: unknowns.nuisance(),
-            channels: unknowns.channels(),
+            parameters,
+            nuisance,
+            channels,
             wrenches: unknowns.wrenches(),
+            a: Vec::with_capacity(parameters * channels),
+            r: Vec::with_capacity(channels),
+            g: Vec::with_capacity(nuisance * channels),
+            n: Vec::with_capacity(channels * channels),
+            units: Vec::with_capacity(channels),
             ..Self::default()
         }
     }

@@ -212,16 +212,16 @@ impl Bank {
                 }
             }
             let is_learnt = |component: usize| tick.learnt_by & tick.moving & bit(component) != 0;
-            let mut views: Vec<MotionReading> = Vec::new();
+            let mut motion_readings: Vec<MotionReading> = Vec::new();
             for subtree in self
                 .subtrees
                 .iter()
                 .filter(|subtree| is_learnt(subtree.component))
             {
-                views.extend(subtree.fits.iter().map(|fit| fit.motion_reading));
+                motion_readings.extend(subtree.fits.iter().map(|fit| fit.motion_reading));
             }
-            while let Some(motion_reading) = views.pop() {
-                views.retain(|other| *other != motion_reading);
+            while let Some(motion_reading) = motion_readings.pop() {
+                motion_readings.retain(|other| *other != motion_reading);
                 let Some(shifted) = self
                     .equations
                     .shifted(&tick, motion_reading, &self.subtrees)

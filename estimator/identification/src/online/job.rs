@@ -333,9 +333,9 @@ impl ComponentJob {
         solution.root = joint;
         (solution.tau, solution.effective) = (in_use.tau, in_use.effective);
         solution.bodies.clone_from(&in_use.bodies);
-        let rates = self.drift_std.chunks_exact(6);
-        for (to, rates) in solution.drift_std.iter_mut().zip(rates) {
-            to.copy_from_slice(rates);
+        let drift_std = self.drift_std.chunks_exact(6);
+        for (to, of_sensor) in solution.drift_std.iter_mut().zip(drift_std) {
+            to.copy_from_slice(of_sensor);
         }
         let noise = solution.noise.iter_mut().zip(&mut solution.worst);
         for ((noise, worst), six) in noise.zip(self.channels.chunks_exact(6)) {

@@ -14,8 +14,8 @@
 //! For each pair `(V, q)` of a grid a filter of the local level model ([`LocalLevel`]) gives the
 //! likelihood of the innovations `y_k - o_k|k-1`. An undeclared disturbance is no noise: each
 //! innovation has a mixture distribution, of which a share [`DISTURBED`] is uniform within
-//! [`RANGE`]. The estimates of `V` and `q^2` are means over the grid, weighted by likelihood and
-//! prior. Initially `V` is hundreds of times the stated variance: readings get their full weight
+//! [`RANGE`]. The estimates of `V` and `q^2` are means over the grid, weighted by likelihood.
+//! Initially `V` is hundreds of times the stated variance: readings get their full weight
 //! only after their noise was observed.
 
 use crate::linear::noise::LocalLevel;

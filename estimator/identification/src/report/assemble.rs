@@ -81,6 +81,12 @@ pub(crate) fn outcome(
     let (calibrations, calibration_findings) = calibrations(identified, &root);
     findings.extend(calibration_findings);
     let judged = Judged::new(logs, identified, &root);
+    let Spectrum {
+        singular_values,
+        rank,
+        condition,
+        weakest,
+    } = spectrum(robot, unknowns, scaled, &spread);
     Outcome {
         robot: robot.name.clone(),
         verdict: verdict(identified),
@@ -102,7 +108,10 @@ pub(crate) fn outcome(
         time_offsets,
         logs: logs.iter().map(|log| log_outcome(log, &judged)).collect(),
         findings,
-        ..spectrum(robot, unknowns, scaled, &spread)
+        rank,
+        condition,
+        weakest,
+        singular_values,
     }
 }
 
@@ -118,14 +127,20 @@ fn inertia_findings(identified: &Identified<'_>) -> Vec<Finding> {
     .collect()
 }
 
-/// What the logs tell of the links' parameters in units of the prior's spread: the figures of an
-/// outcome about that, without all others.
+/// What the logs tell of the links' parameters in units of the prior's spread.
+struct Spectrum {
+    singular_values: Vec<f64>,
+    rank: usize,
+    condition: f64,
+    weakest: Vec<WeakDirection>,
+}
+
 fn spectrum(
     robot: &Robot,
     unknowns: &Unknowns,
     scaled: DMatrix<f64>,
     spread: &[DMatrix<f64>],
-) -> Outcome {
+) -> Spectrum {
     /// Most weak directions that are named.
     const WEAKEST: usize = 5;
     let svd = scaled.svd(false, true);
@@ -150,12 +165,11 @@ fn spectrum(
         }
     });
     let least = rank.checked_sub(1).map(|last| singular_values[last]);
-    Outcome {
+    Spectrum {
         rank,
         condition: least.map_or(f64::NAN, |least| greatest / least),
         weakest: weakest.collect(),
         singular_values,
-        ..Outcome::default()
     }
 }
 

@@ -77,7 +77,7 @@ pub enum SeriesKind {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Series {
     /// Its kind.
-    pub what: SeriesKind,
+    pub kind: SeriesKind,
     /// Its name.
     pub name: String,
 }
@@ -171,7 +171,7 @@ pub(super) fn items_of(
     } else {
         Quality(cells.quality as u32)
     };
-    let SeriesKind::Channel(kind) = series.what else {
+    let SeriesKind::Channel(kind) = series.kind else {
         if let Some(state) = contact_of(&cells.contact)? {
             push(Value::Contact(state));
         }
@@ -262,7 +262,7 @@ mod tests {
     #[test]
     fn a_drive_may_report_no_duty() {
         let series = Series {
-            what: SeriesKind::Channel(Kind::Joint),
+            kind: SeriesKind::Channel(Kind::Joint),
             name: "elbow".into(),
         };
         let read = |values: [f64; 4]| {
@@ -292,19 +292,19 @@ mod tests {
     fn what_is_written_is_read_back_bit_for_bit() {
         let series = [
             Series {
-                what: SeriesKind::Channel(Kind::Joint),
+                kind: SeriesKind::Channel(Kind::Joint),
                 name: "elbow".into(),
             },
             Series {
-                what: SeriesKind::Channel(Kind::Wrench),
+                kind: SeriesKind::Channel(Kind::Wrench),
                 name: "ft".into(),
             },
             Series {
-                what: SeriesKind::Channel(Kind::Imu),
+                kind: SeriesKind::Channel(Kind::Imu),
                 name: "chest".into(),
             },
             Series {
-                what: SeriesKind::Contact,
+                kind: SeriesKind::Contact,
                 name: "hand".into(),
             },
         ];
@@ -452,7 +452,7 @@ mod tests {
         ];
         for (kind, reading) in readings {
             let series = [Series {
-                what: SeriesKind::Channel(kind),
+                kind: SeriesKind::Channel(kind),
                 name: "one".into(),
             }];
             let mut writer = TableWriter::new(Vec::new(), &series, Columns::All).unwrap();

@@ -170,13 +170,13 @@ impl<R: io::Read> TableReader<R> {
             if seen.insert(name.to_owned(), at).is_some() {
                 return Err(TableError::TwoColumns(name.to_owned()));
             }
-            let column = parse_column(name).and_then(|(what, channel, field)| {
-                let Some(what) = what else {
+            let column = parse_column(name).and_then(|(kind, channel, field)| {
+                let Some(kind) = kind else {
                     qualities.push((at, channel.to_owned()));
                     return None;
                 };
                 let key = Series {
-                    what,
+                    kind,
                     name: channel.to_owned(),
                 };
                 let number = *numbers.entry(key.clone()).or_insert_with(|| {
@@ -197,7 +197,7 @@ impl<R: io::Read> TableReader<R> {
         for (at, channel) in qualities {
             let found = series
                 .iter()
-                .position(|s: &Series| s.name == channel && s.what != SeriesKind::Contact);
+                .position(|s: &Series| s.name == channel && s.kind != SeriesKind::Contact);
             match (found, columns.get_mut(at)) {
                 (Some(number), Some(column)) => {
                     *column = Some(TableColumn {
@@ -259,7 +259,7 @@ impl<R: io::Read> TableReader<R> {
         let Some(wanted) = self
             .series
             .get(series)
-            .and_then(|s| parse_field(s.what, field))
+            .and_then(|s| parse_field(s.kind, field))
         else {
             return false;
         };
@@ -363,7 +363,7 @@ impl<R: io::Read> TableReader<R> {
                     value,
                 });
             })
-            .map_err(|problem| format!("{}/{} {problem}", word(series.what), series.name))?;
+            .map_err(|problem| format!("{}/{} {problem}", word(series.kind), series.name))?;
         }
         Ok(())
     }

@@ -41,19 +41,19 @@ impl<W: io::Write> TableWriter<W> {
         let mut header = String::from("t");
         let (mut layout, mut count) = (Vec::new(), 0);
         for one in series {
-            let fields = fields_of(one.what, columns);
+            let fields = fields_of(one.kind, columns);
             for field in &fields {
                 header.push(',');
                 match field {
                     ColumnQuantity::Quality => header.push_str(&one.name),
-                    _ => header.push_str(&format!("{}/{}", word(one.what), one.name)),
+                    _ => header.push_str(&format!("{}/{}", word(one.kind), one.name)),
                 }
                 header.push('/');
                 header.push_str(field_word(*field));
             }
             let first = count;
             count += fields.len();
-            layout.push((one.what, first, fields));
+            layout.push((one.kind, first, fields));
         }
         header.push('\n');
         output.write_all(header.as_bytes())?;

@@ -401,10 +401,10 @@ impl SharedDesign {
         };
         let mean = factor.solve(&right);
         let deviation = |axis: usize| {
-            let mut subtree = DVector::zeros(self.unknowns);
-            subtree[axis] = 1.0;
-            let _ = factor.l_dirty().solve_lower_triangular_mut(&mut subtree);
-            subtree.norm() * self.branches[0].noise.sqrt()
+            let mut unit = DVector::zeros(self.unknowns);
+            unit[axis] = 1.0;
+            let _ = factor.l_dirty().solve_lower_triangular_mut(&mut unit);
+            unit.norm() * self.branches[0].noise.sqrt()
         };
         let axes = (columns.count()..self.unknowns).map(|axis| match self.contact {
             Some(_) => mean[axis].hypot(deviation(axis)),

@@ -299,23 +299,23 @@ fn motion_readings(robot: &Robot, links: &[usize]) -> Vec<MotionReading> {
             .and_then(|joint| model.joints().get(joint));
         joint.is_some_and(|joint| matches!(joint.kind, JointKind::Revolute(_)))
     };
-    let mut views: Vec<MotionReading> = all().map(MotionReading::Reversed).collect();
-    views.extend(all().filter(is_turning).map(MotionReading::Degrees));
+    let mut motion_readings: Vec<MotionReading> = all().map(MotionReading::Reversed).collect();
+    motion_readings.extend(all().filter(is_turning).map(MotionReading::Degrees));
     // Of a limb's encoders any two may be swapped.
     for b in 0..model.dof_count() {
         let link = model.dof_joint(b).map_or(0, |joint| joint + 1);
         let limb = dofs_above(model, link).into_iter().filter(|a| *a != b);
         let concerned = limb.filter(|a| dofs.contains(a) || dofs.contains(&b));
-        views.extend(concerned.map(|a| MotionReading::Swapped(a.min(b), a.max(b))));
+        motion_readings.extend(concerned.map(|a| MotionReading::Swapped(a.min(b), a.max(b))));
     }
-    views.extend(all().map(|dof| MotionReading::Encoder(dof, [0.0; 2])));
-    views.push(MotionReading::BaseTurned(Vec3::zeros()));
+    motion_readings.extend(all().map(|dof| MotionReading::Encoder(dof, [0.0; 2])));
+    motion_readings.push(MotionReading::BaseTurned(Vec3::zeros()));
     match &robot.base {
         BaseMotion::Imu(pose) => {
             let to_base = |turn| pose.rotation * turn * pose.rotation.transpose();
             let turns = quarter_turns().into_iter();
-            views.extend(turns.map(|turn| MotionReading::ImuTurned(to_base(turn))));
-            views.push(MotionReading::ImuInG);
+            motion_readings.extend(turns.map(|turn| MotionReading::ImuTurned(to_base(turn))));
+            motion_readings.push(MotionReading::ImuInG);
         }
         BaseMotion::Standing(motion) => {
             let axes = [Vec3::x(), Vec3::y(), Vec3::z()];
@@ -323,9 +323,9 @@ fn motion_readings(robot: &Robot, links: &[usize]) -> Vec<MotionReading> {
             let stated = motion.proper_acceleration.normalize();
             // The nearest one is as good as stated.
             let others = axes.filter(|axis| axis.dot(&stated) < 0.9);
-            views.extend(others.map(MotionReading::Upright));
+            motion_readings.extend(others.map(MotionReading::Upright));
         }
         BaseMotion::Stance(_) => {}
     }
-    views
+    motion_readings
 }
