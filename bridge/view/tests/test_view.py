@@ -83,6 +83,11 @@ def test_topics_and_their_types(robot):
     assert {topic: found.get(topic) for topic in expected} == expected
 
 
+def same(number, told):
+    """Whether JSON tells this number: it has null for what is not one."""
+    return math.isnan(number) if told is None else number == told
+
+
 def test_torques_are_those_of_echo_and_their_bands_two_deviations(robot, client):
     echo = robot.start(PROPRIO, "echo", "--torques", "--json")
     robot.said(echo, "{")
@@ -98,11 +103,14 @@ def test_torques_are_those_of_echo_and_their_bands_two_deviations(robot, client)
         if one.topic == "/torques" and (expected := told.get(message.acquired)):
             assert list(message.joint) == JOINTS
             for number, joint in enumerate(JOINTS):
-                assert message.torque[number] == expected[joint]["torque"]
-                assert message.standard_deviation[number] == expected[joint]["std"]
+                assert same(message.torque[number], expected[joint]["torque"])
+                assert same(message.standard_deviation[number], expected[joint]["std"])
                 assert message.valid[number] == expected[joint]["valid"]
         elif one.topic == "/torque/l_elbow" and (expected := told.get(message.acquired)):
             elbow = expected["l_elbow"]
+            if elbow["torque"] is None:  # on a machine that has stalled
+                assert math.isnan(message.torque) and not message.valid
+                continue
             assert message.torque == elbow["torque"]
             assert message.lower == pytest.approx(elbow["torque"] - 2 * elbow["std"], rel=1e-12)
             assert message.upper == pytest.approx(elbow["torque"] + 2 * elbow["std"], rel=1e-12)
