@@ -28,10 +28,10 @@
 //!
 //! # Noise
 //! Rows are whitened with *inflated* variances, and offsets drift between blocks (random walks).
-//! `noise_tracker` estimates both from the mean of each channel from one second to the next, minus the
-//! prediction by the earlier bodies. All readings count there, rejected ones too: otherwise noise
-//! above the assumed one would be rejected for ever. Initially the noise is assumed hundreds of
-//! times the stated one. Offsets are constant while a contact is declared or a disturbance is
+//! `noise_tracker` estimates both from the mean of each channel from one second to the next, minus
+//! the prediction by the earlier bodies. All readings count there, rejected ones too: otherwise
+//! noise above the assumed one would be rejected for ever. Initially the noise is assumed hundreds
+//! of times the stated one. Offsets are constant while a contact is declared or a disturbance is
 //! suspected.
 //!
 //! # Gating

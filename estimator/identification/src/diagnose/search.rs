@@ -3,8 +3,8 @@
 //!
 //! Every hypothesis is judged by the same evidence, the cost of a fit with it: squared residuals
 //! plus twice the prior's cost, at the prior's scale. The hypothesis that lowers the cost the most
-//! is accepted if it does so by more than parameters and noise do ([`crate::nested_test`]); then the
-//! next beside it ([`crate::nested_test::accepted`]). What is found is reported, not corrected.
+//! is accepted if it does so by more than parameters and noise do ([`crate::nested_test`]); then
+//! the next beside it ([`crate::nested_test::accepted`]). What is found is reported, not corrected.
 //!
 //! # Encoder sign
 //! Other rows: positions, velocities and accelerations are negated. Tested before gains of the F/T
