@@ -98,8 +98,10 @@ const fn word(verdict: Readiness) -> &'static str {
 
 fn ok(what: &'static str, says: impl Into<String>) -> CheckResult {
     CheckResult {
+        what,
         verdict: Readiness::Ok,
-        ..lacking(what, says, "")
+        says: says.into(),
+        hint: String::new(),
     }
 }
 

@@ -92,15 +92,13 @@ fn group(key: &[u8]) -> SocketAddrV4 {
 
 /// A socket of bus `name` in `group`.
 fn join(name: &str, group: SocketAddrV4) -> Result<Socket, OpenError> {
-    let check = |what: &str, result: io::Result<()>| {
-        let action = format!("{what} for virtual bus {name}");
-        result.map_err(|cause| OpenError::System { action, cause })
-    };
-    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP));
-    let socket = socket.map_err(|cause| OpenError::System {
-        action: format!("create a socket for virtual bus {name}"),
+    let failed = |what: &str, cause: io::Error| OpenError::System {
+        action: format!("{what} for virtual bus {name}"),
         cause,
-    })?;
+    };
+    let check = |what: &str, result: io::Result<()>| result.map_err(|cause| failed(what, cause));
+    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP));
+    let socket = socket.map_err(|cause| failed("create a socket", cause))?;
     // Every multicast datagram goes to all sockets that share the address this way.
     // SO_REUSEPORT would additionally require that all of them belong to one user.
     check("share the address", socket.set_reuse_address(true))?;
